@@ -1,0 +1,46 @@
+"""What the author of a component reads: the six interfaces and the data they exchange."""
+
+from pbdkit.interfaces.arithmetic import Vector, length, squared_length, where
+from pbdkit.interfaces.component import Component, Pair
+from pbdkit.interfaces.diagnostic import Diagnostic, Moment, Variable
+from pbdkit.interfaces.fracture import FractureModel
+from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
+from pbdkit.interfaces.neighbours import NeighbourMetric, Slot
+from pbdkit.interfaces.rule import FollowerRule, Here, Setting
+
+INTERFACES: dict[str, type[Component]] = {
+    "lattice": Lattice,
+    "neighbours": NeighbourMetric,
+    "rule": FollowerRule,
+    "frame": FramePolicy,
+    "fracture": FractureModel,
+    "diagnostics": Diagnostic,
+}
+"""The open interfaces by the field of the experiment in which their components stand."""
+
+__all__ = [
+    "INTERFACES",
+    "BasisSite",
+    "Cell",
+    "Component",
+    "Diagnostic",
+    "FollowerRule",
+    "FractureModel",
+    "FrameMap",
+    "FramePolicy",
+    "FrameSites",
+    "Here",
+    "Lattice",
+    "Moment",
+    "NeighbourMetric",
+    "Offset",
+    "Pair",
+    "Setting",
+    "Slot",
+    "Variable",
+    "Vector",
+    "length",
+    "squared_length",
+    "where",
+]

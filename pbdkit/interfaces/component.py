@@ -1,0 +1,78 @@
+"""What every exchangeable part is: one frozen model with a `type`, parameters and behaviour."""
+
+from __future__ import annotations
+
+from abc import ABC
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from pbdkit.interfaces.naming import did_you_mean
+
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+"""Two numbers, (x, y); an experiment file writes them as a list of two."""
+
+
+class Strict(BaseModel):
+    """A frozen model that takes finite numbers, known keys and nothing else.
+
+    "10", True and 10.0 are not the integer 10, and an unknown key is answered with the nearest
+    right one.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        validate_default=True,
+        validate_by_name=False,
+        validate_by_alias=True,
+        serialize_by_alias=True,
+    )
+
+    @classmethod
+    def known_keys(cls) -> list[str]:
+        """The keys that an experiment may write here."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys_only(cls, data: Any) -> Any:
+        unknown = [k for k in data if k not in cls.known_keys()] if isinstance(data, dict) else []
+        if unknown:
+            known = [k for k in cls.known_keys() if k != "type"]
+            taken = f"known here: {', '.join(known)}" if known else "nothing can be set here"
+            message = f"unknown key{did_you_mean(str(unknown[0]), known)} ({taken})"
+            raise PydanticCustomError("key", "{text}", {"text": message, "key": unknown[0]})
+        return data
+
+
+class Component(Strict, ABC):
+    """A frozen, validated set of parameters together with the behaviour that they drive.
+
+    A final class gives `type` a literal default and is told from its siblings by it::
+
+        class Stiff(pbdkit.FollowerRule):
+            type: Literal["stiff"] = "stiff"
+
+    A component holds no run state: what it must remember travels in the state of the stepper.
+    """
+
+    type: str
+
+    @classmethod
+    def type_name(cls) -> str:
+        """The `type` by which experiments name this component; TypeError if it declares none."""
+        default = cls.model_fields["type"].default
+        if not isinstance(default, str):
+            raise TypeError(
+                f'{cls.__name__} does not name its type: add `type: Literal["my-name"] = "my-name"`'
+            )
+        return default
+
+    def numeric_parameters(self) -> dict[str, float]:
+        """The parameters that are numbers or switches, as they reach elementwise functions."""
+        values: dict[str, Any] = {name: getattr(self, name) for name in type(self).model_fields}
+        return {k: v for k, v in values.items() if isinstance(v, (int, float))}

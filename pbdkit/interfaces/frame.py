@@ -1,0 +1,51 @@
+"""The FramePolicy interface: how the frame follows the body, as a linear map."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces.component import Component
+
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class FrameMap:
+    """u of frame point `point[e]` is the sum over its entries e of weight[e] · u[body[e]].
+
+    `point` counts the frame points from 0 in the order of their numbers, sorted; `body` are
+    rows of the particle table. With `lag` 1 the body's displacements of the step before count.
+    """
+
+    point: Indices
+    body: Indices
+    weight: NDArray[np.float64]
+    lag: int = 0
+
+
+class FrameSites(ABC):
+    """The frame of a scene, as a policy sees it."""
+
+    @abstractmethod
+    def nearest(self) -> tuple[Indices, Indices]:
+        """(point, body): each frame point with every body particle that is nearest to it in the
+        reference configuration, distance ≤ d_min(1 + 1e-9) + 1e-12; sorted by both."""
+
+
+class FramePolicy(Component):
+    """The points around the body that remove the edge effect, and how they follow it.
+
+    To add a policy, write `depth` and `follow`. The map is linear and has no memory.
+    """
+
+    @abstractmethod
+    def depth(self, reach: int) -> int:
+        """How many layers the frame has; `reach` is what the neighbours reach, in site index."""
+
+    @abstractmethod
+    def follow(self, frame: FrameSites) -> FrameMap:
+        """The map from body displacements to the frame's; every frame point needs an entry."""

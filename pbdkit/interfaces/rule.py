@@ -1,0 +1,75 @@
+"""The FollowerRule interface: two elementwise functions and their parameters."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+from pbdkit.interfaces.arithmetic import Vector
+from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.lattice import Cell
+from pbdkit.interfaces.neighbours import Slot
+
+
+class Here(NamedTuple):
+    """What stands at the follower itself, one component a plane.
+
+    `u` is its displacement in the intermediate configuration; `X` its reference position, given
+    to rules that declare `uses_reference`, otherwise zeros.
+    """
+
+    u: Vector
+    X: Vector
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
+    the box (`lower`, `upper`) of the body's reference configuration, frame not included."""
+
+    cell: Cell
+    slots: tuple[tuple[Slot, ...], ...]
+    lower: Vector
+    upper: Vector
+
+
+class FollowerRule(Component):
+    """How a follower moves, given its neighbours in the intermediate configuration m.
+
+    To add a rule, write `gather` and `apply`, both static and elementwise: the framework calls
+    them with whole arrays, single numbers or probes. With u = x - X:
+
+    1. for each neighbour k that is present, ``gather(d, r, w, p)`` with the difference
+       d = u_k - u_j, the rest offset r = X_k - X_j (so x_k - x_j = r + d), the slot's weights w
+       and the parameters p returns a tuple of contributions;
+    2. the contributions are summed over the neighbours, in the order of the slots;
+    3. ``apply(total, here, p)`` returns the move (x, y) from where the particle stands in m to its
+       target: zero moves mean rest, exactly.
+
+    Relaxation and memory are applied afterwards and are no concern of the rule. A particle that
+    has no neighbour stays. A fictitious neighbour counts as present.
+    """
+
+    uses_reference: ClassVar[bool] = False
+
+    def parameters(self, setting: Setting) -> dict[str, float]:
+        """The numbers that `gather` and `apply` see as ``p.name``; by default the rule's own.
+
+        Raise ExperimentError where the rule does not go with the lattice.
+        """
+        return self.numeric_parameters()
+
+    def weights(self, slot: Slot) -> tuple[float, ...]:
+        """The constants of a slot that `gather` sees as ``w``; by default none."""
+        return ()
+
+    @staticmethod
+    @abstractmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """The contributions of one neighbour, elementwise."""
+
+    @staticmethod
+    @abstractmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """The move of the follower (target - where it stands in m), elementwise."""
