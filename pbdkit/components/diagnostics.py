@@ -1,0 +1,129 @@
+"""Pseudo-energies, displacements, tracks and the count of broken bonds (model.md, section 8)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import Diagnostic, Moment, Variable, Vector, length
+
+LENGTH = "lattice unit"
+
+
+class PE1(Diagnostic):
+    """PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours, broken or not.
+
+    For every body particle, leaders included; frame points are neighbours but get 0.
+    """
+
+    type: Literal["pe1"] = "pe1"
+
+    uses_bonds: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`pe1`."""
+        return (Variable("pe1", ("particle",), "pseudo-energy PE1", f"{LENGTH}^2"),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """Squared length changes, summed."""
+        return (now.sum_over_neighbours(_squared_extension),)
+
+
+class PE1Intact(Diagnostic):
+    """PE1 over unbroken bonds only."""
+
+    type: Literal["pe1-intact"] = "pe1-intact"
+
+    uses_bonds: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`pe1_intact`."""
+        name = "pseudo-energy PE1 of intact bonds"
+        return (Variable("pe1_intact", ("particle",), name, f"{LENGTH}^2"),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """Squared length changes of intact bonds, summed."""
+        return (now.sum_over_neighbours(_squared_extension, intact_only=True),)
+
+
+class PE2(Diagnostic):
+    """PE2_j(t) = |x_j(t) - x_j(t-1)|, against the step before whatever is recorded; 0 at time 0."""
+
+    type: Literal["pe2"] = "pe2"
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`pe2`."""
+        return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """The length of the last step."""
+        moved = now.displacement() - now.previous_displacement()
+        return (np.sqrt((moved * moved).sum(axis=1)),)
+
+
+class Displacement(Diagnostic):
+    """u = x - X, with all its digits however far from the origin the body lies."""
+
+    type: Literal["displacement"] = "displacement"
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`u`."""
+        return (Variable("u", ("particle", "axis"), "displacement", LENGTH),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """The displacements."""
+        return (now.displacement(),)
+
+
+class Track(Diagnostic):
+    """The position of chosen particles at every step."""
+
+    type: Literal["track"] = "track"
+    numbers: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
+
+    every_step: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`track`."""
+        return (Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH),)
+
+    def check(self, particles: int) -> None:
+        """Refuses numbers that no particle has."""
+        for n, number in enumerate(self.numbers):
+            if number > particles:
+                raise ExperimentError(
+                    f"there is no particle {number}; they are numbered 1 to {particles}",
+                    ("numbers", n),
+                )
+
+    def coordinates(self) -> dict[str, NDArray[Any]]:
+        """`tracked`, the numbers of the particles."""
+        return {"tracked": np.array(self.numbers, np.int64)}
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """X + u of the chosen rows."""
+        rows = now.rows(self.numbers)
+        return (now.reference(rows) + now.displacement(rows),)
+
+
+class Broken(Diagnostic):
+    """The number of broken bonds."""
+
+    type: Literal["broken"] = "broken"
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`broken_bonds`."""
+        return (Variable("broken_bonds", (), "number of broken bonds", "1", dtype="i8"),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """The count."""
+        return (now.broken_bonds(),)
+
+
+def _squared_extension(d: Vector, r: Vector) -> Any:
+    extension = length(Vector(r.x + d.x, r.y + d.y)) - length(r)
+    return extension * extension

@@ -1,0 +1,101 @@
+"""Bonds that never break, and bonds that break beyond a length (model.md, section 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import FractureModel, Slot, Vector, squared_length, where
+
+Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
+
+
+class NoFracture(FractureModel):
+    """Nothing breaks; the scene has no bond state."""
+
+    type: Literal["none"] = "none"
+
+    can_break: ClassVar[bool] = False
+
+    def constants(self, slot: Slot) -> tuple[float, ...]:
+        """None."""
+        return ()
+
+    @staticmethod
+    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+        """Never."""
+        return False
+
+    @staticmethod
+    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
+        """The undeformed cell."""
+        return Vector(0.0, 0.0)
+
+
+class Threshold(FractureModel):
+    """A bond breaks when |r + d|² > threshold², one threshold a shell (the paper's section 5).
+
+    The fictitious point that takes the lost neighbour's place stands at m_j + λ R
+    (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
+    contracts) or at X_k (`fictitious: reference`). `frame_bonds: false` spares the bonds to the
+    frame.
+    """
+
+    type: Literal["threshold"] = "threshold"
+    thresholds: Thresholds
+    placement: float = 1.0
+    fictitious_at: Literal["cell", "reference"] = Field("cell", alias="fictitious")
+    frame_bonds: bool = True
+
+    def parameters(self) -> dict[str, float]:
+        """λ - 1, and whether the reference position counts."""
+        return {
+            "excess": self.placement - 1.0,
+            "at_reference": float(self.fictitious_at == "reference"),
+        }
+
+    def breaks_frame_bonds(self) -> bool:
+        """As `frame_bonds` says."""
+        return self.frame_bonds
+
+    def constants(self, slot: Slot) -> tuple[float, ...]:
+        """The squared threshold of the slot's shell."""
+        return (self.thresholds[slot.shell - 1] ** 2,)
+
+    @staticmethod
+    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+        """|r + d|² > threshold²."""
+        return squared_length(Vector(r.x + d.x, r.y + d.y)) > c[0]
+
+    @staticmethod
+    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
+        """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
+        return Vector(
+            where(p.at_reference, -u.x, p.excess * r.x), where(p.at_reference, -u.y, p.excess * r.y)
+        )
+
+    def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
+        """Refuses a wrong number of thresholds, and thresholds below every rest length."""
+        if len(self.thresholds) != len(shells):
+            raise ExperimentError(
+                f"one threshold a shell is needed: {len(self.thresholds)} given for "
+                f"{len(shells)} shell(s)",
+                ("thresholds",),
+            )
+        warnings = []
+        for n, (threshold, lengths) in enumerate(zip(self.thresholds, shells, strict=True)):
+            if threshold < min(lengths) * (1 - 1e-12):
+                raise ExperimentError(
+                    f"{threshold:g} is below the rest length {min(lengths):g} of shell {n + 1}: "
+                    "every bond would break at rest; raise it",
+                    ("thresholds", n),
+                )
+            if threshold < max(lengths) * (1 - 1e-12):
+                warnings.append(
+                    f"fracture.thresholds.{n}: {threshold:g} is below the largest rest length "
+                    f"{max(lengths):g} of shell {n + 1}: those bonds break in the first step"
+                )
+        return warnings

@@ -1,0 +1,85 @@
+"""The five plane Bravais lattices (model.md, section 2; the paper's figure 1)."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pbdkit.interfaces import BasisSite, Cell, Lattice, Vector
+
+Spacing = Annotated[float, Field(ge=1e-100, le=1e100)]
+"""A lattice constant; the range keeps squared lengths finite."""
+
+
+class Square(Lattice):
+    """Sites at (i·a, j·a)."""
+
+    type: Literal["square"] = "square"
+    a: Spacing
+
+    def cell(self) -> Cell:
+        """One site."""
+        return Cell((Vector(self.a, 0.0), Vector(0.0, self.a)))
+
+
+class Rectangular(Lattice):
+    """Sites at (i·a, j·b)."""
+
+    type: Literal["rectangular"] = "rectangular"
+    a: Spacing
+    b: Spacing
+
+    def cell(self) -> Cell:
+        """One site."""
+        return Cell((Vector(self.a, 0.0), Vector(0.0, self.b)))
+
+
+class Oblique(Lattice):
+    """Sites at i·(a, 0) + j·b·(cos angle, sin angle); the angle is in degrees."""
+
+    type: Literal["oblique"] = "oblique"
+    a: Spacing
+    b: Spacing
+    angle: Annotated[float, Field(gt=0.0, lt=180.0)]
+
+    def cell(self) -> Cell:
+        """One site."""
+        angle = math.radians(self.angle)
+        return Cell(
+            (Vector(self.a, 0.0), Vector(self.b * math.cos(angle), self.b * math.sin(angle)))
+        )
+
+
+class CentredRectangular(Lattice):
+    """Rows b/2 apart, the odd ones shifted by a/2."""
+
+    type: Literal["centred-rectangular"] = "centred-rectangular"
+    a: Spacing
+    b: Spacing
+
+    def cell(self) -> Cell:
+        """A rectangle a × b with a site in its centre."""
+        return _rows(self.a, self.b)
+
+
+class Hexagonal(Lattice):
+    """Rows a·√3/2 apart, the odd ones shifted by a/2: six neighbours at distance a."""
+
+    type: Literal["hexagonal"] = "hexagonal"
+    a: Spacing
+
+    def cell(self) -> Cell:
+        """A rectangle a × a√3 with a site in its centre."""
+        return _rows(self.a, self.a * math.sqrt(3.0))
+
+
+def _rows(a: float, b: float) -> Cell:
+    # The primitive basis is along the row and up the slanted line: p = i - floor(j/2), q = j.
+    return Cell(
+        vectors=(Vector(a, 0.0), Vector(0.0, b)),
+        sites=(BasisSite(), BasisSite(Vector(a / 2, b / 2), index=(0, 1), primitive=(0, 1))),
+        period=(1, 2),
+        primitive=((1, 0), (-1, 2)),
+    )

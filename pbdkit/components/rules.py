@@ -1,0 +1,105 @@
+"""The paper's follower rules (its section 3; model.md, section 5)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pbdkit.interfaces import FollowerRule, Here, Setting, Vector, length, where
+
+
+class Barycentre(FollowerRule):
+    """x_j = (1/N) Σ x_k.
+
+    The rest offsets are summed apart from the differences: with all neighbours present they
+    cancel exactly, and small differences keep all their digits.
+    """
+
+    type: Literal["barycentre"] = "barycentre"
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """(d, r, 1)."""
+        return d.x, d.y, r.x, r.y, 1.0
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """(Σd + Σr) / N."""
+        dx, dy, rx, ry, n = total
+        return (dx + rx) / n, (dy + ry) / n
+
+
+class MeanDisplacement(FollowerRule):
+    """u_j = (1/N) Σ u_k."""
+
+    type: Literal["mean-displacement"] = "mean-displacement"
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """(d, 1)."""
+        return d.x, d.y, 1.0
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """Σd / N."""
+        dx, dy, n = total
+        return dx / n, dy / n
+
+
+class DistanceWeighted(FollowerRule):
+    """x_j = Σ |x_k - x_j| x_k / Σ |x_k - x_j|; where the sum is 0 the particle stays.
+
+    As printed in the paper it is linearly unstable on every lattice: after some 50 steps rounding
+    decides. A relaxation below 1 settles it (0.66 on the square lattice).
+    """
+
+    type: Literal["distance-weighted"] = "distance-weighted"
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """(|r + d| (r + d), |r + d|)."""
+        x, y = r.x + d.x, r.y + d.y
+        distance = length(Vector(x, y))
+        return distance * x, distance * y, distance
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """Σ |r + d| (r + d) / Σ |r + d|."""
+        x, y, distance = total
+        share = where(distance > 0.0, distance, 1.0)
+        return x / share, y / share
+
+
+class MixedCoordinate(FollowerRule):
+    """Barycentre along the loading axis; across it y_j = K (x_j - X_j) da + (1/N) Σ y_k.
+
+    x_j is the target just computed and da = Y_j - (Y_min + Y_max)/2 over the body's reference
+    configuration. K < 0 contracts under extension; it is no Poisson ratio: its effect grows with
+    x and with the number of rows. `axis` is the loading axis.
+    """
+
+    type: Literal["mixed-coordinate"] = "mixed-coordinate"
+    K: float
+    axis: Literal["x", "y"] = "x"
+
+    uses_reference: ClassVar[bool] = True
+
+    def parameters(self, setting: Setting) -> dict[str, float]:
+        """K, the loading axis as 0 or 1, and the body's middle across it."""
+        along = ("x", "y").index(self.axis)
+        across = 1 - along
+        middle = (setting.lower[across] + setting.upper[across]) / 2
+        return {"K": self.K, "along": along, "middle": middle}
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """(d, r, 1)."""
+        return d.x, d.y, r.x, r.y, 1.0
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """The barycentre's move, and K · (u + move along the axis) · da across it."""
+        dx, dy, rx, ry, n = total
+        x, y = (dx + rx) / n, (dy + ry) / n
+        if p.along == 0:
+            return x, y + p.K * (here.u.x + x) * (here.X.y - p.middle)
+        return x + p.K * (here.u.y + y) * (here.X.x - p.middle), y

@@ -1,0 +1,1 @@
+"""Which components are installed, and where each comes from."""

@@ -1,0 +1,110 @@
+"""The registry: from the `type` in an experiment to the class that implements it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+
+from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.interfaces import Component
+from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.registry.loading import Plugin, check_component, load_builtin, load_installed
+
+
+class Registry:
+    """The built-in components, those handed over in Python, and, once needed, the installed ones.
+
+    An experiment that uses only built-in names imports no third-party code.
+    """
+
+    def __init__(self, components: Iterable[type[Component]] = ()) -> None:
+        given = tuple(components)
+        for component in given:
+            try:
+                check_component(component)
+            except TypeError as error:
+                raise ExperimentError(f"components: {error}") from None
+        self._builtin = load_builtin()
+        self._given = Plugin("components", "", "", "ok", components=given)
+
+    @cached_property
+    def installed(self) -> list[Plugin]:
+        """The third-party plugins; the first look at them imports them."""
+        return load_installed()
+
+    @property
+    def plugins(self) -> list[Plugin]:
+        """Every plugin, the built-in one first."""
+        return [self._builtin, self._given, *self.installed]
+
+    def find(self, interface: type[Component], name: str) -> type[Component]:
+        """The class of that interface and type.
+
+        `name` may name its distribution: ``pbdkit-x:rule-name``. Raises ExperimentError for a name
+        that nobody offers or that two distributions offer, PluginError where the distribution
+        named is missing or broken.
+        """
+        if ":" in name:
+            return self._find_in_distribution(interface, *name.split(":", 1))
+        for plugins in ([self._builtin], [self._given]):
+            if found := _named(plugins, interface, name):
+                return found[0][1]
+        found = _named(self.installed, interface, name)
+        if len(found) > 1:
+            offers = ", ".join(f"'{plugin.distribution}:{name}'" for plugin, _ in found)
+            raise ExperimentError(f"'{name}' is offered by several distributions: write {offers}")
+        if not found:
+            raise ExperimentError(self._unknown(interface, name))
+        return found[0][1]
+
+    def components(self, interface: type[Component]) -> dict[str, type[Component]]:
+        """Every usable component of an interface by type, third parties' included."""
+        return {
+            component.type_name(): component
+            for plugin in reversed(self.plugins)
+            for component in plugin.components
+            if issubclass(component, interface)
+        }
+
+    def versions(self, used: Iterable[Component]) -> dict[str, str]:
+        """The distributions that these components come from, with their versions."""
+        classes = {type(component) for component in used}
+        loaded = [self._builtin, *self.__dict__.get("installed", ())]
+        return {p.distribution: p.version for p in loaded if classes & set(p.components)}
+
+    def _find_in_distribution(
+        self, interface: type[Component], distribution: str, name: str
+    ) -> type[Component]:
+        of_it = [p for p in self.plugins if p.distribution == distribution]
+        if not of_it:
+            raise PluginError(f"'{name}' is asked of {distribution}, which is not installed")
+        if found := _named(of_it, interface, name):
+            return found[0][1]
+        for plugin in of_it:
+            if plugin.state != "ok":
+                raise PluginError(
+                    f"'{name}' is asked of {distribution} {plugin.version}, "
+                    f"which is {plugin.state}: {plugin.reason}"
+                )
+        raise ExperimentError(f"{distribution} offers no {interface.__name__} '{name}'")
+
+    def _unknown(self, interface: type[Component], name: str) -> str:
+        offered = sorted(self.components(interface))
+        hint = did_you_mean(name, offered)
+        broken = "".join(
+            f"; {p.distribution} {p.version} is {p.state}: {p.reason}"
+            for p in self.installed
+            if p.state != "ok"
+        )
+        return f"unknown type '{name}'{hint} (installed: {', '.join(offered)}){broken}"
+
+
+def _named(
+    plugins: Iterable[Plugin], interface: type[Component], name: str
+) -> list[tuple[Plugin, type[Component]]]:
+    return [
+        (plugin, component)
+        for plugin in plugins
+        for component in plugin.components
+        if issubclass(component, interface) and component.type_name() == name
+    ]
