@@ -1,0 +1,1 @@
+"""The experiment: read, checked, and kept with the places where it was written."""

@@ -1,0 +1,45 @@
+"""Turns what pydantic finds into one message: place, field, what is wrong, the nearest right."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.parts import brief
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces.naming import did_you_mean
+
+SHOWN = 8
+
+
+def report(error: ValidationError, source: Source) -> ExperimentError:
+    """The error to raise instead: a line a fault, the first few of them."""
+    faults = error.errors(include_url=False)
+    lines = [source.message(*_described(fault)) for fault in faults[:SHOWN]]
+    if len(faults) > SHOWN:
+        lines.append(f"... and {len(faults) - SHOWN} more")
+    return ExperimentError("\n".join(lines), _described(faults[0])[0])
+
+
+def located(error: ExperimentError, source: Source) -> ExperimentError:
+    """The same error with the place of its field in front."""
+    return ExperimentError(source.message(error.where, str(error)), error.where)
+
+
+def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
+    where, context = tuple(fault["loc"]), fault.get("ctx", {})
+    if "text" in context:
+        return (*where, context["key"]) if "key" in context else where, context["text"]
+    if fault["type"] == "missing":
+        return where, "is missing"
+    message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    if fault["type"] == "value_error":
+        return where, message
+    if fault["type"] == "string_pattern_mismatch":
+        message = "may hold letters, digits, '.', '_', '-' and '/', and no '..'"
+    hint = ""
+    if fault["type"] == "literal_error" and isinstance(fault["input"], str):
+        hint = did_you_mean(fault["input"], context["expected"].replace("'", "").split(" or "))
+    return where, f"{message}, got {brief(fault['input'])}{hint}"

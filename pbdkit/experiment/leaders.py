@@ -1,0 +1,68 @@
+"""Leader groups: who leads, how, and when. Selections are a closed family."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_serializer, model_validator
+
+from pbdkit.experiment.motions import AnyMotion
+from pbdkit.interfaces import Pair
+from pbdkit.interfaces.component import Strict
+
+Box = Annotated[tuple[float, float, float, float], Field(strict=False)]
+Numbers = Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
+Points = Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)]
+
+
+class Selection(Strict):
+    """Chooses body particles of the reference configuration, in one of four ways.
+
+    `edge`: the outermost of every row (left, right) or column (bottom, top); `box`: [xmin, ymin,
+    xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points.
+    """
+
+    edge: Literal["left", "right", "bottom", "top"] | None = None
+    box: Box | None = None
+    numbers: Numbers | None = None
+    nearest: Points | None = None
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Selection:
+        if len(self._given()) != 1:
+            raise ValueError("give exactly one of edge, box, numbers, nearest")
+        return self
+
+    def _given(self) -> dict[str, Any]:
+        names = type(self).model_fields
+        return {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+
+    @model_serializer
+    def _serialize(self) -> dict[str, Any]:
+        return self._given()
+
+
+class LeaderGroup(Strict):
+    """Particles that lead from step `from` to step `until`, both included, and follow otherwise.
+
+    The motion counts its steps from `from` and starts where the particle then is.
+    """
+
+    select: Selection
+    motion: AnyMotion
+    from_: Annotated[int, Field(ge=1, alias="from")] = 1
+    until: Annotated[int, Field(ge=1)] | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> LeaderGroup:
+        if self.until is not None and self.until < self.from_:
+            raise ValueError(f"until ({self.until}) is before from ({self.from_})")
+        return self
+
+    def leads(self, step: int) -> bool:
+        """Whether the group leads during that step."""
+        return self.from_ <= step and (self.until is None or step <= self.until)
+
+    def last(self, steps: int) -> int:
+        """The last step of a run of `steps` in which the group leads."""
+        return steps if self.until is None else min(self.until, steps)

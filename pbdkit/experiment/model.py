@@ -1,0 +1,141 @@
+"""The experiment: a validated description of a scene, and of what to do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, PrivateAttr, SerializeAsAny, StringConstraints, ValidationError
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.bodies import AnyBody
+from pbdkit.experiment.faults import located, report
+from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.parts import closed_part, open_part
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import (
+    Component,
+    Diagnostic,
+    FollowerRule,
+    FractureModel,
+    FramePolicy,
+    Lattice,
+    NeighbourMetric,
+)
+from pbdkit.interfaces.component import Strict
+from pbdkit.registry.registry import Registry
+
+_WORD = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
+Name = Annotated[str, StringConstraints(pattern=rf"^{_WORD}(/{_WORD})*$", max_length=200)]
+
+
+class Reference(Component):
+    """The run starts from the reference configuration."""
+
+    type: Literal["reference"] = "reference"
+
+
+class Stepping(Component):
+    """One step after the other.
+
+    `relaxation` w and `memory` b apply to any rule's move, for followers only:
+    x(t+1) = m + w · move + b · (x(t) - x(t-1)).
+    """
+
+    type: Literal["stepping"] = "stepping"
+    relaxation: Annotated[float, Field(gt=0.0)] = 1.0
+    memory: float = 0.0
+
+
+class Record(Strict):
+    """What is kept: every so many steps; time 0 and the last step always."""
+
+    every: Annotated[int, Field(ge=1)] = 1
+
+    def keeps(self, step: int, steps: int) -> bool:
+        """Whether that step of a run of `steps` is recorded."""
+        return step % self.every == 0 or step == steps
+
+    def count(self, steps: int) -> int:
+        """How many steps of a run of `steps` are recorded."""
+        return steps // self.every + 1 + (steps % self.every > 0)
+
+
+AnyLattice = Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
+AnyNeighbours = Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)]
+AnyRule = Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
+AnyFrame = Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)]
+AnyFracture = Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)]
+AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
+AnyInitial = Annotated[SerializeAsAny[Reference], closed_part(Reference, Reference)]
+AnySolver = Annotated[SerializeAsAny[Stepping], closed_part(Stepping, Stepping)]
+
+
+def _default(part: str) -> Any:
+    # As in a file, so that it is resolved like one, and `--set` can start from it.
+    return Field(default={"type": part})
+
+
+class Experiment(Strict):
+    """A scene and what to do with it, checked as a whole: the same from a file, dict or objects.
+
+    Raises ExperimentError, which names the field and the remedy, for anything that is not right,
+    and PluginError where a part is asked of a distribution that is missing or broken.
+    """
+
+    version: Literal[1] = 1
+    name: Name
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    lattice: AnyLattice
+    body: AnyBody
+    neighbours: AnyNeighbours = _default("coordination")
+    rule: AnyRule
+    frame: AnyFrame = _default("mean")
+    fracture: AnyFracture = _default("none")
+    initial: AnyInitial = _default("reference")
+    leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
+    steps: Annotated[int, Field(ge=1, lt=2**62)]
+    record: Record = Field(default_factory=Record)
+    diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
+    solver: AnySolver = _default("stepping")
+
+    _source: Source = PrivateAttr(default_factory=Source)
+    _registry: Registry = PrivateAttr()
+
+    def __init__(self, **parts: Any) -> None:
+        self._validate(parts, Registry(), Source())
+
+    @classmethod
+    def build(cls, source: Source, components: Iterable[type[Component]] = ()) -> Self:
+        """The experiment of a source, with components handed over besides the installed ones."""
+        experiment = cls.__new__(cls)
+        experiment._validate(source.data, Registry(components), source)
+        return experiment
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """The parts that a file may leave out, as it would write them."""
+        fields = cls.model_fields.items()
+        return {name: f.default for name, f in fields if isinstance(f.default, dict)}
+
+    def components(self) -> list[Component]:
+        """Every part of an open interface."""
+        parts = [self.lattice, self.neighbours, self.rule, self.frame, self.fracture]
+        return [*parts, *self.diagnostics]
+
+    def distributions(self) -> dict[str, str]:
+        """The distributions that the parts come from, with their versions."""
+        return self._registry.versions(self.components())
+
+    def located(self, error: ExperimentError) -> ExperimentError:
+        """The error with the place of its field in the file."""
+        return located(error, self._source)
+
+    def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
+        try:
+            self.__pydantic_validator__.validate_python(
+                parts, self_instance=self, context={"registry": registry}
+            )
+        except ValidationError as error:
+            raise report(error, source) from None
+        self._registry, self._source = registry, source

@@ -1,0 +1,75 @@
+"""Fields of an experiment that hold a part: {type: ..., its parameters} becomes an object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pydantic import BeforeValidator, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import Component
+from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.registry.registry import Registry
+
+Finder = Callable[[str], type[Component]]
+
+
+def open_part(interface: type[Component]) -> BeforeValidator:
+    """The part is a component of an open interface, found in the registry.
+
+    The registry comes in the validation context, so that components handed over in Python count.
+    """
+
+    def build(value: Any, info: ValidationInfo) -> Any:
+        registry: Registry = (info.context or {}).get("registry") or Registry()
+        return _build(value, interface, lambda name: registry.find(interface, name), info)
+
+    return BeforeValidator(build)
+
+
+def closed_part(base: type[Component], *members: type[Component]) -> BeforeValidator:
+    """The part is one of a fixed list of classes, told apart by `type`."""
+    by_name = {member.type_name(): member for member in members}
+
+    def find(name: str) -> type[Component]:
+        if name not in by_name:
+            hint = did_you_mean(name, by_name)
+            raise ExperimentError(f"unknown type '{name}'{hint} (known: {', '.join(by_name)})")
+        return by_name[name]
+
+    return BeforeValidator(lambda value, info: _build(value, base, find, info))
+
+
+def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo) -> Any:
+    if isinstance(value, base):
+        return value
+    if not isinstance(value, dict):
+        raise fault(f"expected {{type: ..., its parameters}}, got {brief(value)}")
+    name = value.get("type")
+    if name is None:
+        raise fault("`type` is missing")
+    if not isinstance(name, str):
+        raise fault(f"expected a word, got {brief(name)}", key="type")
+    try:
+        part = find(name)
+    except ExperimentError as error:
+        raise fault(str(error), key="type") from None
+    parameters = {k: v for k, v in value.items() if k != "type"}
+    return part.model_validate(parameters, context=info.context)
+
+
+def fault(text: str, **where: Any) -> PydanticCustomError:
+    """An error for pydantic to carry: `text` for the user, `key` where a key of it is meant."""
+    return PydanticCustomError("fault", "{text}", {"text": text, **where})
+
+
+def brief(value: Any) -> str:
+    """The value as users wrote it, cut where it is long."""
+    if isinstance(value, (dict, list, tuple)) and len(value) > 4:
+        return f"a {'map' if isinstance(value, dict) else 'list'} of {len(value)}"
+    if isinstance(value, int) and abs(value) > 10**20:
+        return "a huge integer"
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."

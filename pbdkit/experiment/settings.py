@@ -1,0 +1,56 @@
+"""``--set PATH=VALUE``: changes one value of an experiment's raw data."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.source import Source, Where, read_value
+
+
+def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> Source:
+    """A copy of the source with one value set.
+
+    `setting` is ``path=value`` with a dotted path, list positions from 0 and a YAML value. A part
+    that the file leaves out starts from its entry in `defaults`.
+    """
+    label = f"--set {setting}"
+    path, equals, value = setting.partition("=")
+    if not equals or not path:
+        raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
+    where = _parsed(path)
+    changed = Source(source.name, copy.deepcopy(source.data), dict(source.places))
+    _place(changed.data, where, read_value(value, label), label, defaults)
+    for known in [k for k in changed.places if k[: len(where)] == where]:
+        del changed.places[known]
+    changed.places[where] = label
+    return changed
+
+
+def _parsed(path: str) -> Where:
+    return tuple(int(part) if part.isdigit() else part for part in path.split("."))
+
+
+def _place(data: Any, where: Where, value: Any, label: str, defaults: Mapping[str, Any]) -> None:
+    *parents, last = where
+    for depth, part in enumerate(parents):
+        if isinstance(data, dict) and part not in data:
+            data[part] = copy.deepcopy(defaults.get(str(part), {})) if depth == 0 else {}
+        data = _entry(data, part, label)
+    if isinstance(data, dict):
+        data[str(last)] = value
+    else:
+        _entry(data, last, label)
+        data[last] = value
+
+
+def _entry(data: Any, part: str | int, label: str) -> Any:
+    if isinstance(data, dict):
+        return data[part if part in data else str(part)]
+    if not isinstance(data, list):
+        raise ExperimentError(f"{label}: '{part}' is looked for in a single value")
+    if not isinstance(part, int) or part >= len(data):
+        raise ExperimentError(f"{label}: '{part}' is no position in a list of {len(data)}, from 0")
+    return data[part]
