@@ -1,0 +1,84 @@
+"""The bonds of a scene: which exist, which can break, and their table in the dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
+from pbdkit.scene.raster import EMPTY, FOLLOWER, Block, Raster
+
+
+@dataclass(frozen=True)
+class BondTable:
+    """A row a bond, sorted: `ends` (bond, 2) are rows of the particle table, lower first, `shell`
+    counts from 1. `plane` and `place` tell where its state lives: plane[bond] of the
+    neighbourhood's planes, at the flat place of the plane's source within its sublattice."""
+
+    ends: NDArray[np.int64]
+    shell: NDArray[np.int8]
+    plane: Indices
+    place: Indices
+
+
+def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
+    """The block of source places of every bond of a plane with an end in the body."""
+    forward = raster.body_block(plane.slot.source)
+    landed = raster.body_block(plane.slot.target)
+    backward = landed.seen_through(plane.opposite) if landed else None
+    blocks = [b for b in (forward, backward) if b]
+    if not blocks:
+        return None
+    start = (min(b.start[0] for b in blocks), min(b.start[1] for b in blocks))
+    stop = (max(b.stop[0] for b in blocks), max(b.stop[1] for b in blocks))
+    return Block(plane.slot.source, start, stop)
+
+
+def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> NDArray[np.bool_]:
+    """Where in the block of a plane a bond starts: both ends are particles, at least one of the
+    body, or both where bonds to the frame are left out."""
+    here = raster.kind[block.slices()]
+    there = raster.kind[block.seen_through(plane.slot).slices()]
+    found: NDArray[np.bool_] = (here == FOLLOWER) & (there == FOLLOWER)
+    if frame_too:
+        found = (here == FOLLOWER) & (there != EMPTY) | (here != EMPTY) & (there == FOLLOWER)
+    return found
+
+
+def count_bonds(raster: Raster, neighbourhood: Neighbourhood) -> int:
+    """The number of bonds with at least one end in the body."""
+    blocks = [(plane, plane_block(raster, plane)) for plane in neighbourhood.planes]
+    return sum(int(bonds_in(raster, b, plane, True).sum()) for plane, b in blocks if b)
+
+
+def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
+    """The table of all bonds."""
+    parts = [
+        _bonds_of_plane(raster, n, plane, block)
+        for n, plane in enumerate(neighbourhood.planes)
+        if (block := plane_block(raster, plane))
+    ]
+    lower, upper, shell, number, place = (np.concatenate(p) for p in zip(*parts, strict=True))
+    order = np.lexsort((upper, lower))
+    ends = np.stack([lower, upper], axis=1)[order].astype(np.int64)
+    return BondTable(ends, shell[order].astype(np.int8), number[order], place[order])
+
+
+def _bonds_of_plane(
+    raster: Raster, number: int, plane: BondPlane, block: Block
+) -> tuple[Indices, Indices, Indices, Indices, Indices]:
+    m, n = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
+    m, n = m + block.start[0], n + block.start[1]
+    here = _flat(raster, plane.slot.source, m, n)
+    there = _flat(raster, plane.slot.target, m + plane.slot.cell[0], n + plane.slot.cell[1])
+    a, b = raster.row_at[here], raster.row_at[there]
+    within = np.ravel_multi_index((m, n), raster.shape[1:])
+    shell = np.full(len(a), plane.slot.shell)
+    return np.minimum(a, b), np.maximum(a, b), shell, np.full(len(a), number), within
+
+
+def _flat(raster: Raster, sublattice: int, m: Indices, n: Indices) -> Indices:
+    return np.ravel_multi_index((np.full(len(m), sublattice), m, n), raster.shape)

@@ -1,0 +1,96 @@
+"""The frame of a scene: which body particles each of its points is nearest to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.lattice import Offset
+from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame's points and their map on the raster: u[place[point]] = Σ weight · u[body]."""
+
+    place: Indices
+    map: FrameMap
+    body_place: Indices
+
+
+def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
+    """The policy's map for this raster; None where the scene has no frame."""
+    rows = np.flatnonzero(raster.table_kind == FRAME)
+    if not len(rows):
+        return None
+    follow = policy.follow(RasterFrame(raster, rows))
+    alone = np.setdiff1d(np.arange(len(rows)), follow.point)
+    if len(alone):
+        raise ExperimentError(
+            f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
+            "and it would anchor the body",
+            ("frame",),
+        )
+    return Frame(raster.place[rows], follow, raster.place[follow.body])
+
+
+@dataclass(frozen=True)
+class RasterFrame(FrameSites):
+    """The frame points of a raster; `frame_rows` are their rows in the table."""
+
+    raster: Raster
+    frame_rows: Indices
+
+    def nearest(self) -> tuple[Indices, Indices]:
+        """Searches outwards from every frame point, shell of sites by shell, until all have met
+        the body and every tie is in."""
+        sublattice = self.raster.cells()[0][self.frame_rows]
+        pairs = [
+            self._nearest_of(s, np.flatnonzero(sublattice == s)) for s in np.unique(sublattice)
+        ]
+        point, body = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        order = np.lexsort((body, point))
+        return point[order], body[order]
+
+    def _nearest_of(self, sublattice: int, points: Indices) -> tuple[Indices, Indices]:
+        cell = self.raster.lattice.cell()
+        nearest = np.full(len(points), np.inf)
+        searched, radius = 0.0, max(math.hypot(*v) for v in cell.vectors)
+        pairs = []
+        while (_with_ties(nearest) > searched).any():
+            for offset in cell.offsets(sublattice, radius):
+                if offset.length > searched:
+                    pairs.append(self._met_at(offset, points, nearest))
+            searched, radius = radius, radius * 1.5
+        point, body = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        return point, body
+
+    def _met_at(self, offset: Offset, points: Indices, nearest: Floats) -> tuple[Indices, Indices]:
+        """The points with a body particle at that offset and none nearer; notes the distance."""
+        open_ = np.flatnonzero(offset.length <= _with_ties(nearest))
+        places = self.raster.place[self.frame_rows[points[open_]]]
+        _, m, n = np.unravel_index(places, self.raster.shape)
+        m, n = m + offset.cell[0], n + offset.cell[1]
+        _, m_count, n_count = self.raster.shape
+        inside = (m >= 0) & (m < m_count) & (n >= 0) & (n < n_count)
+        open_, m, n = open_[inside], m[inside], n[inside]
+        met = self.raster.kind[offset.target, m, n] == FOLLOWER
+        open_, m, n = open_[met], m[met], n[met]
+        nearest[open_] = np.minimum(nearest[open_], offset.length)
+        target = np.full(len(m), offset.target)
+        return points[open_], self.raster.row_at[
+            np.ravel_multi_index((target, m, n), self.raster.shape)
+        ]
+
+
+def _with_ties(distance: Floats) -> Floats:
+    """The distance up to which another particle counts as equally near (model.md, section 7)."""
+    return distance * (1 + 1e-9) + 1e-12

@@ -1,0 +1,137 @@
+"""Leader groups on a raster: who leads when, and where to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.leaders import LeaderGroup, Selection
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
+
+
+@dataclass(frozen=True)
+class Leading:
+    """A leader group with the rows and places of its particles."""
+
+    group: LeaderGroup
+    rows: Indices
+    place: Indices
+
+
+def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> tuple[Leading, ...]:
+    """Every group with its particles.
+
+    Raises ExperimentError for a group that selects nobody or a frame point, and for groups that
+    move one particle differently in the same step.
+    """
+    found = []
+    for n, group in enumerate(groups):
+        rows = select(raster, group.select, ("leaders", n, "select"))
+        found.append(Leading(group, rows, raster.place[rows]))
+    for n, later in enumerate(found):
+        for k, earlier in enumerate(found[:n]):
+            _refuse_contradiction((k, earlier), (n, later), steps)
+    return tuple(found)
+
+
+def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
+    """(particle,): the kind of every particle during a step; at time 0 that of step 1."""
+    kinds = raster.table_kind.copy()
+    for leaders in leading:
+        if leaders.group.leads(max(step, 1)):
+            kinds[leaders.rows] = LEADER
+    return kinds
+
+
+def select(raster: Raster, selection: Selection, where: tuple[str | int, ...]) -> Indices:
+    """The rows of the selected body particles, sorted."""
+    if selection.edge is not None:
+        rows = _edge(raster, selection.edge)
+    elif selection.box is not None:
+        rows = _box(raster, selection.box)
+    elif selection.numbers is not None:
+        rows = _numbers(raster, selection.numbers, (*where, "numbers"))
+    else:
+        rows = _nearest(raster, selection.nearest or ())
+    if not len(rows):
+        low, high = (np.round(f(raster.reference(raster.body_rows), axis=0), 6).tolist()
+                     for f in (np.min, np.max))  # fmt: skip
+        raise ExperimentError(f"selects no particle; the body reaches from {low} to {high}", where)
+    return np.unique(rows)
+
+
+def _edge(raster: Raster, edge: str) -> Indices:
+    """The body particle of smallest or largest i in every row j, or j in every column i."""
+    body = raster.body_rows
+    along, line = raster.site[body].T if edge in ("left", "right") else raster.site[body].T[::-1]
+    if edge in ("right", "top"):
+        along = -along
+    order = np.lexsort((along, line))
+    _, first = np.unique(line[order], return_index=True)
+    return body[order[first]]
+
+
+def _box(raster: Raster, box: tuple[float, float, float, float]) -> Indices:
+    slack = 1e-9 * math.hypot(*raster.lattice.cell().vectors[0])
+    low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
+    x = raster.reference(raster.body_rows)
+    return raster.body_rows[((x >= low) & (x <= high)).all(axis=1)]
+
+
+def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
+    for n, number in enumerate(numbers):
+        if number > raster.count:
+            raise ExperimentError(
+                f"there is no particle {number}; they are numbered 1 to {raster.count}", (*where, n)
+            )
+        if raster.table_kind[number - 1] != FOLLOWER:
+            raise ExperimentError(
+                f"particle {number} is a frame point: only body particles can lead", (*where, n)
+            )
+    return np.array(numbers, np.intp) - 1
+
+
+def _nearest(raster: Raster, points: Iterable[tuple[float, float]]) -> Indices:
+    body = raster.body_rows
+    x = raster.reference(body)
+    found = []
+    for point in points:
+        distance = np.hypot(x[:, 0] - point[0], x[:, 1] - point[1])
+        ties = distance <= distance.min() * (1 + 1e-9) + 1e-12
+        found.append(body[np.argmax(ties)])
+    return np.array(found, np.intp)
+
+
+def _refuse_contradiction(
+    first: tuple[int, Leading], second: tuple[int, Leading], steps: int
+) -> None:
+    """Compares what two groups prescribe in every step in which both lead one particle."""
+    (k, a), (n, b) = first, second
+    if b.group.from_ < a.group.from_:
+        a, b = b, a
+    shared = np.intersect1d(a.rows, b.rows)
+    begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
+    if not len(shared) or begin > end:
+        return
+    settled = begin + max(a.group.motion.settles(), b.group.motion.settles())
+    # b starts where a, which led the particle just before unless both begin together, left it.
+    start = _offset(a.group, begin - 1)
+    for step in range(begin, min(end, settled) + 1):
+        one, other = _offset(a.group, step), start + _offset(b.group, step)
+        if np.abs(one - other).max() > 1e-12 * max(1.0, np.abs(one).max()):
+            raise ExperimentError(
+                f"moves particle {shared[0] + 1} in step {step} otherwise than leaders.{k} does; "
+                "select it in one of them only, or let one end before the other begins",
+                ("leaders", n),
+            )
+
+
+def _offset(group: LeaderGroup, step: int) -> NDArray[np.float64]:
+    n = step - group.from_ + 1
+    return np.array(group.motion.offset(n) if n >= 1 else (0.0, 0.0))

@@ -1,0 +1,88 @@
+"""How large a scene is, before anything of it is allocated."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Diagnostic
+from pbdkit.interfaces.lattice import Index
+from pbdkit.scene.neighbourhood import Neighbourhood
+
+MIB = 2**20
+WORKSPACE_BYTES = 60
+"""Per particle, what building the tables takes at its peak besides what stays."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Estimates: particles (frame included), bytes of the scene while it runs, bytes of its
+    output. The output is in memory too where a run returns a dataset instead of writing a file."""
+
+    particles: int
+    memory: int
+    output: int
+
+
+def estimate(
+    experiment: Experiment, neighbourhood: Neighbourhood, window: Index, layers: int
+) -> Sizes:
+    """From the window of site indices that the body fills at most, with Python's integers."""
+    cell = experiment.lattice.cell()
+    share = len(cell.sites) / (cell.period[0] * cell.period[1])
+    particles = math.ceil((window[0] + 2 * layers) * (window[1] + 2 * layers) * share)
+    return sizes_of(experiment, neighbourhood, particles)
+
+
+def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
+    """The same for a known number of particles."""
+    planes = len(neighbourhood.planes) / len(neighbourhood.slots)
+    state = 2 * 2 * 8 + experiment.fracture.can_break * planes * (4 + 1)
+    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
+    records = experiment.record.count(experiment.steps)
+    per_record = particles * (2 * 8 + 1) + sum(
+        _bytes_a_record(d, particles) for d in experiment.diagnostics if not d.every_step
+    )
+    every_step = sum(_bytes_a_record(d, particles) for d in experiment.diagnostics if d.every_step)
+    once = particles * (2 * 8 + 2 * 4 + 2 * 8)
+    if experiment.fracture.can_break or any(d.uses_bonds for d in experiment.diagnostics):
+        once += math.ceil(particles * planes * (2 * 8 + 1 + 4))
+    output = once + records * per_record + (experiment.steps + 1) * every_step
+    return Sizes(particles, memory, output)
+
+
+def refuse_too_large(
+    experiment: Experiment, neighbourhood: Neighbourhood, window: Index, layers: int
+) -> None:
+    """Raises ExperimentError where the scene cannot fit into the memory of this machine."""
+    sizes = estimate(experiment, neighbourhood, window, layers)
+    available = machine_memory()
+    if sizes.memory > available:
+        raise ExperimentError(
+            f"{sizes.particles:.3g} particles need about {sizes.memory / 2**30:.3g} GiB and this "
+            f"machine has {available / 2**30:.3g}; make it smaller",
+            ("body",),
+        )
+
+
+def machine_memory() -> int:
+    """The physical memory in bytes; what cannot be asked is taken as 16 GiB."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 16 * 2**30
+
+
+def _bytes_a_record(diagnostic: Diagnostic, particles: int) -> int:
+    sizes = {"particle": particles, "axis": 2}
+    sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
+    return sum(
+        math.prod(sizes[dim] for dim in v.dims) * np.dtype(v.dtype).itemsize
+        for v in diagnostic.variables()
+    )

@@ -1,0 +1,1 @@
+"""The stepper: from the state at one step to the state at the next."""

@@ -1,0 +1,61 @@
+"""Breaking bonds, and what stands in for the lost neighbours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import FractureModel, Slot, Vector, where
+from pbdkit.scene.bonds import bonds_in, plane_block
+from pbdkit.scene.raster import Block
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.parameters import named
+from pbdkit.stepping.sums import difference
+
+Steps = NDArray[np.int32]
+
+
+class Fracturing:
+    """The fracture model of a scene on its planes of bonds."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._model: FractureModel = scene.experiment.fracture
+        self._parameters = named(self._model.parameters())
+        self._breakable = []
+        self._plane_of: dict[Slot, tuple[int, bool]] = {}
+        frame_too = self._model.breaks_frame_bonds()
+        for n, plane in enumerate(scene.neighbourhood.planes):
+            self._plane_of |= {plane.slot: (n, True), plane.opposite: (n, False)}
+            if block := plane_block(scene.raster, plane):
+                where_ = bonds_in(scene.raster, block, plane, frame_too)
+                constants = self._model.constants(plane.slot)
+                self._breakable.append((n, plane.slot, block, where_, constants))
+
+    def break_bonds(self, m: NDArray[Any], broken_step: Steps, step: int) -> None:
+        """Marks, in place, the bonds that break in the intermediate configuration m."""
+        for n, slot, block, breakable, constants in self._breakable:
+            _, rows, columns = block.slices()
+            plane = broken_step[n, rows, columns]
+            d = difference(m, block, slot)
+            breaks = self._model.breaks(d, slot.rest, constants, self._parameters)
+            plane[breakable & (plane < 0) & breaks] = step
+
+    def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, broken_step: Steps) -> Vector:
+        """The difference that the rule sees: that of the fictitious point where the bond broke."""
+        broken = self.broken(block, slot, broken_step)
+        if not broken.any():
+            return d
+        lost = self._model.fictitious(u, slot.rest, self._parameters)
+        return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
+
+    def broken(self, block: Block, slot: Slot, broken_step: Steps) -> NDArray[np.bool_]:
+        """Where on the block the bond along a slot is broken.
+
+        A bond lives on the plane of its positive slot: at this end or at the other.
+        """
+        n, positive = self._plane_of[slot]
+        _, rows, columns = (block if positive else block.seen_through(slot)).slices()
+        broken: NDArray[np.bool_] = broken_step[n, rows, columns] >= 0
+        return broken
