@@ -1,0 +1,122 @@
+"""The run at the end of a step, as the dataset and the diagnostics see it: a row a particle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Moment, Slot, Vector
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.fracturing import Fracturing
+from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.sums import difference, presence, sum_over_slots
+
+
+class Tables:
+    """What every moment of a scene shares: the reference, and who is present around whom."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.raster = scene.raster
+
+    @cached_property
+    def reference(self) -> Floats:
+        """X, (particle, axis)."""
+        return self.raster.reference()
+
+    @cached_property
+    def fracturing(self) -> Fracturing | None:
+        """The planes of bonds, where bonds can break."""
+        return Fracturing(self.scene) if self.scene.has_fracture else None
+
+    @cached_property
+    def blocks(self) -> list[tuple[Any, ...]]:
+        """(block, slots, presence) of the body's particles of each sublattice."""
+        slots = self.scene.neighbourhood.slots
+        blocks = [self.raster.body_block(s) for s in range(self.raster.shape[0])]
+        return [
+            (b, slots[b.sublattice], presence(self.raster, b, slots[b.sublattice]))
+            for b in blocks
+            if b
+        ]
+
+
+class StateMoment(Moment):
+    """A state as a table."""
+
+    def __init__(self, state: State, tables: Tables) -> None:
+        self.step = state.step
+        self._state = state
+        self._tables = tables
+
+    @cached_property
+    def _u(self) -> Floats:
+        return self._table(self._state.u)
+
+    def _table(self, u: Floats, rows: Indices | slice = slice(None)) -> Floats:
+        place = self._tables.raster.place[rows]
+        return np.stack([plane.ravel()[place] for plane in u], axis=1)
+
+    def rows(self, numbers: tuple[int, ...]) -> Indices:
+        """Numbers count from 1 in the order of the rows."""
+        return np.array(numbers, np.intp) - 1
+
+    def displacement(self, rows: Indices | None = None) -> Floats:
+        """The whole table is made once a moment; a few rows are made without it."""
+        return self._u if rows is None else self._table(self._state.u, rows)
+
+    def previous_displacement(self) -> Floats:
+        """From the buffer of the step before."""
+        return self._table(self._state.previous)
+
+    def reference(self, rows: Indices | None = None) -> Floats:
+        """X."""
+        return self._tables.reference if rows is None else self._tables.reference[rows]
+
+    def position(self) -> Floats:
+        """x = X + u, (particle, axis)."""
+        position: Floats = self._tables.reference + self._u
+        return position
+
+    def kind(self) -> NDArray[np.int8]:
+        """(particle,): the role during this step."""
+        return kinds_at(self._tables.raster, self._tables.scene.leading, self.step)
+
+    def broken_bonds(self) -> int:
+        """Every bond that breaks is marked on one plane, once."""
+        broken = self._state.broken_step
+        return 0 if broken is None else int((broken >= 0).sum())
+
+    def broken_step(self) -> NDArray[np.int32]:
+        """(bond,): the step at which each bond broke, -1 where it has not."""
+        bonds, broken = self._tables.scene.bonds, self._state.broken_step
+        assert broken is not None
+        return broken.reshape(len(broken), -1)[bonds.plane, bonds.place]
+
+    def sum_over_neighbours(
+        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+    ) -> Floats:
+        """The loop of the stepper, on the body's particles."""
+        raster, state = self._tables.raster, self._state
+        fracturing = self._tables.fracturing if intact_only else None
+        sums = np.zeros(raster.shape)
+        for block, slots, present in self._tables.blocks:
+
+            def contribution(slot: Slot, block: Any = block) -> tuple[Any, ...]:
+                value = function(difference(state.u, block, slot), slot.rest)
+                if fracturing is None or state.broken_step is None:
+                    return (value,)
+                broken = fracturing.broken(block, slot, state.broken_step)
+                return (np.where(broken, 0.0, value),)
+
+            (total,) = sum_over_slots(slots, present, contribution)
+            body = raster.kind[block.slices()] == FOLLOWER
+            sums[block.slices()] = np.where(body, total, 0.0)
+        return sums.ravel()[raster.place]

@@ -1,0 +1,51 @@
+"""A progress bar on a terminal, for what takes over a second."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+PATIENCE_S = 1.0
+REFRESH_S = 0.1
+
+
+@contextmanager
+def progress_bar(steps: int, wanted: bool) -> Iterator[Callable[[int], None]]:
+    """Yields a function to be told each step; it draws on stderr once a second has passed."""
+    bar: Any = None
+    due = time.perf_counter() + PATIENCE_S
+
+    def show(step: int) -> None:
+        nonlocal bar, due
+        if not wanted or time.perf_counter() < due:
+            return
+        if bar is None:
+            bar = _new_bar(steps)
+        due = time.perf_counter() + REFRESH_S
+        bar.update(bar.task_ids[0], completed=step)
+
+    try:
+        yield show
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def _new_bar(steps: int) -> Any:
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn, TimeRemainingColumn
+
+    count = TextColumn("step {task.completed:.0f} of {task.total:.0f}")
+    bar = Progress(
+        *Progress.get_default_columns()[:2],
+        count,
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+        transient=True,
+    )
+    bar.start()
+    bar.add_task("stepping", total=steps)
+    return bar

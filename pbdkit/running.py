@@ -1,0 +1,123 @@
+"""Runs experiments: from a file, a dict or an object to a dataset in memory or in a file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pbdkit.errors import DivergedError, ExperimentError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.settings import with_setting
+from pbdkit.experiment.shipped import read_experiment
+from pbdkit.experiment.source import Source, read_text
+from pbdkit.interfaces import Component
+from pbdkit.results.memory import MemorySink
+from pbdkit.results.progress import progress_bar
+from pbdkit.results.recorder import Outcome, Recorder, Sink
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+if TYPE_CHECKING:
+    import xarray
+
+Progress = Callable[[int], None]
+Components = Iterable[type[Component]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a run went, for those who look at its cost."""
+
+    outcome: Outcome
+    particles: int
+    wall_s: float
+
+
+def load(
+    name: str | Path, *, components: Components = (), settings: Iterable[str] = ()
+) -> Experiment:
+    """The experiment in a YAML file, or the shipped one of that name, e.g. "paper/a".
+
+    `settings` are changes such as "rule.K=-0.002"; `components` are classes from Python that the
+    experiment may name besides the installed ones. Raises ExperimentError and PluginError.
+    """
+    source = read_experiment(str(name))
+    for setting in settings:
+        source = with_setting(source, setting, Experiment.defaults())
+    return Experiment.build(source, components)
+
+
+def run(
+    experiment: Experiment | Mapping[str, Any] | str | Path,
+    *,
+    components: Components = (),
+    progress: bool = True,
+) -> xarray.Dataset:
+    """Runs an experiment and returns its dataset; nothing is written.
+
+    `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
+    ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
+    DivergedError, with what was recorded before, when the run leaves the finite numbers.
+    """
+    sink = MemorySink()
+    report = run_into(sink, build_scene(_experiment(experiment, components)), progress)
+    dataset = sink.dataset()
+    if report.outcome.status == "diverged":
+        raise DivergedError(report.outcome.stop_reason, dataset)
+    return dataset
+
+
+def rerun(
+    dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
+) -> xarray.Dataset:
+    """The same run again, bit for bit, from the experiment that the dataset carries."""
+    if "experiment" not in dataset.attrs:
+        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
+    source = read_text(dataset.attrs["experiment"], "dataset")
+    return run(Experiment.build(source, components), progress=progress)
+
+
+def run_into(sink: Sink, scene: Scene, progress: bool) -> Report:
+    """Steps the scene to its end and records it into the sink."""
+    recorder = Recorder(scene, sink)
+    begun = time.perf_counter()
+    recorder.begin()
+    try:
+        with progress_bar(scene.experiment.steps, progress) as show:
+            outcome = _step_through(scene, recorder, show)
+    except BaseException:
+        sink.abandon()
+        raise
+    return Report(outcome, scene.raster.count, time.perf_counter() - begun)
+
+
+def _step_through(scene: Scene, recorder: Recorder, show: Progress) -> Outcome:
+    steps, stepper, state = scene.experiment.steps, Stepper(scene), initial_state(scene)
+    outcome = Outcome("complete", "all steps done", steps)
+    try:
+        recorder.observe(state)
+        while state.step < steps:
+            state = stepper.advance(state)
+            recorder.observe(state)
+            show(state.step)
+    except FloatingPointError as error:
+        reason = f"{error} left the finite numbers under rule '{scene.experiment.rule.type}'"
+        outcome = Outcome("diverged", reason, state.step)
+    except KeyboardInterrupt:
+        outcome = Outcome("interrupted", f"interrupted after step {state.step}", state.step)
+    recorder.finish(state, outcome)
+    return outcome
+
+
+def _experiment(
+    given: Experiment | Mapping[str, Any] | str | Path, components: Components
+) -> Experiment:
+    if isinstance(given, Experiment):
+        return given
+    if isinstance(given, Mapping):
+        return Experiment.build(Source(data=dict(given)), components)
+    return load(given, components=components)
