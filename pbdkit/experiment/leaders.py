@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_serializer, model_validator
+from pydantic import ConfigDict, Field, model_serializer, model_validator
 
 from pbdkit.experiment.motions import AnyMotion
 from pbdkit.interfaces import Pair
@@ -21,6 +21,8 @@ class Selection(Strict):
     `edge`: the outermost of every row (left, right) or column (bottom, top); `box`: [xmin, ymin,
     xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points.
     """
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
 
     edge: Literal["left", "right", "bottom", "top"] | None = None
     box: Box | None = None

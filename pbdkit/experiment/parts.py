@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Union
 
 from pydantic import BeforeValidator, ValidationInfo
 from pydantic_core import PydanticCustomError
@@ -39,7 +39,10 @@ def closed_part(base: type[Component], *members: type[Component]) -> BeforeValid
             raise ExperimentError(f"unknown type '{name}'{hint} (known: {', '.join(by_name)})")
         return by_name[name]
 
-    return BeforeValidator(lambda value, info: _build(value, base, find, info))
+    return BeforeValidator(
+        lambda value, info: _build(value, base, find, info),
+        json_schema_input_type=Union[members],  # noqa: UP007
+    )
 
 
 def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo) -> Any:

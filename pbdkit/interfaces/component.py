@@ -49,6 +49,11 @@ class Strict(BaseModel):
         return data
 
 
+def _require_type(schema: dict[str, Any]) -> None:
+    # `type` has a default in Python, but a file tells the components apart by it.
+    schema["required"] = ["type", *(k for k in schema.get("required", ()) if k != "type")]
+
+
 class Component(Strict, ABC):
     """A frozen, validated set of parameters together with the behaviour that they drive.
 
@@ -59,6 +64,8 @@ class Component(Strict, ABC):
 
     A component holds no run state: what it must remember travels in the state of the stepper.
     """
+
+    model_config = ConfigDict(json_schema_extra=_require_type)
 
     type: str
 

@@ -57,11 +57,14 @@ class Registry:
             raise ExperimentError(self._unknown(interface, name))
         return found[0][1]
 
-    def components(self, interface: type[Component]) -> dict[str, type[Component]]:
-        """Every usable component of an interface by type, third parties' included."""
+    def components(
+        self, interface: type[Component], *, installed: bool = True
+    ) -> dict[str, type[Component]]:
+        """Every usable component of an interface by type; third parties' too if `installed`."""
+        plugins = self.plugins if installed else [self._builtin, self._given]
         return {
             component.type_name(): component
-            for plugin in reversed(self.plugins)
+            for plugin in reversed(plugins)
             for component in plugin.components
             if issubclass(component, interface)
         }

@@ -80,7 +80,7 @@ def bond_columns() -> list[Column]:
     """The table of bonds, where fracture or a diagnostic uses it."""
     ends = "the two particles of the bond, as positions along `particle` from 0, lower first"
     return [
-        Column("bond", ("bond", "end"), "i8", When.START, _described(ends)),
+        Column("bond", ("bond", "end"), "i8", When.START, _described(ends), True),
         Column("shell", ("bond",), "i1", When.START, _described("shell of the bond, from 1")),
     ]
 

@@ -1,0 +1,96 @@
+"""The command line. Commands load what they need when they run: `--help` costs next to nothing."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from importlib import import_module
+from typing import Any
+
+import click
+
+COMMANDS = {
+    "run": "run",
+    "check": "check",
+    "experiments": "experiments",
+    "init": "experiments",
+    "plot": "plot",
+    "plugins": "plugins",
+    "schema": "schema",
+}
+"""Every command with the module of pbdkit.cli in which it stands."""
+
+
+class Commands(click.Group):
+    """A group whose commands are imported when first needed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the order of a first session."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """The command of that name."""
+        if name not in COMMANDS:
+            return None
+        command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
+        return command
+
+
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    invoke_without_command=True,
+    epilog="Start with `pbdkit run paper/a`, or `pbdkit init` for an experiment of your own.",
+)
+@click.option("--debug", is_flag=True, help="Show a traceback where something fails.")
+@click.version_option(package_name="pbdkit")
+@click.pass_context
+def program(context: click.Context, debug: bool) -> None:
+    """Position-based dynamics of deformable bodies on lattices: rules instead of forces."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
+    broken plugin, 4 diverged, 6 storage failed, 130 interrupted."""
+    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
+    except click.exceptions.Abort:
+        code = _failed("interrupted", 130)
+    except KeyboardInterrupt:
+        code = _failed("interrupted", 130)
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except Exception as error:
+        if "--debug" in given:
+            traceback.print_exc()
+        code = _report(error)
+    sys.exit(code or 0)
+
+
+def _report(error: Exception) -> int:
+    from pbdkit import errors
+
+    codes = {
+        errors.ExperimentError: 2,
+        errors.PluginError: 3,
+        errors.DivergedError: 4,
+        errors.StorageError: 6,
+    }
+    for kind, code in codes.items():
+        if isinstance(error, kind):
+            return _failed(str(error), code)
+    if isinstance(error, MemoryError):
+        return _failed("out of memory; `pbdkit check` estimates what an experiment needs", 6)
+    what = f"{type(error).__name__}: {error}"
+    return _failed(
+        f"a bug in pbdkit, please report it: {what} (`pbdkit --debug ...` shows where)", 1
+    )
+
+
+def _failed(message: str, code: int) -> int:
+    click.echo(f"pbdkit: {message}" if "\n" not in message else f"pbdkit:\n{message}", err=True)
+    return code

@@ -1,0 +1,35 @@
+"""``pbdkit check``."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from pbdkit.cli.options import experiment_argument, json_option, set_option
+
+
+@click.command()
+@experiment_argument
+@set_option
+@json_option
+def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
+    """Validate an experiment and say what will happen, without running it."""
+    from pbdkit.running import load
+    from pbdkit.scene.forecast import forecast
+    from pbdkit.scene.scene import build_scene
+
+    loaded = load(experiment, settings=settings)
+    found = forecast(build_scene(loaded))
+    if as_json:
+        click.echo(json.dumps(found.as_dict()))
+        return
+    click.echo(f"{loaded.name}: valid")
+    records = loaded.record.count(loaded.steps)
+    click.echo(f"  steps      {loaded.steps}, of which {records} are recorded (time 0 included)")
+    click.echo(f"  particles  {found.particles}, of which {found.followers} follow in step 1")
+    click.echo(f"  bonds      {found.bonds}")
+    click.echo(f"  memory     about {found.memory_mib:.3g} MiB")
+    click.echo(f"  output     about {found.output_mib:.3g} MiB")
+    for warning in found.warnings:
+        click.echo(f"warning: {warning}")

@@ -1,0 +1,92 @@
+"""``pbdkit run``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pbdkit.cli.options import experiment_argument, json_option, set_option
+
+if TYPE_CHECKING:
+    from pbdkit.running import Report
+
+
+@click.command()
+@experiment_argument
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="The file to write.")
+@set_option
+@click.option("--force", is_flag=True, help="Replace an existing output.")
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+@json_option
+def run(
+    experiment: str,
+    output: Path | None,
+    settings: tuple[str, ...],
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
+    from pbdkit.running import load, run_into
+    from pbdkit.scene.scene import build_scene
+
+    loaded = load(experiment, settings=settings)
+    path = output or Path(loaded.name.replace("/", "-") + ".nc")
+    _refuse_existing(path, force)
+    scene = build_scene(loaded)
+    if not quiet:
+        for warning in scene.warnings:
+            click.echo(f"warning: {warning}", err=True)
+
+    from pbdkit.results.netcdf import NetcdfSink
+
+    silent = quiet or as_json or not sys.stderr.isatty()
+    report = run_into(NetcdfSink(path), scene, progress=not silent)
+    if as_json:
+        click.echo(json.dumps(_figures(report, path)))
+    elif not quiet:
+        outcome = report.outcome
+        size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
+        click.echo(f"{outcome.status}: {size}, written to {path}")
+    return _exit_code(report)
+
+
+def _refuse_existing(path: Path, force: bool) -> None:
+    from pbdkit.errors import ExperimentError
+
+    if path.is_dir():
+        raise ExperimentError(f"{path}: is a folder; name a file with -o")
+    if path.exists() and not force:
+        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
+
+
+def _figures(report: Report, path: Path) -> dict[str, Any]:
+    import resource
+
+    work = report.particles * max(1, report.outcome.steps)
+    return {
+        "status": report.outcome.status,
+        "steps": report.outcome.steps,
+        "particles": report.particles,
+        "wall_s": round(report.wall_s, 6),
+        "ns_per_particle_step": round(report.wall_s * 1e9 / work, 3),
+        "peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "engine": "numpy",
+        "output": str(path),
+    }
+
+
+def _exit_code(report: Report) -> int:
+    codes = {"diverged": 4, "interrupted": 130}
+    code = codes.get(report.outcome.status, 0)
+    if code:
+        click.echo(
+            f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
+            "what was recorded before is kept",
+            err=True,
+        )
+    return code
