@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from pbdkit.experiment.model import Experiment
@@ -19,7 +20,10 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
         field: list(registry.components(interface, installed=installed).values())
         for field, interface in INTERFACES.items()
     }
-    models = [Experiment, *(c for components in offered.values() for c in components)]
+    models: list[type[BaseModel]] = [
+        Experiment,
+        *(c for components in offered.values() for c in components),
+    ]
     names, together = models_json_schema([(model, "validation") for model in models])
     definitions = together["$defs"]
     top = definitions.pop(names[Experiment, "validation"]["$ref"].split("/")[-1])

@@ -15,7 +15,7 @@ from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column
 from pbdkit.results.recorder import Sink, Values
 
-BATCH_BYTES = 4 * 2**20
+BATCH_BYTES = 2**20
 """Entries are written, and chunked, in batches of about so much: one particle's history and one
 snapshot both stay cheap to read."""
 
@@ -36,6 +36,7 @@ class NetcdfSink(Sink):
         self._batch: dict[str, int] = {}
         with self._storing():
             self._file = netCDF4.Dataset(self._temporary, "w", format="NETCDF4")
+            self._file.set_fill_off()
             for dim in dict.fromkeys(d for c in columns for d in c.dims):
                 self._file.createDimension(dim, sizes.get(dim))
             for column in columns:

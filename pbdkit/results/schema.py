@@ -47,7 +47,7 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
     depend on parameters the schema leaves them open."""
     assert issubclass(diagnostic, Diagnostic)
     try:
-        variables = diagnostic.model_construct().variables()
+        variables = diagnostic.model_construct(type="").variables()
     except AttributeError:
         return []
     return [layout.diagnostic_column(v, diagnostic.every_step) for v in variables]

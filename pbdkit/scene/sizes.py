@@ -15,8 +15,10 @@ from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.neighbourhood import Neighbourhood
 
 MIB = 2**20
-WORKSPACE_BYTES = 60
-"""Per particle, what building the tables takes at its peak besides what stays."""
+WORKSPACE_BYTES = 100
+"""Per particle, what making the tables takes at its peak besides what stays (measured)."""
+BOND_BYTES = 74
+"""Per bond, the table of bonds and the making of it (measured)."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,9 @@ def estimate(
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
+    shows_bonds = experiment.fracture.can_break or any(d.uses_bonds for d in experiment.diagnostics)
     state = 2 * 2 * 8 + experiment.fracture.can_break * planes * (4 + 1)
-    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16 + shows_bonds * planes * BOND_BYTES
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
     records = experiment.record.count(experiment.steps)
     per_record = particles * (2 * 8 + 1) + sum(
@@ -51,8 +54,8 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     )
     every_step = sum(_bytes_a_record(d, particles) for d in experiment.diagnostics if d.every_step)
     once = particles * (2 * 8 + 2 * 4 + 2 * 8)
-    if experiment.fracture.can_break or any(d.uses_bonds for d in experiment.diagnostics):
-        once += math.ceil(particles * planes * (2 * 8 + 1 + 4))
+    if shows_bonds:
+        once += math.ceil(particles * planes * (2 * 8 + 1 + 4 * experiment.fracture.can_break))
     output = once + records * per_record + (experiment.steps + 1) * every_step
     return Sizes(particles, memory, output)
 
