@@ -1,0 +1,52 @@
+"""Imports follow the data: experiment, scene, stepping, results, running, command line."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "pbdkit"
+ORDER = [
+    "errors",
+    "interfaces",
+    "registry",
+    "components",
+    "experiment",
+    "scene",
+    "stepping",
+    "results",
+    "running",
+    "cli",
+]
+FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)
+
+
+def room(module):
+    return ORDER.index(module.split(".")[1])
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pbdkit."):
+            yield node.module
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_lead_upstream_only(path):
+    own = room(".".join(("pbdkit", *path.relative_to(PACKAGE).with_suffix("").parts)))
+    downstream = [module for module in imported(path) if room(module) > own]
+    assert downstream == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_and_functions_stay_short(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 250
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 45, node.name
+
+
+def test_every_folder_has_its_place_in_the_order():
+    folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
+    assert folders <= set(ORDER)

@@ -1,0 +1,73 @@
+"""What the documentation shows, runs."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import pbdkit
+from pbdkit.cli import program
+from pbdkit.experiment.source import read_text
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(language):
+    return [
+        pytest.param(page, code, id=f"{page.name}-{n}")
+        for page in PAGES
+        for n, code in enumerate(
+            re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
+        )
+    ]
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("python"))
+def test_python_runs(page, code):
+    names = {}
+    exec(compile(code, page.name, "exec"), names)
+    if "ds" in names:
+        assert names["ds"].attrs["status"] == "complete"
+        assert abs(names["ds"].position - names["ds"].reference).max() > 0
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("yaml"))
+def test_experiments_run(page, code):
+    experiment = pbdkit.Experiment.build(read_text(code, page.name))
+    assert pbdkit.run(experiment, progress=False).attrs["status"] == "complete"
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("console"))
+def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (experiment,) = (c for p, c in (b.values for b in blocks("yaml")) if p.name == "README.md")
+    Path("tensile.yaml").write_text(experiment)
+    if "plot" in code:
+        assert "pbdkit run" in code
+    for line in code.splitlines():
+        if not line.startswith("$ pbdkit "):
+            continue
+        result = CliRunner().invoke(program, shlex.split(line.removeprefix("$ pbdkit ")))
+        if "barycenter" in line:
+            assert "did you mean 'barycentre'?" in str(result.exception)
+        else:
+            assert result.exit_code == 0, (line, result.output, result.exception)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
+
+
+def test_readme_lists_the_two_commands_that_ci_runs():
+    text = (ROOT / "README.md").read_text()
+    commands = re.findall(r"^python3 -m venv .*$", text, re.M)
+    assert [c.split(" && ")[-1] for c in commands] == [
+        ".venv/bin/pbdkit run paper/a",
+        ".venv/bin/pytest",
+    ]

@@ -1,0 +1,57 @@
+"""The schemas in schemas/ are current, and describe what is accepted and made."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import pbdkit
+from pbdkit.experiment.schema import experiment_schema
+from pbdkit.experiment.shipped import read_experiment, shipped_names
+from pbdkit.registry.registry import Registry
+from pbdkit.results.schema import dataset_schema
+
+SCHEMAS = Path(__file__).parent.parent / "schemas"
+EXPERIMENT = experiment_schema(Registry(), installed=False)
+DATASET = dataset_schema(Registry(), installed=False)
+
+
+@pytest.mark.parametrize(("name", "schema"), [("experiment", EXPERIMENT), ("dataset", DATASET)])
+def test_committed_schema_is_current(name, schema):
+    committed = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
+    assert committed == json.loads(json.dumps(schema)), "make it anew, see CONTRIBUTING.md"
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_experiments_and_their_datasets_are_described(name):
+    jsonschema.validate(read_experiment(name).data, EXPERIMENT)
+    experiment = pbdkit.load(name, settings=["steps=12"])
+    jsonschema.validate(json.loads(experiment.model_dump_json()), EXPERIMENT)
+    made = pbdkit.run(experiment, progress=False).to_dict(data=False)
+    jsonschema.validate(json.loads(json.dumps(made, default=lambda a: a.tolist())), DATASET)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("lattice", "type"), "sqare"),
+        (("lattice",), {"a": 1.0}),
+        (("rule", "k"), 1.0),
+        (("leaders", 0, "select"), {}),
+        (("steps",), "10"),
+        (("stepz",), 10),
+    ],
+)
+def test_the_schema_refuses_what_the_program_refuses(path, value):
+    data = read_experiment("paper/a").data
+    *parents, last = path
+    part = data
+    for key in parents:
+        part = part[key]
+    part[last] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, EXPERIMENT)
+    with pytest.raises(pbdkit.ExperimentError):
+        pbdkit.Experiment(**data)
