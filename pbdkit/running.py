@@ -17,6 +17,8 @@ from pbdkit.interfaces import Component
 from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
+from pbdkit.results.stopping import asked_to_stop
+from pbdkit.scene.forecast import refuse_too_much_output
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import initial_state
 from pbdkit.stepping.stepper import Stepper
@@ -24,7 +26,6 @@ from pbdkit.stepping.stepper import Stepper
 if TYPE_CHECKING:
     import xarray
 
-Progress = Callable[[int], None]
 Components = Iterable[type[Component]]
 
 
@@ -63,8 +64,9 @@ def run(
     ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
     DivergedError, with what was recorded before, when the run leaves the finite numbers.
     """
-    sink = MemorySink()
-    report = run_into(sink, build_scene(_experiment(experiment, components)), progress)
+    sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
+    refuse_too_much_output(scene)
+    report = run_into(sink, scene, progress)
     dataset = sink.dataset()
     if report.outcome.status == "diverged":
         raise DivergedError(report.outcome.stop_reason, dataset)
@@ -87,27 +89,29 @@ def run_into(sink: Sink, scene: Scene, progress: bool) -> Report:
     begun = time.perf_counter()
     recorder.begin()
     try:
-        with progress_bar(scene.experiment.steps, progress) as show:
-            outcome = _step_through(scene, recorder, show)
+        with progress_bar(scene.experiment.steps, progress) as show, asked_to_stop() as stopping:
+            outcome = _step_through(scene, recorder, show, stopping)
     except BaseException:
         sink.abandon()
         raise
     return Report(outcome, scene.raster.count, time.perf_counter() - begun)
 
 
-def _step_through(scene: Scene, recorder: Recorder, show: Progress) -> Outcome:
+def _step_through(
+    scene: Scene, recorder: Recorder, show: Callable[[int], None], stopping: Callable[[], bool]
+) -> Outcome:
     steps, stepper, state = scene.experiment.steps, Stepper(scene), initial_state(scene)
     outcome = Outcome("complete", "all steps done", steps)
     try:
         recorder.observe(state)
-        while state.step < steps:
+        while state.step < steps and not stopping():
             state = stepper.advance(state)
             recorder.observe(state)
             show(state.step)
     except FloatingPointError as error:
         reason = f"{error} left the finite numbers under rule '{scene.experiment.rule.type}'"
         outcome = Outcome("diverged", reason, state.step)
-    except KeyboardInterrupt:
+    if outcome.status == "complete" and state.step < steps:
         outcome = Outcome("interrupted", f"interrupted after step {state.step}", state.step)
     recorder.finish(state, outcome)
     return outcome

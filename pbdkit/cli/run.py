@@ -65,8 +65,6 @@ def _refuse_existing(path: Path, force: bool) -> None:
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
-    import resource
-
     work = report.particles * max(1, report.outcome.steps)
     return {
         "status": report.outcome.status,
@@ -74,10 +72,20 @@ def _figures(report: Report, path: Path) -> dict[str, Any]:
         "particles": report.particles,
         "wall_s": round(report.wall_s, 6),
         "ns_per_particle_step": round(report.wall_s * 1e9 / work, 3),
-        "peak_memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "peak_memory_mib": _peak_memory_mib(),
         "engine": "numpy",
         "output": str(path),
     }
+
+
+def _peak_memory_mib() -> float | None:
+    """Of this process; None where the system does not tell."""
+    try:
+        from resource import RUSAGE_SELF, getrusage
+    except ImportError:
+        return None
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return round(getrusage(RUSAGE_SELF).ru_maxrss / unit, 1)
 
 
 def _exit_code(report: Report) -> int:

@@ -62,8 +62,12 @@ class Threshold(FractureModel):
         return self.frame_bonds
 
     def constants(self, slot: Slot) -> tuple[float, ...]:
-        """The squared threshold of the slot's shell."""
-        return (self.thresholds[slot.shell - 1] ** 2,)
+        """The squared threshold of the slot's shell.
+
+        A threshold that equals the rest length up to rounding breaks nothing at rest.
+        """
+        limit, rest = self.thresholds[slot.shell - 1] ** 2, squared_length(slot.rest)
+        return (max(limit, rest) if limit > rest * (1 - 1e-12) else limit,)
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:

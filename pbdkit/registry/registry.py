@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from functools import cached_property
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.interfaces import Component
+from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.registry.loading import Plugin, check_component, load_builtin, load_installed
 
@@ -18,14 +18,14 @@ class Registry:
     """
 
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
-        given = tuple(components)
-        for component in given:
+        self._builtin = load_builtin()
+        self._given = Plugin("components", "", "", "ok", components=tuple(components))
+        for component in self._given.components:
             try:
                 check_component(component)
             except TypeError as error:
                 raise ExperimentError(f"components: {error}") from None
-        self._builtin = load_builtin()
-        self._given = Plugin("components", "", "", "ok", components=given)
+            self._refuse_reserved(component)
 
     @cached_property
     def installed(self) -> list[Plugin]:
@@ -35,7 +35,8 @@ class Registry:
     @property
     def plugins(self) -> list[Plugin]:
         """Every plugin, the built-in one first."""
-        return [self._builtin, self._given, *self.installed]
+        given = [self._given] if self._given.components else []
+        return [self._builtin, *given, *self.installed]
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
         """The class of that interface and type.
@@ -75,10 +76,20 @@ class Registry:
         loaded = [self._builtin, *self.__dict__.get("installed", ())]
         return {p.distribution: p.version for p in loaded if classes & set(p.components)}
 
+    def _refuse_reserved(self, component: type[Component]) -> None:
+        name = component.type_name()
+        interfaces = [i for i in INTERFACES.values() if issubclass(component, i)]
+        if _named([self._builtin], interfaces[0], name):
+            raise ExperimentError(
+                f"components: '{name}' is the name of a built-in {interfaces[0].__name__}; "
+                f"give {component.__name__} another type"
+            )
+
     def _find_in_distribution(
         self, interface: type[Component], distribution: str, name: str
     ) -> type[Component]:
-        of_it = [p for p in self.plugins if p.distribution == distribution]
+        own = [self._builtin] if distribution == self._builtin.distribution else []
+        of_it = own or [p for p in self.installed if p.distribution == distribution]
         if not of_it:
             raise PluginError(f"'{name}' is asked of {distribution}, which is not installed")
         if found := _named(of_it, interface, name):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import FOLLOWER
@@ -52,3 +53,16 @@ def forecast(scene: Scene) -> Forecast:
         output_mib=round(sizes.output / MIB, 3),
         warnings=tuple(warnings),
     )
+
+
+def refuse_too_much_output(scene: Scene) -> None:
+    """Raises ExperimentError where the records of a run cannot all be in memory at once."""
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    if sizes.output > machine_memory():
+        raise scene.experiment.located(
+            ExperimentError(
+                f"the records take {sizes.output / 2**30:.3g} GiB, more than this machine's "
+                "memory: record fewer steps, or let `pbdkit run` stream them into a file",
+                ("record",),
+            )
+        )

@@ -1,0 +1,250 @@
+"""Pictures of a dataset's configurations: kinds, numbers, a variable as colours or contours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pbdkit.errors import ExperimentError
+from pbdkit.results.snapshot import Array, Snapshot, label, take_snapshots, variable_label
+from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+KINDS = {
+    FRAME: ("frame", "#F0E442"),
+    FOLLOWER: ("follower", "#0072B2"),
+    LEADER: ("leader", "#D55E00"),
+}
+"""Names and colours (of Okabe and Ito), in the order of drawing."""
+INK, LINE = "#404040", "#B0B0B0"
+DOT_COLOURS, CONTOUR_COLOURS = "viridis", "YlOrRd"
+DETAILED = 20_000
+"""Up to so many particles each is a dot; bonds are drawn, and numbers may be."""
+PAGE_IN, PANEL_IN, DPI, NUMBERED_PT = 7.2, 4.6, 200, 24.0
+"""The widths of the panels of a page and of one alone, and how far apart numbers lie at rest."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the panels of a picture share: limits, the distance of particles at rest, the scale of
+    the values (None where there are none), and whether numbers are written."""
+
+    box: tuple[float, float, float, float]
+    spacing: float
+    norm: Normalize | None
+    numbers: bool
+
+
+def draw(
+    dataset: xarray.Dataset,
+    time: int | None = None,
+    *,
+    color: str | None = None,
+    contours: bool = False,
+    numbers: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draws the configuration at one recorded step, by default the last, and returns its axes.
+
+    Particles have the colours of their kinds, or of the variable `color` (the length of a vector);
+    with `contours` its filled contours over the body lie below the particles' kinds. `numbers`
+    writes the number at each particle. Without `ax` a new figure is made: ``ax.figure``.
+
+    Raises ExperimentError for a step that was not recorded, for a variable that cannot be drawn,
+    and where matplotlib is missing.
+    """
+    _require_matplotlib()
+    snapshots = take_snapshots(dataset, [time], color, contours)
+    look = _look(dataset, snapshots, numbers)
+    axes = _canvas(1, look) if ax is None else [ax]
+    _paint(axes[0], dataset, snapshots[0], look)
+    title = f"{dataset.attrs.get('title', '')}, step {snapshots[0].step}"
+    axes[0].set_title(title.lstrip(", "))
+    _explain(axes, dataset, look, color, contours)
+    return axes[0]
+
+
+def figure(
+    dataset: xarray.Dataset,
+    times: Iterable[int],
+    *,
+    color: str | None = None,
+    contours: bool = False,
+    numbers: bool = False,
+) -> Figure:
+    """Draws several recorded steps, a panel each, with the same limits and one scale of colours.
+
+    The options and what is raised are those of `draw`; no times at all: ExperimentError.
+    """
+    _require_matplotlib()
+    snapshots = take_snapshots(dataset, times, color, contours)
+    if not snapshots:
+        raise ExperimentError("a figure needs at least one time")
+    look = _look(dataset, snapshots, numbers)
+    axes = _canvas(len(snapshots), look)
+    for ax, snapshot in zip(axes, snapshots, strict=True):
+        _paint(ax, dataset, snapshot, look)
+        ax.set_title(f"step {snapshot.step}")
+    _label_outer_only(axes, _columns(len(axes), look))
+    _explain(axes, dataset, look, color, contours)
+    whole = axes[0].get_figure(root=True)
+    assert whole is not None
+    whole.suptitle(str(dataset.attrs.get("title", "")))
+    return whole
+
+
+def _require_matplotlib() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise ExperimentError("pictures need matplotlib: pip install 'pbdkit[plot]'") from None
+
+
+def _look(dataset: xarray.Dataset, snapshots: list[Snapshot], numbers: bool) -> Look:
+    count = dataset.sizes["particle"]
+    if numbers and _crowded(dataset):
+        raise ExperimentError(f"{count} particles are too many to number; at most {DETAILED}")
+    width, height = np.ptp(dataset["reference"].values, axis=0)
+    spacing = float(max(math.sqrt(width * height / count), max(width, height) / count)) or 1.0
+    low = np.min([s.position.min(axis=0) for s in snapshots], axis=0) - spacing
+    high = np.max([s.position.max(axis=0) for s in snapshots], axis=0) + spacing
+    norm = None if snapshots[0].values is None else _norm(snapshots)
+    return Look((low[0], high[0], low[1], high[1]), spacing, norm, numbers)
+
+
+def _norm(snapshots: list[Snapshot]) -> Normalize:
+    """The scale of all values shown, with steps at round levels where there are contours."""
+    from matplotlib import colors, ticker
+
+    values = np.concatenate([s.shown_values() for s in snapshots])
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    high = high if high > low else low + 1.0
+    if snapshots[0].triangles is None:
+        return colors.Normalize(low, high)
+    return colors.BoundaryNorm(ticker.MaxNLocator(12).tick_values(low, high), 256)
+
+
+def _columns(panels: int, look: Look) -> int:
+    """How many panels stand side by side, so that the whole is a little wider than tall."""
+    left, right, bottom, top = look.box
+    shape = (right - left) / (top - bottom) / 1.3
+
+    def unevenness(columns: int) -> float:
+        rows = math.ceil(panels / columns)
+        return abs(math.log(shape * columns / rows)) + 0.4 * (rows * columns - panels)
+
+    return min(range(1, panels + 1), key=unevenness)
+
+
+def _canvas(panels: int, look: Look) -> list[Axes]:
+    """The axes of a new figure, which is about as wide as a page."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    left, right, bottom, top = look.box
+    columns = _columns(panels, look)
+    rows = math.ceil(panels / columns)
+    wide = PANEL_IN if panels == 1 else PAGE_IN / columns
+    if look.numbers:
+        wide = max(wide, NUMBERED_PT / 72 * (right - left) / look.spacing)
+    tall = min(max(wide * (top - bottom) / (right - left), 0.4 * wide), 3 * wide)
+    beside = 0.6 if look.norm is None else 1.6
+    size = (columns * wide + beside, rows * (tall + 0.3) + 0.9)
+    layout = ConstrainedLayoutEngine(compress=True, w_pad=0.06, h_pad=0.06)
+    whole = Figure(size, DPI, layout=layout)
+    return [whole.add_subplot(rows, columns, n + 1) for n in range(panels)]
+
+
+def _label_outer_only(axes: list[Axes], columns: int) -> None:
+    """Keeps the labels of panels with none below or none to their left."""
+    for n, ax in enumerate(axes):
+        lowest, leftmost = n >= len(axes) - columns, n % columns == 0
+        ax.tick_params(labelbottom=lowest, labelleft=leftmost)
+        ax.xaxis.label.set_visible(lowest)
+        ax.yaxis.label.set_visible(leftmost)
+
+
+def _paint(ax: Axes, dataset: xarray.Dataset, now: Snapshot, look: Look) -> None:
+    """One configuration in one pair of axes, without title and legend."""
+    from matplotlib.collections import LineCollection
+
+    left, right, bottom, top = look.box
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    units = dataset["position"].attrs.get("units", "")
+    ax.set(xlabel=label("x", units), ylabel=label("y", units))
+    inches = ax.bbox.transformed(ax.figure.dpi_scale_trans.inverted())
+    apart = 72 * look.spacing * min(inches.width / (right - left), inches.height / (top - bottom))
+    size = 1.3 * apart if _crowded(dataset) else min(0.4 * apart, 7.0)
+    if not _crowded(dataset):
+        ends = list(now.position[now.bonds])
+        ax.add_collection(LineCollection(ends, colors=LINE, linewidths=0.08 * size, zorder=0))
+    _dots(ax, now, look.norm, size, _crowded(dataset))
+    if look.numbers:
+        for number, place in zip(dataset["number"].values, now.position, strict=True):
+            beside = (0.5 * size, 0.5 * size)
+            ax.annotate(str(number), place, beside, textcoords="offset points", fontsize=6)
+
+
+def _crowded(dataset: xarray.Dataset) -> bool:
+    return bool(dataset.sizes["particle"] > DETAILED)
+
+
+def _dots(ax: Axes, now: Snapshot, norm: Normalize | None, size: float, crowded: bool) -> None:
+    """Contours, and the particles on them: dots, or squares, unless those hid the contours."""
+    from matplotlib.colors import BoundaryNorm
+    from matplotlib.tri import Triangulation
+
+    (x, y), values, mesh = now.position.T, now.values, now.triangles
+    dense = {"marker": "s", "edgecolors": "none", "rasterized": True}
+    style: dict[str, Any] = dense if crowded else {"edgecolors": INK, "lw": 0.08 * size}
+    if values is not None and mesh is None:
+        ax.scatter(x, y, (1.2 * size) ** 2, values, cmap=DOT_COLOURS, norm=norm, **style)
+        return
+    if values is not None and mesh is not None and len(mesh) and isinstance(norm, BoundaryNorm):
+        fill, levels = Triangulation(x, y, mesh), norm.boundaries
+        ax.tricontourf(fill, np.nan_to_num(values), levels, cmap=CONTOUR_COLOURS, norm=norm)
+    if mesh is None or not crowded:
+        for kind, (_, colour) in KINDS.items():
+            ax.scatter(x[now.kind == kind], y[now.kind == kind], size**2, colour, **style)
+
+
+def _explain(
+    axes: list[Axes], dataset: xarray.Dataset, look: Look, color: str | None, contours: bool
+) -> None:
+    """The colour bar and the legend of the kinds, as far as they are used."""
+    from matplotlib.cm import ScalarMappable
+
+    if color is not None:
+        colours = ScalarMappable(look.norm, CONTOUR_COLOURS if contours else DOT_COLOURS)
+        bar = axes[0].figure.colorbar(colours, ax=axes, aspect=25)
+        bar.set_label(variable_label(dataset, color))
+        bar.ax.ticklabel_format(axis="y", scilimits=(-3, 4))
+    if color is None or (contours and not _crowded(dataset)):
+        _legend(axes, np.unique(dataset["kind"].values))
+
+
+def _legend(axes: list[Axes], present: Array) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.transforms import ScaledTranslation
+
+    handles = [
+        Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
+        for kind, (name, colour) in reversed(KINDS.items())
+        if kind in present
+    ]
+    style = {"handles": handles, "ncols": 3, "frameon": False, "handletextpad": 0.1}
+    ax, whole = axes[0], axes[0].figure
+    if len(axes) > 1:
+        whole.legend(loc="outside lower center", **style)
+        return
+    below = ax.transAxes + ScaledTranslation(0, -0.45, whole.dpi_scale_trans)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, **style)
