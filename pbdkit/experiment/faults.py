@@ -16,7 +16,8 @@ SHOWN = 8
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """The error to raise instead: a line a fault, the first few of them."""
-    faults = error.errors(include_url=False)
+    found = error.errors(include_url=False)
+    faults = [f for f in found if f["type"] != "too_short" or not _follows(f, found)]
     lines = [source.message(*_described(fault)) for fault in faults[:SHOWN]]
     if len(faults) > SHOWN:
         lines.append(f"... and {len(faults) - SHOWN} more")
@@ -43,3 +44,9 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "literal_error" and isinstance(fault["input"], str):
         hint = did_you_mean(fault["input"], context["expected"].replace("'", "").split(" or "))
     return where, f"{message}, got {brief(fault['input'])}{hint}"
+
+
+def _follows(fault: Any, found: list[Any]) -> bool:
+    """Whether a list is too short only because its items are at fault themselves."""
+    where = fault["loc"]
+    return any(f["loc"][: len(where)] == where and f["loc"] != where for f in found)

@@ -39,6 +39,8 @@ class MemorySink(Sink):
         """The dataset as in the file."""
         import xarray
 
+        import pbdkit.results.accessor  # noqa: F401, so that the dataset has `pbd`
+
         variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
         coordinates = [c.name for c in self._columns if c.coordinate]
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
