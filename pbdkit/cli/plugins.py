@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from pbdkit.cli.options import json_option
+
+if TYPE_CHECKING:
+    from pbdkit.registry.loading import Plugin
 
 
 @click.group()
@@ -34,18 +37,17 @@ def list_(as_json: bool) -> None:
     Console().print(table)
 
 
-def _rows(plugin: Any) -> list[dict[str, str]]:
-    from pbdkit.interfaces import INTERFACES
+def _rows(plugin: Plugin) -> list[dict[str, str]]:
+    from pbdkit.registry.registry import interface_of
 
-    origin = {"distribution": plugin.distribution, "version": plugin.version}
-    state = {"state": plugin.state, "reason": plugin.reason}
-    rows = [
-        {
-            "interface": next(i.__name__ for i in INTERFACES.values() if issubclass(c, i)),
-            "type": c.type_name(),
-        }
-        | origin
-        | state
-        for c in plugin.components
+    rest = {
+        "distribution": plugin.distribution,
+        "version": plugin.version,
+        "state": plugin.state,
+        "reason": plugin.reason,
+    }
+    offered = [(interface_of(c).__name__, c.type_name()) for c in plugin.components]
+    return [
+        {"interface": interface, "type": name} | rest
+        for interface, name in [("plugin", plugin.name), *offered]
     ]
-    return [{"interface": "plugin", "type": plugin.name} | origin | state, *rows]

@@ -56,11 +56,15 @@ def run(
 
 
 def _refuse_existing(path: Path, force: bool) -> None:
-    from pbdkit.errors import ExperimentError
+    from pbdkit.errors import ExperimentError, StorageError
 
-    if path.is_dir():
+    try:
+        is_folder, exists = path.is_dir(), path.exists()
+    except OSError as error:
+        raise StorageError(f"{str(path)[:80]}...: {error.strerror}") from None
+    if is_folder:
         raise ExperimentError(f"{path}: is a folder; name a file with -o")
-    if path.exists() and not force:
+    if exists and not force:
         raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -66,8 +67,9 @@ class Threshold(FractureModel):
 
         A threshold that equals the rest length up to rounding breaks nothing at rest.
         """
-        limit, rest = self.thresholds[slot.shell - 1] ** 2, squared_length(slot.rest)
-        return (max(limit, rest) if limit > rest * (1 - 1e-12) else limit,)
+        threshold, rest = self.thresholds[slot.shell - 1], squared_length(slot.rest)
+        at_rest = threshold >= math.sqrt(rest) * (1 - 1e-12)
+        return (max(threshold**2, rest) if at_rest else threshold**2,)
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:

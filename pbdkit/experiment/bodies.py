@@ -11,6 +11,8 @@ from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component, Lattice
 from pbdkit.interfaces.lattice import Index
 
+Count = Annotated[int, Field(ge=1, le=2**31)]
+
 
 class Body(Component):
     """An outline that is filled with the sites of a lattice."""
@@ -24,8 +26,8 @@ class Grid(Body):
     """`columns` × `rows` sites from (0, 0)."""
 
     type: Literal["grid"] = "grid"
-    columns: Annotated[int, Field(ge=1)]
-    rows: Annotated[int, Field(ge=1)]
+    columns: Count
+    rows: Count
 
     def window(self, lattice: Lattice) -> tuple[Index, Index]:
         """(0, 0) to (columns - 1, rows - 1)."""

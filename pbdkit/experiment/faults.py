@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pydantic import ValidationError
@@ -12,6 +13,14 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces.naming import did_you_mean
 
 SHOWN = 8
+PLAIN = {
+    "missing": "is missing",
+    "tuple_type": "should be a list, got {got}",
+    "too_long": "should have at most {max_length} items, got {actual_length}",
+    "too_short": "should have at least {min_length} item(s), got {actual_length}",
+    "model_type": "should be a map of keys, got {got}",
+}
+"""Where pydantic speaks of Python's types, the words of an experiment file."""
 
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
@@ -33,16 +42,14 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     where, context = tuple(fault["loc"]), fault.get("ctx", {})
     if "text" in context:
         return (*where, context["key"]) if "key" in context else where, context["text"]
-    if fault["type"] == "missing":
-        return where, "is missing"
+    if fault["type"] in PLAIN:
+        return where, PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
     message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
     if fault["type"] == "value_error":
         return where, message
-    if fault["type"] == "string_pattern_mismatch":
-        message = "may hold letters, digits, '.', '_', '-' and '/', and no '..'"
     hint = ""
     if fault["type"] == "literal_error" and isinstance(fault["input"], str):
-        hint = did_you_mean(fault["input"], context["expected"].replace("'", "").split(" or "))
+        hint = did_you_mean(fault["input"], re.findall(r"'([^']*)'", context["expected"]))
     return where, f"{message}, got {brief(fault['input'])}{hint}"
 
 

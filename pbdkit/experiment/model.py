@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, PrivateAttr, SerializeAsAny, StringConstraints, ValidationError
+from pydantic import (
+    AfterValidator,
+    Field,
+    PrivateAttr,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.bodies import AnyBody
 from pbdkit.experiment.faults import located, report
 from pbdkit.experiment.leaders import LeaderGroup
-from pbdkit.experiment.parts import closed_part, open_part
+from pbdkit.experiment.parts import brief, closed_part, fault, open_part
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
+    INTERFACES,
     Component,
     Diagnostic,
     FollowerRule,
@@ -25,8 +35,28 @@ from pbdkit.interfaces import (
 from pbdkit.interfaces.component import Strict
 from pbdkit.registry.registry import Registry
 
+
+def _valid_name(name: str) -> str:
+    words = name.split("/")
+    if len(name) > 200 or ".." in name or not all(re.fullmatch(_WORD, word) for word in words):
+        raise fault(
+            "may hold letters, digits, '.', '_', '-' and '/', no '..', and no part between slashes "
+            f"that is empty or begins with a dot; got {brief(name)}"
+        )
+    return name
+
+
+def _known_version(version: int) -> int:
+    if version != 1:
+        raise fault(f"this pbdkit reads version 1, got {brief(version)}")
+    return version
+
+
 _WORD = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
-Name = Annotated[str, StringConstraints(pattern=rf"^{_WORD}(/{_WORD})*$", max_length=200)]
+Name = Annotated[
+    str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
+]
+Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
 
 
 class Reference(Component):
@@ -83,7 +113,7 @@ class Experiment(Strict):
     and PluginError where a part is asked of a distribution that is missing or broken.
     """
 
-    version: Literal[1] = 1
+    version: Version = 1
     name: Name
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     lattice: AnyLattice
@@ -105,6 +135,19 @@ class Experiment(Strict):
     def __init__(self, **parts: Any) -> None:
         self._validate(parts, Registry(), Source())
 
+    @model_serializer(mode="wrap")
+    def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Types that several distributions offer keep the name of theirs."""
+        found: dict[str, Any] = serialize(self)
+        for field in INTERFACES:
+            parts = getattr(self, field)
+            if field == "diagnostics":
+                for part, dumped in zip(parts, found[field], strict=True):
+                    dumped["type"] = self._registry.name_of(part)
+            else:
+                found[field]["type"] = self._registry.name_of(parts)
+        return found
+
     @classmethod
     def build(cls, source: Source, components: Iterable[type[Component]] = ()) -> Self:
         """The experiment of a source, with components handed over besides the installed ones."""
@@ -117,6 +160,12 @@ class Experiment(Strict):
         """The parts that a file may leave out, as it would write them."""
         fields = cls.model_fields.items()
         return {name: f.default for name, f in fields if isinstance(f.default, dict)}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Experiment) and self.__dict__ == other.__dict__
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.__dict__.values()))
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""

@@ -19,8 +19,8 @@ class Motion(Component):
         """How far from its start the leader stands at the end of the motion's n-th step, n ≥ 1."""
 
     @abstractmethod
-    def settles(self) -> int:
-        """The number of steps after which the offset stays as it is."""
+    def knots(self) -> tuple[int, ...]:
+        """The steps n between which, and after which, the offset is linear in n."""
 
 
 class Hold(Motion):
@@ -32,9 +32,9 @@ class Hold(Motion):
         """None."""
         return (0.0, 0.0)
 
-    def settles(self) -> int:
-        """At once."""
-        return 0
+    def knots(self) -> tuple[int, ...]:
+        """None."""
+        return ()
 
 
 class Velocity(Motion):
@@ -49,9 +49,9 @@ class Velocity(Motion):
         moved = min(n, self.steps)
         return (self.velocity[0] * moved, self.velocity[1] * moved)
 
-    def settles(self) -> int:
-        """After `steps`."""
-        return self.steps
+    def knots(self) -> tuple[int, ...]:
+        """The end of the motion."""
+        return (self.steps,)
 
 
 class Displace(Motion):
@@ -64,9 +64,9 @@ class Displace(Motion):
         """The displacement, from the first step on."""
         return self.displacement
 
-    def settles(self) -> int:
-        """After one step."""
-        return 1
+    def knots(self) -> tuple[int, ...]:
+        """The first step."""
+        return (1,)
 
 
 AnyMotion = Annotated[SerializeAsAny[Motion], closed_part(Motion, Hold, Velocity, Displace)]

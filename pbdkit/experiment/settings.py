@@ -25,12 +25,14 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
     _place(changed.data, where, read_value(value, label), label, defaults)
     for known in [k for k in changed.places if k[: len(where)] == where]:
         del changed.places[known]
-    changed.places[where] = label
+    for depth in range(1, len(where) + 1):
+        changed.places.setdefault(where[:depth], label)
     return changed
 
 
 def _parsed(path: str) -> Where:
-    return tuple(int(part) if part.isdigit() else part for part in path.split("."))
+    parts = path.split(".")
+    return tuple(int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in parts)
 
 
 def _place(data: Any, where: Where, value: Any, label: str, defaults: Mapping[str, Any]) -> None:

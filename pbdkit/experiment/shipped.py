@@ -26,12 +26,16 @@ def shipped_text(name: str) -> str:
 def read_experiment(name: str) -> Source:
     """The source of the experiment in a file, or of the shipped experiment of that name."""
     path = Path(name)
-    if path.is_file():
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except OSError as error:
+        raise ExperimentError(f"{name[:80]}...: {error.strerror}") from None
+    if is_file:
         return read_file(path)
     names = shipped_names()
     if name in names:
         return read_text(shipped_text(name), name)
-    what = "is a folder" if path.is_dir() else "is no file and no shipped experiment"
+    what = "is a folder" if is_folder else "is no file and no shipped experiment"
     hint = did_you_mean(name, names)
     raise ExperimentError(f"{name}: {what}{hint} (`pbdkit experiments` lists them)")
 

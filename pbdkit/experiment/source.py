@@ -23,11 +23,13 @@ from ruamel.yaml.events import (
     ScalarEvent,
 )
 from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
 
 from pbdkit.errors import ExperimentError, dotted
 
 MAX_BYTES = 2**20
 MAX_DEPTH = 32
+MAX_NODES = 20_000
 Where = tuple[str | int, ...]
 
 
@@ -87,19 +89,29 @@ def _read(text: str, source: Source) -> Any:
         _guard(yaml, text, source.name)
         node = yaml.compose(io.StringIO(text))
         return None if node is None else _build(node, (), source, yaml)
+    except ReaderError as error:
+        before = text[: error.position]
+        place = f"{before.count(chr(10)) + 1}:{error.position - before.rfind(chr(10))}"
+        what = f"the character {error.character!r} is not allowed in YAML"
+        raise ExperimentError(f"{source.name}:{place}: {what}") from None
     except YAMLError as error:
         raise _syntax_error(error, source.name) from None
-    except ValueError as error:  # characters that YAML forbids, integers beyond Python's limit
-        raise ExperimentError(f"{source.name}: {str(error).splitlines()[0]}") from None
 
 
 def _guard(yaml: YAML, text: str, name: str) -> None:
-    depth = documents = 0
+    depth = documents = nodes = 0
     for event in yaml.parse(io.StringIO(text)):
         line = f"{name}:{event.start_mark.line + 1}:{event.start_mark.column + 1}"
         if isinstance(event, AliasEvent):
             raise ExperimentError(f"{line}: aliases (*{event.anchor}) are not taken; write it out")
+        nodes += isinstance(event, NodeEvent)
+        if nodes > MAX_NODES:
+            raise ExperimentError(
+                f"{line}: more than {MAX_NODES} values, which no experiment needs"
+            )
         if isinstance(event, DocumentStartEvent):
+            if event.version or event.tags:
+                raise ExperimentError(f"{line}: directives (%YAML, %TAG) are not taken")
             documents += 1
             if documents > 1:
                 raise ExperimentError(f"{line}: a second document; one file holds one experiment")
@@ -122,9 +134,13 @@ def _build(node: Any, where: Where, source: Source, yaml: YAML) -> Any:
         return [_build(item, (*where, n), source, yaml) for n, item in enumerate(node.value)]
     if isinstance(node, MappingNode):
         return _build_map(node, where, source, yaml)
-    if str(node.tag).rsplit(":", 1)[-1] in ("null", "bool", "int", "float"):
+    if str(node.tag).rsplit(":", 1)[-1] not in ("null", "bool", "int", "float"):
+        return node.value
+    try:
         return yaml.constructor.construct_object(node)
-    return node.value
+    except ValueError:
+        what = f"{dotted(where)}: '{node.value[:20]}...' is too long for a number"
+        raise ExperimentError(f"{_place(node, source)}: {what}") from None
 
 
 def _build_map(node: MappingNode, where: Where, source: Source, yaml: YAML) -> dict[str, Any]:

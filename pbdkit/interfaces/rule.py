@@ -15,8 +15,9 @@ from pbdkit.interfaces.neighbours import Slot
 class Here(NamedTuple):
     """What stands at the follower itself, one component a plane.
 
-    `u` is its displacement in the intermediate configuration; `X` its reference position, given
-    to rules that declare `uses_reference`, otherwise zeros.
+    `u` is its displacement in the intermediate configuration; `X` its reference position from the
+    lattice's site (0, 0), so that no digit depends on where the body lies, given to rules that
+    declare `uses_reference`, otherwise zeros.
     """
 
     u: Vector
@@ -26,7 +27,8 @@ class Here(NamedTuple):
 @dataclass(frozen=True)
 class Setting:
     """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
-    the box (`lower`, `upper`) of the body's reference configuration, frame not included."""
+    the box (`lower`, `upper`) of the body's reference configuration, frame not included, from the
+    lattice's site (0, 0)."""
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]

@@ -65,11 +65,14 @@ def load_plugin(point: EntryPoint, name: str, version: str) -> Plugin:
 def _offered(point: EntryPoint) -> list[type[Component]]:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
-    manager.register(point.load(), point.name)
+    module = point.load()
+    manager.register(module, point.name)
     manager.check_pending()
     answers = manager.hook.pbdkit_components()
-    if not answers:
+    if not manager.get_hookcallers(module):
         raise TypeError("its module implements no hook `pbdkit_components`")
+    if not answers or not isinstance(answers[0], list):
+        raise TypeError("its hook `pbdkit_components` must return a list of component classes")
     for component in answers[0]:
         check_component(component)
     return list(answers[0])

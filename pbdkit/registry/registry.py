@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 
 from pbdkit.errors import ExperimentError, PluginError
@@ -25,12 +26,13 @@ class Registry:
                 check_component(component)
             except TypeError as error:
                 raise ExperimentError(f"components: {error}") from None
-            self._refuse_reserved(component)
+            self._refuse_taken(component)
 
     @cached_property
     def installed(self) -> list[Plugin]:
         """The third-party plugins; the first look at them imports them."""
-        return load_installed()
+        found = load_installed()
+        return [self._judged(plugin, found) for plugin in found]
 
     @property
     def plugins(self) -> list[Plugin]:
@@ -76,14 +78,35 @@ class Registry:
         loaded = [self._builtin, *self.__dict__.get("installed", ())]
         return {p.distribution: p.version for p in loaded if classes & set(p.components)}
 
-    def _refuse_reserved(self, component: type[Component]) -> None:
-        name = component.type_name()
-        interfaces = [i for i in INTERFACES.values() if issubclass(component, i)]
-        if _named([self._builtin], interfaces[0], name):
+    def name_of(self, component: Component) -> str:
+        """The type by which an experiment finds this component again, with its distribution where
+        several offer the type."""
+        name, interface = component.type_name(), interface_of(type(component))
+        if _named([self._builtin, self._given], interface, name):
+            return name
+        found = _named(self.__dict__.get("installed", ()), interface, name)
+        own = [plugin for plugin, offered in found if offered is type(component)]
+        return f"{own[0].distribution}:{name}" if len(found) > 1 and own else name
+
+    def _judged(self, plugin: Plugin, installed: list[Plugin]) -> Plugin:
+        """The plugin, in conflict where a component of it cannot be named by its type alone."""
+        reasons = []
+        for component in plugin.components:
+            name, interface = component.type_name(), interface_of(component)
+            offers = _named([self._builtin, *installed], interface, name)
+            if others := [p.distribution for p, _ in offers if p is not plugin]:
+                reasons.append(f"'{name}' is offered by {', '.join(others)} too")
+        return replace(plugin, state="conflict", reason="; ".join(reasons)) if reasons else plugin
+
+    def _refuse_taken(self, component: type[Component]) -> None:
+        name, interface = component.type_name(), interface_of(component)
+        if _named([self._builtin], interface, name):
             raise ExperimentError(
-                f"components: '{name}' is the name of a built-in {interfaces[0].__name__}; "
+                f"components: '{name}' is the name of a built-in {interface.__name__}; "
                 f"give {component.__name__} another type"
             )
+        if len({c for _, c in _named([self._given], interface, name)}) > 1:
+            raise ExperimentError(f"components: two classes have the type '{name}'")
 
     def _find_in_distribution(
         self, interface: type[Component], distribution: str, name: str
@@ -100,7 +123,9 @@ class Registry:
                     f"'{name}' is asked of {distribution} {plugin.version}, "
                     f"which is {plugin.state}: {plugin.reason}"
                 )
-        raise ExperimentError(f"{distribution} offers no {interface.__name__} '{name}'")
+        offered = [c.type_name() for p in of_it for c in p.components if issubclass(c, interface)]
+        hint = did_you_mean(name, offered)
+        raise ExperimentError(f"{distribution} offers no {interface.__name__} '{name}'{hint}")
 
     def _unknown(self, interface: type[Component], name: str) -> str:
         offered = sorted(self.components(interface))
@@ -111,6 +136,11 @@ class Registry:
             if p.state != "ok"
         )
         return f"unknown type '{name}'{hint} (installed: {', '.join(offered)}){broken}"
+
+
+def interface_of(component: type[Component]) -> type[Component]:
+    """The open interface that a component class implements."""
+    return next(i for i in INTERFACES.values() if issubclass(component, i))
 
 
 def _named(

@@ -25,7 +25,7 @@ class NetcdfSink(Sink):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self._temporary = path.with_name(f".pbdkit-{os.getpid()}.partial")
         self._file: Any = None
 
     def begin(self, columns: list[Column], sizes: dict[str, int], records: int) -> None:
@@ -34,6 +34,8 @@ class NetcdfSink(Sink):
         self._waiting: dict[str, list[Any]] = {c.name: [] for c in columns if c.grows}
         self._written = dict.fromkeys(self._waiting, 0)
         self._batch: dict[str, int] = {}
+        if not self._path.parent.is_dir():
+            raise StorageError(f"{self._path}: there is no folder {self._path.parent}")
         with self._storing():
             self._file = netCDF4.Dataset(self._temporary, "w", format="NETCDF4")
             self._file.set_fill_off()
@@ -67,7 +69,8 @@ class NetcdfSink(Sink):
         """Removes the temporary file."""
         with suppress(Exception):
             self._file.close()
-        self._temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._temporary.unlink(missing_ok=True)
 
     def _define(self, column: Column, sizes: dict[str, int], records: int) -> None:
         dtype: Any = str if column.dtype == "str" else column.dtype

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Diagnostic
+from pbdkit.interfaces import Diagnostic, Variable
+from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column
 from pbdkit.results.moment import StateMoment, Tables
@@ -59,6 +60,7 @@ class Recorder:
         self._scene = scene
         self._sink = sink
         self._tables = Tables(scene)
+        self._last_recorded = -1
         diagnostics = scene.experiment.diagnostics
         self._recorded = [d for d in diagnostics if not d.every_step]
         self._stepped = [d for d in diagnostics if d.every_step]
@@ -84,6 +86,7 @@ class Recorder:
             for dim, length in zip(c.dims, np.shape(known[c.name]), strict=True)
         }
         experiment = self._scene.experiment
+        self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
         self._sink.begin(columns, sizes, experiment.record.count(experiment.steps))
         self._sink.put(known)
 
@@ -91,22 +94,30 @@ class Recorder:
         """Takes what is wanted of this step. Raises FloatingPointError where a recorded value has
         left the finite numbers; nothing of that step is kept."""
         steps, record = self._scene.experiment.steps, self._scene.experiment.record
+        with np.errstate(all="ignore"):
+            self._observe(state, record.keeps(state.step, steps), bool(self._stepped))
+
+    def _observe(self, state: State, recorded: bool, stepped: bool) -> None:
         moment = StateMoment(state, self._tables)
         values: Values = {}
-        if record.keeps(state.step, steps):
+        if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
             values |= self._measured(self._recorded, moment)
-        if self._stepped:
+            self._last_recorded = state.step
+        if stepped:
             values |= {"step": state.step} | self._measured(self._stepped, moment)
         if values:
             self._sink.put(values)
 
     def finish(self, state: State, outcome: Outcome) -> None:
-        """Hands over what is known at the end, and the attributes."""
+        """Hands over what is known at the end, and the attributes. The last step of a run that was
+        interrupted is recorded too."""
+        if outcome.status == "interrupted" and state.step > self._last_recorded:
+            self._observe(state, recorded=True, stepped=False)
         if self._scene.has_fracture:
             self._sink.put({"broken_step": StateMoment(state, self._tables).broken_step()})
         self._sink.finish(self._attributes(outcome))
@@ -122,20 +133,20 @@ class Recorder:
         for diagnostic in self._scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 columns.append(layout.own_coordinate(name, values.dtype.str[1:]))
+            known = {d for c in columns for d in c.dims}
             for variable in diagnostic.variables():
+                _refuse_unknown(diagnostic, variable, known, {c.name for c in columns})
                 columns.append(layout.diagnostic_column(variable, diagnostic.every_step))
         return columns
 
     def _measured(self, diagnostics: list[Diagnostic], moment: StateMoment) -> Values:
         values: Values = {}
         for diagnostic in diagnostics:
-            variables, measured = diagnostic.variables(), diagnostic.measure(moment)
-            if len(variables) != len(measured):
-                raise PluginError(
-                    f"diagnostic '{diagnostic.type}' declares {len(variables)} variables and "
-                    f"measured {len(measured)}"
-                )
-            values |= {v.name: m for v, m in zip(variables, measured, strict=True)}
+            with blaming(diagnostic, f"at step {moment.step}"):
+                measured = diagnostic.measure(moment)
+                for variable, value in zip(diagnostic.variables(), measured, strict=True):
+                    _refuse_unfit(variable, value, self._shapes[variable.name], moment.step)
+                    values[variable.name] = value
         return values
 
     def _attributes(self, outcome: Outcome) -> dict[str, str]:
@@ -151,3 +162,25 @@ class Recorder:
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
+
+
+def _refuse_unknown(
+    diagnostic: Diagnostic, variable: Variable, dims: set[str], names: set[str]
+) -> None:
+    what = f"Diagnostic '{diagnostic.type}' declares the variable '{variable.name}'"
+    if variable.name in names:
+        raise PluginError(f"{what}, and that name is taken")
+    if unknown := [dim for dim in variable.dims if dim not in dims]:
+        raise PluginError(f"{what} with the dimension '{unknown[0]}', which it gives no values")
+
+
+def _refuse_unfit(variable: Variable, value: Any, shape: tuple[int, ...], step: int) -> None:
+    """Raises ValueError for another shape than declared, FloatingPointError for what is not
+    finite."""
+    if np.shape(value) != shape:
+        raise ValueError(f"'{variable.name}' has the shape {np.shape(value)}, not {shape}")
+    finite = np.isfinite(value)
+    if not finite.all():
+        place = np.argwhere(~finite)[0]
+        whose = f"particle {place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
+        raise FloatingPointError(f"{variable.name} of {whose} at step {step}")

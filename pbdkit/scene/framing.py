@@ -52,7 +52,7 @@ class RasterFrame(FrameSites):
     def nearest(self) -> tuple[Indices, Indices]:
         """Searches outwards from every frame point, shell of sites by shell, until all have met
         the body and every tie is in."""
-        sublattice = self.raster.cells()[0][self.frame_rows]
+        sublattice = self.raster.cells(self.frame_rows)[0]
         pairs = [
             self._nearest_of(s, np.flatnonzero(sublattice == s)) for s in np.unique(sublattice)
         ]

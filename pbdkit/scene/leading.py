@@ -119,10 +119,11 @@ def _refuse_contradiction(
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
     if not len(shared) or begin > end:
         return
-    settled = begin + max(a.group.motion.settles(), b.group.motion.settles())
     # b starts where a, which led the particle just before unless both begin together, left it.
     start = _offset(a.group, begin - 1)
-    for step in range(begin, min(end, settled) + 1):
+    knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
+    near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1)}
+    for step in sorted(step for step in near if begin <= step <= end):
         one, other = _offset(a.group, step), start + _offset(b.group, step)
         if np.abs(one - other).max() > 1e-12 * max(1.0, np.abs(one).max()):
             raise ExperimentError(

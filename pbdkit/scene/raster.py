@@ -82,21 +82,22 @@ class Raster:
         """The rows of leaders and followers."""
         return np.flatnonzero(self.table_kind == FOLLOWER)
 
-    def cells(self) -> tuple[Indices, Indices, Indices]:
-        """(sublattice, repeat cell, repeat cell) of every particle."""
-        s, m, n = np.unravel_index(self.place, self.shape)
+    def cells(self, rows: Indices | None = None) -> tuple[Indices, Indices, Indices]:
+        """(sublattice, repeat cell, repeat cell) of all particles or of some rows."""
+        place = self.place if rows is None else self.place[rows]
+        s, m, n = np.unravel_index(place, self.shape)
         return s, m + self.first[0], n + self.first[1]
 
     def reference(self, rows: Indices | None = None) -> NDArray[np.float64]:
         """X, (particle, axis), of all particles or of some rows."""
-        s, m, n = (c if rows is None else c[rows] for c in self.cells())
-        return np.stack(positions(self.lattice, s, m, n), axis=1)
+        offsets = positions(self.lattice.cell(), *self.cells(rows))
+        return np.stack(offsets, axis=1) + self.lattice.origin
 
     def reference_planes(self, block: Block) -> Vector:
-        """X on a block, a plane a component."""
+        """X from the lattice's site (0, 0) on a block, a plane a component."""
         m = np.arange(block.start[0], block.stop[0])[:, None] + self.first[0]
         n = np.arange(block.start[1], block.stop[1])[None, :] + self.first[1]
-        return positions(self.lattice, block.sublattice, m, n)
+        return positions(self.lattice.cell(), block.sublattice, m, n)
 
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
@@ -108,13 +109,11 @@ class Raster:
         return Block(sublattice, start, (int(first[-1]) + 1, int(second[-1]) + 1))
 
 
-def positions(lattice: Lattice, s: int | Indices, m: Indices, n: Indices) -> Vector:
-    """X of sublattice s in the repeat cell (m, n): origin + at + m·a + n·b."""
-    cell = lattice.cell()
+def positions(cell: Cell, s: int | Indices, m: Indices, n: Indices) -> Vector:
+    """Sublattice s in the repeat cell (m, n), from site (0, 0): at + m·a + n·b."""
     a, b = cell.vectors
     at = np.array([site.at for site in cell.sites])
-    x, y = lattice.origin
-    return Vector(at[s, 0] + (m * a.x + n * b.x) + x, at[s, 1] + (m * a.y + n * b.y) + y)
+    return Vector(at[s, 0] + (m * a.x + n * b.x), at[s, 1] + (m * a.y + n * b.y))
 
 
 def build_raster(

@@ -16,7 +16,7 @@ from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood
-from pbdkit.scene.raster import Raster, build_raster
+from pbdkit.scene.raster import Raster, build_raster, positions
 from pbdkit.scene.sizes import refuse_too_large
 
 
@@ -51,9 +51,9 @@ class Scene:
 
     def setting(self) -> Setting:
         """What a rule may derive its constants from."""
-        x = self.raster.reference(self.raster.body_rows)
-        lower, upper = Vector(*x.min(axis=0).tolist()), Vector(*x.max(axis=0).tolist())
         cell = self.experiment.lattice.cell()
+        x, y = positions(cell, *self.raster.cells(self.raster.body_rows))
+        lower, upper = Vector(x.min(), y.min()), Vector(x.max(), y.max())
         return Setting(cell, self.neighbourhood.slots, lower, upper)
 
 

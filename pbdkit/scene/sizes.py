@@ -86,6 +86,6 @@ def _bytes_a_record(diagnostic: Diagnostic, particles: int) -> int:
     sizes = {"particle": particles, "axis": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     return sum(
-        math.prod(sizes[dim] for dim in v.dims) * np.dtype(v.dtype).itemsize
+        math.prod(sizes.get(dim, 1) for dim in v.dims) * np.dtype(v.dtype).itemsize
         for v in diagnostic.variables()
     )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import PluginError
 from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -52,7 +52,8 @@ class Stepper:
         _place(u, led)
         if self._fracturing and state.broken_step is not None:
             self._fracturing.break_bonds(u, state.broken_step, step)
-        with np.errstate(all="ignore"):  # what leaves the finite numbers is found at recording
+        # What leaves the finite numbers is found at recording.
+        with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
             for part in self._parts:
                 self._move_followers(part, u, new, state.broken_step)
         _place(new, led)
@@ -109,9 +110,9 @@ class Stepper:
         solver = self._scene.experiment.solver
         for here, step, out in zip(u, move, planes(new, part.block), strict=True):
             if np.shape(step) not in ((), here.shape):
-                raise PluginError(
-                    f"rule '{self._rule.type}' returned an array of shape {np.shape(step)} "
-                    f"for particles of shape {here.shape}: it is not elementwise"
+                raise ValueError(
+                    f"it returned the shape {np.shape(step)} for particles of shape {here.shape}: "
+                    "it is not elementwise"
                 )
             target = here + (step if solver.relaxation == 1.0 else solver.relaxation * step)
             if solver.memory != 0.0:
