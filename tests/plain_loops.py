@@ -301,13 +301,13 @@ def rule_target(body: Body, rule: Part, j: int, here: Point, seen: list[Point]) 
     X = body.X
     if rule["type"] == "mean-displacement":
         rest = [X[near.particle] for near in body.neighbours[j]]
-        return plus(X[j], mean([minus(place, X_k) for place, X_k in zip(seen, rest)]))
+        return plus(X[j], mean([minus(place, X_k) for place, X_k in zip(seen, rest, strict=True)]))
     if rule["type"] == "distance-weighted":
         weights = [distance(place, here) for place in seen]
         total = math.fsum(weights)
         if total == 0.0:
             return here
-        weighted = mean([times(d, place) for d, place in zip(weights, seen)])
+        weighted = mean([times(d, place) for d, place in zip(weights, seen, strict=True)])
         return times(len(seen) / total, weighted)
     x, y = mean(seen)
     if rule["type"] == "mixed-coordinate":
@@ -385,7 +385,7 @@ def simulate(experiment: dict[str, Any]) -> dict[str, Any]:
         history.append(new)
 
     lost = [{bond for bond, s in broken.items() if s <= t} for t in times_0_to_end]
-    before_and_after = list(zip([history[0], *history], history))
+    before_and_after = list(zip([history[0], *history], history, strict=False))
     return {
         "number": [j + 1 for j in everyone],
         "site": [list(site) for site in body.sites],

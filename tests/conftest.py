@@ -1,0 +1,159 @@
+"""What several test modules share."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+import pbdkit
+from pbdkit.cli import main
+from pbdkit.scene.scene import Scene, build_scene
+
+Build = Callable[..., Scene]
+Refused = Callable[..., str]
+Install = Callable[..., None]
+
+
+class Result(NamedTuple):
+    """What a call of the program left behind."""
+
+    code: int
+    out: str
+    err: str
+
+
+Call = Callable[..., Result]
+
+
+@pytest.fixture
+def tensile() -> dict[str, Any]:
+    """A small tensile experiment: 4 × 3 particles in a frame of one layer, 30 numbers in all."""
+    return {
+        "version": 1,
+        "name": "tensile",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": 4, "rows": 3},
+        "rule": {"type": "barycentre"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "velocity", "velocity": [0.1, 0.0], "steps": 3},
+                "until": 3,
+            },
+        ],
+        "steps": 10,
+    }
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """``install("pbdkit-x", source)``: a distribution whose entry point is a module of that source.
+
+    It is found in this process and in those that it starts.
+    """
+    site = tmp_path / "site"
+    site.mkdir()
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    modules = []
+
+    def make(distribution: str, source: str, version: str = "1.0") -> None:
+        module = distribution.replace("-", "_")
+        modules.append(module)
+        (site / f"{module}.py").write_text(source)
+        info = site / f"{module}-{version}.dist-info"
+        info.mkdir()
+        metadata = f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
+        (info / "METADATA").write_text(metadata)
+        (info / "entry_points.txt").write_text(f"[pbdkit]\n{distribution} = {module}\n")
+        monkeypatch.syspath_prepend(site)
+
+    yield make
+    for module in modules:
+        sys.modules.pop(module, None)
+
+
+@pytest.fixture
+def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Build:
+    """The scene of an experiment file e.yaml with that text."""
+    monkeypatch.chdir(tmp_path)
+
+    def of(text: str | bytes, *settings: str, components: Any = ()) -> Scene:
+        Path("e.yaml").write_bytes(text.encode() if isinstance(text, str) else text)
+        return build_scene(pbdkit.load("e.yaml", settings=settings, components=components))
+
+    return of
+
+
+@pytest.fixture
+def refused(build: Build) -> Refused:
+    """The message of the ExperimentError that the text causes; never long."""
+
+    def message(text: str | bytes, *settings: str, components: Any = ()) -> str:
+        with pytest.raises(pbdkit.ExperimentError) as caught:
+            build(text, *settings, components=components)
+        assert len(str(caught.value)) < 2000
+        return str(caught.value)
+
+    return message
+
+
+@pytest.fixture
+def call(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tensile: dict[str, Any],
+) -> Call:
+    """Calls the program in a folder that is empty but for e.json, the tensile experiment."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    Path("e.json").write_text(json.dumps(tensile))
+
+    def of(*arguments: str) -> Result:
+        with pytest.raises(SystemExit) as caught:
+            main(list(arguments))
+        return Result(int(caught.value.code or 0), *capsys.readouterr())
+
+    return of
+
+
+PROBE = """
+import os, signal
+from typing import ClassVar, Literal
+import pbdkit
+seen = []
+
+class Probe(pbdkit.Diagnostic):
+    type: Literal["probe"] = "probe"
+    every_step: ClassVar[bool] = True
+
+    def variables(self):
+        return (pbdkit.Variable("NAME", DIMS, "zero", "1"),)
+
+    def measure(self, now):
+        if now.step == 3:
+            BODY
+        return (0.0,)
+
+@pbdkit.hookimpl
+def pbdkit_components():
+    return [Probe]
+"""
+
+
+@pytest.fixture
+def probing(install: Install) -> Install:
+    """``probing(body)`` installs a diagnostic `probe` that runs that body in step 3."""
+
+    def make(body: str = "pass", dims: str = "()", name: str = "probe") -> None:
+        source = PROBE.replace("BODY", body).replace("DIMS", dims).replace("NAME", name)
+        install("pbdkit-probe", source)
+
+    return make

@@ -1,0 +1,250 @@
+"""The program: exit codes, what it prints, which files it leaves, and what it imports."""
+
+# ruff: noqa: E501  (a row of a table is a line)
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import xarray
+
+import pbdkit
+from pbdkit.cli import COMMANDS
+
+Call = Callable[..., Any]
+Probing = Callable[..., None]
+OUT = Path("tensile.nc")
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+
+
+def left() -> list[str]:
+    return sorted(path.name for path in Path().iterdir() if path.name != "e.json")
+
+
+PROBED = ("run", "e.json", "--set", "diagnostics=[{type: probe}]")
+
+
+def test_every_command_explains_itself(call: Call) -> None:
+    listed = python("-m", "pbdkit", "--help").stdout
+    assert [c for c in COMMANDS if c not in listed or call(c, "--help").code] == []
+
+
+def test_run_writes_the_file_it_names(call: Call) -> None:
+    result = call("run", "e.json")
+    assert (result.code, result.err, left()) == (0, "", ["tensile.nc"])
+    assert "complete: 30 particles, 10 steps in " in result.out
+    with xarray.open_dataset(OUT) as ds:
+        assert ds.attrs["status"] == "complete"
+        xarray.testing.assert_equal(ds.load(), pbdkit.run("e.json", progress=False))
+    assert call("run", "paper/a", "--set", "steps=1", "--quiet") == (0, "", "")
+    assert left() == ["paper-a.nc", "tensile.nc"]
+
+
+def test_the_figures_of_run(call: Call) -> None:
+    result = call("run", "e.json", "--json")
+    figures = json.loads(result.out)
+    known = {"status": "complete", "steps": 10, "particles": 30, "output": "tensile.nc"}
+    assert known.items() <= figures.items()
+    measured = {"wall_s", "ns_per_particle_step", "peak_memory_mib", "engine"}
+    assert (set(figures) >= known.keys() | measured, result.err) == (True, "")
+
+
+def test_the_figures_of_check(call: Call) -> None:
+    figures = json.loads(call("check", "e.json", "--json").out)
+    known = {"particles": 30, "followers": 6, "bonds": 31, "warnings": []}
+    assert known.items() <= figures.items()
+    assert min(figures["memory_mib"], figures["output_mib"]) > 0
+    assert left() == []
+
+
+def test_check_warns_and_is_content(call: Call) -> None:
+    fracture = "--set=fracture={type: threshold, thresholds: [1.2]}"
+    others = ["--set=neighbours={type: chebyshev}", "--set=leaders=[]"]
+    result = call("check", "e.json", fracture, *others)
+    assert "warning: fracture.thresholds.0: 1.2 is below the largest rest length" in result.out
+    assert (result.code, "warning: leaders: there are none" in result.out) == (0, True)
+
+
+def test_an_existing_output_is_kept_unless_forced(call: Call) -> None:
+    OUT.write_text("mine")
+    message = "pbdkit: tensile.nc: exists; --force replaces it, -o names another file\n"
+    assert call("run", "e.json") == (2, "", message)
+    assert OUT.read_text() == "mine"
+    assert call("run", "e.json", "--force").code == 0
+    assert pbdkit.open(OUT).attrs["status"] == "complete"
+
+
+WRONG = {
+    "unknown command": (2, ["rnu"], "No such command 'rnu'"),
+    "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
+    "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "--set steps=0: steps: "),
+    "unknown type": (2, ["run", "e.json", "--set", "rule.type=x"], "unknown type 'x'"),
+    "missing plugin": (3, ["run", "e.json", "--set", "rule.type=no:x"], "no, which is not installed"),
+    "output is a folder": (2, ["run", "e.json", "-o", "."], ".: is a folder"),
+    "no such folder": (6, ["run", "e.json", "-o", "no/o.nc"], "no/o.nc: there is no folder no"),
+    "file for a folder": (6, ["run", "e.json", "-o", "e.json/o.nc"], "e.json/o.nc: there is no folder e.json"),
+    "closed folder": (6, ["run", "e.json", "-o", "/proc/o.nc"], "/proc/o.nc: cannot be written"),
+    "long file name": (6, ["run", "e.json", "-o", "o" * 300], "File name too long"),
+    "init over a file": (2, ["init", "e.json"], "e.json: exists and is left as it is"),
+    "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("code", "arguments", "message"), WRONG.values(), ids=WRONG)
+def test_exit_codes(call: Call, code: int, arguments: list[str], message: str) -> None:
+    result = call(*arguments)
+    assert message in result.err
+    assert (result.code, result.out, left()) == (code, "", [])
+    assert "Traceback" not in result.err
+
+
+def test_a_traceback_only_on_request(call: Call) -> None:
+    result = call("--debug", "run", "f.yaml")
+    assert (result.code, "Traceback" in result.err) == (2, True)
+
+
+SETTINGS = {
+    "a default absent in the file": ("solver.relaxation=0.5", lambda e: e.solver.relaxation == 0.5),
+    "a part absent in the file": ("record.every=5", lambda e: e.record.every == 5),
+    "a whole part": ("rule={type: mean-displacement}", lambda e: e.rule.type == "mean-displacement"),
+    "in a list": ("leaders.1.until=7", lambda e: e.leaders[1].until == 7),
+    "in two lists": ("leaders.1.motion.velocity.0=1e-3", lambda e: e.leaders[1].motion.velocity[0] == 1e-3),
+    "an item": ("leaders.0={select: {numbers: [8]}, motion: {type: hold}}", lambda e: e.leaders[0].select.numbers == (8,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("setting", "holds"), SETTINGS.values(), ids=SETTINGS)
+def test_a_setting(call: Call, setting: str, holds: Callable[[Any], bool]) -> None:
+    call("run", "e.json", "--set", setting)
+    assert holds(pbdkit.Experiment(**json.loads(pbdkit.open(OUT).attrs["experiment"])))
+
+
+UNSET = {
+    "steps": "expected PATH=VALUE, for instance rule.K=-0.002",
+    "leaders.-1.until=3": "'-1' is no position in a list of 2, from 0",
+    "leaders.².until=3": "'²' is no position in a list of 2, from 0",
+    "steps.x=1": "'x' is looked for in a single value",
+    "rule.K=1": "rule.K: unknown key",
+    "rulee.K=1": "rulee: unknown key; did you mean 'rule'?",
+    "steps=[1": "not valid YAML",
+}
+
+
+@pytest.mark.parametrize(("setting", "message"), UNSET.items())
+def test_a_wrong_setting(call: Call, setting: str, message: str) -> None:
+    result = call("run", "e.json", "--set", setting)
+    assert (result.code, left()) == (2, [])
+    assert result.err.startswith(f"pbdkit: --set {setting}")
+    assert message in result.err
+
+
+BLOWN = ["--set=solver.relaxation=50", "--set=steps=300", "--set=diagnostics=[{type: pe1}]"]
+
+
+def test_a_run_that_diverges_keeps_what_was_finite(call: Call) -> None:
+    result = python("-m", "pbdkit", "run", "e.json", *BLOWN)
+    assert (result.returncode, left()) == (4, ["tensile.nc"])
+    ds = pbdkit.open(OUT)
+    assert ds.attrs["status"] == "diverged"
+    assert int(ds["time"][-1]) > 50
+    assert bool(abs(ds["position"]).max() < float("inf"))
+    assert "left the finite numbers under rule 'barycentre'" in result.stderr
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("every", [1, 7])
+def test_an_interruption_keeps_all(call: Call, probing: Probing, name: str, every: int) -> None:
+    probing(f"signal.raise_signal(signal.{name})")
+    result = call(*PROBED, "--set", f"record.every={every}")
+    assert (result.code, left()) == (130, ["tensile.nc"])
+    assert result.err.startswith("pbdkit: interrupted: ")
+    ds = pbdkit.open(OUT)
+    assert ds.attrs["status"] == "interrupted"
+    assert int(ds["time"][-1]) == 3
+
+
+def test_a_killed_run_leaves_nothing_that_looks_like_a_result(call: Call, probing: Probing) -> None:
+    probing("os.kill(os.getpid(), signal.SIGKILL)")
+    OUT.write_text("mine")
+    assert python("-m", "pbdkit", *PROBED, "--force").returncode == -9
+    assert OUT.read_text() == "mine"
+    assert [str(path) for path in Path().glob("*.nc")] == ["tensile.nc"]
+
+
+FAILING = {
+    "second Ctrl-C": (130, {"body": "raise KeyboardInterrupt"}, "interrupted"),
+    "error of a plugin": (3, {"body": "raise ZeroDivisionError"}, "probe"),
+    "OSError of a plugin": (3, {"body": "raise OSError"}, "probe"),
+    "too many values": (3, {"body": "return (0.0, 1.0)"}, "probe"),
+    "wrong shape": (3, {"body": "return ([1.0, 2.0],)"}, "probe"),
+    "unknown dimension": (3, {"dims": "('nowhere',)"}, "probe"),
+    "taken name": (3, {"name": "position"}, "probe"),
+}
+
+
+@pytest.mark.parametrize(("code", "fault", "word"), FAILING.values(), ids=FAILING)
+def test_a_run_that_fails_leaves_nothing(
+    call: Call, probing: Probing, code: int, fault: Any, word: str
+) -> None:
+    probing(**fault)
+    result = call(*PROBED)
+    assert (result.code, left()) == (code, [])
+    assert word in result.err
+
+
+def test_the_file_appears_only_whole(call: Call, probing: Probing) -> None:
+    probing("seen.extend(os.listdir())")
+    assert call(*PROBED).code == 0
+    seen = sys.modules["pbdkit_probe"].seen
+    assert ("e.json" in seen, "tensile.nc" in seen) == (True, False)
+
+
+HELP = "from pbdkit.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+
+
+@pytest.mark.parametrize("start", [HELP, "import pbdkit"], ids=["help", "import"])
+def test_starting_loads_nothing_heavy(start: str) -> None:
+    heavy = "{'xarray', 'scipy', 'numba', 'netCDF4', 'matplotlib', 'rich'}"
+    ask = f"{start}\nimport sys\nprint('heavy:', sorted({heavy} & set(sys.modules)))"
+    assert python("-c", ask).stdout.splitlines()[-1] == "heavy: []"
+
+
+ASKED = {
+    "run": (["run", "e.json"], False),
+    "the distribution named": (["check", "e.json", "--set", "rule.type=pbdkit:barycentre"], False),
+    "list": (["plugins", "list", "--json"], True),
+}
+
+
+@pytest.mark.parametrize(("arguments", "imported"), ASKED.values(), ids=ASKED)
+def test_built_in_parts_import_no_plugin(
+    install: Any, call: Call, arguments: list[str], imported: bool
+) -> None:
+    install("pbdkit-loud", "open('imported', 'w').close()\nraise ImportError('loud')")
+    assert call(*arguments).code == 0
+    assert Path("imported").exists() == imported
+
+
+def test_plugins_list_has_a_row_a_plugin_and_a_row_a_component(install: Any, call: Call) -> None:
+    install("pbdkit-sick", "raise ImportError('sick')", "0.3")
+    rows = json.loads(call("plugins", "list", "--json").out)
+    assert {*rows[-1]} == {"interface", "type", "distribution", "version", "state", "reason"}
+    assert {row["distribution"] for row in rows} == {"pbdkit", "pbdkit-sick"}
+    assert (rows[-1]["state"], rows[-1]["reason"]) == ("broken", "ImportError: sick")
+
+
+def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> None:
+    assert call("init", "a.yaml").code == 0
+    assert call("run", "a.yaml", "--set", "steps=5", "-o", "a.nc").code == 0
+    assert call("plot", "a.nc", "--color", "pe1").code == 0
+    assert left() == ["a.nc", "a.png", "a.yaml"]

@@ -1,0 +1,179 @@
+"""Every component: frozen, pure, the same after JSON and after pickling."""
+
+import json
+import pickle
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pbdkit import Experiment, Here, Vector, load
+from pbdkit.components import pbdkit_components
+from pbdkit.components.fracture import NoFracture, Threshold
+from pbdkit.components.lattices import Hexagonal
+from pbdkit.components.neighbours import Coordination
+from pbdkit.components.rules import (
+    Barycentre,
+    DistanceWeighted,
+    MeanDisplacement,
+    MixedCoordinate,
+)
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.interfaces import Setting
+from pbdkit.scene.neighbourhood import build_neighbourhood
+
+REQUIRED = {
+    "a": 1.5,
+    "b": 0.1,
+    "angle": 70.0,
+    "K": -0.004,
+    "thresholds": [6.0, 0.1],
+    "numbers": [3, 1],
+    "radius": 1.5,
+    "poisson_ratio": 0.3,
+    "length": 0.1,
+}
+
+
+def an_instance(component):
+    """One of it, with the parameters that it cannot do without."""
+    fields = component.model_fields.items()
+    given = {f.alias or name: REQUIRED[name] for name, f in fields if f.is_required()}
+    return component.model_validate(given)
+
+
+every_component = pytest.mark.parametrize(
+    "component", [an_instance(c) for c in pbdkit_components()], ids=lambda c: type(c).__name__
+)
+every_experiment = pytest.mark.parametrize("name", shipped_names())
+every_rule = pytest.mark.parametrize(
+    "rule",
+    [Barycentre(), MeanDisplacement(), DistanceWeighted(), MixedCoordinate(K=0.3)],
+    ids=lambda r: r.type,
+)
+
+
+@every_component
+def test_components_are_frozen(component):
+    before = component.model_dump()
+    for name in type(component).model_fields:
+        with pytest.raises(ValidationError, match="frozen"):
+            setattr(component, name, getattr(component, name))
+    assert component.model_dump() == before
+    assert hash(component) == hash(component.model_copy())
+
+
+@every_component
+def test_components_survive_json_and_pickling(component):
+    kind = type(component)
+    assert kind.model_validate_json(component.model_dump_json()) == component
+    assert kind.model_validate(json.loads(component.model_dump_json())) == component
+    assert pickle.loads(pickle.dumps(component)) == component
+
+
+@every_component
+def test_components_take_no_unknown_key(component):
+    with pytest.raises(ValidationError, match="nonsense"):
+        type(component).model_validate(component.model_dump() | {"nonsense": 1})
+
+
+@every_experiment
+def test_shipped_experiments_survive_json_and_pickling(name):
+    experiment = load(name)
+    as_data = experiment.model_dump()
+    assert Experiment(**json.loads(experiment.model_dump_json())).model_dump() == as_data
+    assert Experiment(**as_data).model_dump() == as_data
+    assert pickle.loads(pickle.dumps(experiment)).model_dump() == as_data
+
+
+def test_experiments_that_say_the_same_are_equal():
+    one, other = load("paper/a"), load("paper/a")
+    assert one == other
+    assert one != load("paper/b")
+
+
+def read_only(rng):
+    """A vector of two arrays that nobody can write to."""
+    arrays = rng.normal(size=(2, 4, 3))
+    arrays.flags.writeable = False
+    return Vector(*arrays)
+
+
+def parameters_of(rule):
+    cell = Hexagonal(a=1.0).cell()
+    slots = build_neighbourhood(cell, Coordination()).slots
+    setting = Setting(cell, slots, Vector(0.0, 0.0), Vector(4.0, 3.0))
+    return slots[0][0], SimpleNamespace(**rule.parameters(setting))
+
+
+@every_rule
+def test_rules_change_none_of_their_inputs_and_give_the_same_twice(rule):
+    rng = np.random.default_rng(0)
+    slot, p = parameters_of(rule)
+    d, here = read_only(rng), Here(read_only(rng), read_only(rng))
+
+    def target():
+        total = tuple(np.array(part) for part in rule.gather(d, slot.rest, rule.weights(slot), p))
+        for part in total:
+            part.flags.writeable = False
+        return np.array(rule.apply(total, here, p))
+
+    assert np.array_equal(target(), target())
+
+
+@every_rule
+def test_rules_are_elementwise(rule):
+    rng = np.random.default_rng(0)
+    slot, p = parameters_of(rule)
+    d, u, X = read_only(rng), read_only(rng), read_only(rng)
+    w = rule.weights(slot)
+    whole = np.array(rule.apply(rule.gather(d, slot.rest, w, p), Here(u, X), p))
+
+    def at(v, place):
+        return Vector(float(v.x[place]), float(v.y[place]))
+
+    for place in np.ndindex(4, 3):
+        total = rule.gather(at(d, place), slot.rest, w, p)
+        one = rule.apply(total, Here(at(u, place), at(X, place)), p)
+        assert np.array_equal(np.array(one, float), whole[(slice(None), *place)])
+
+
+@every_rule
+def test_zero_differences_of_opposite_pairs_mean_rest(rule):
+    slot, p = parameters_of(rule)
+    zero, r = Vector(0.0, 0.0), slot.rest
+    ends = (r, Vector(-r.x, -r.y))
+    parts = [rule.gather(zero, end, rule.weights(slot), p) for end in ends]
+    total = tuple(a + b for a, b in zip(*parts, strict=True))
+    assert tuple(rule.apply(total, Here(zero, Vector(3.0, 3.0)), p)) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        NoFracture(),
+        Threshold(thresholds=(1.5,)),
+        Threshold(thresholds=(1.5,), placement=1.2),
+        Threshold(thresholds=(1.5,), fictitious="reference"),
+    ],
+    ids=["none", "cell", "loosened", "reference"],
+)
+def test_fracture_functions_are_pure_and_the_same_from_both_ends(model):
+    rng = np.random.default_rng(0)
+    slot = build_neighbourhood(Hexagonal(a=1.0).cell(), Coordination()).slots[0][0]
+    d, r, c = read_only(rng), slot.rest, model.constants(slot)
+    p = SimpleNamespace(**model.parameters())
+    breaks = model.breaks(d, r, c, p)
+    back = model.breaks(Vector(-d.x, -d.y), Vector(-r.x, -r.y), c, p)
+    assert np.array_equal(breaks, back)
+    assert np.any(breaks) == model.can_break
+    u = read_only(rng)
+    lost = np.array([np.broadcast_to(part, (4, 3)) for part in model.fictitious(u, r, p)])
+    again = np.array([np.broadcast_to(part, (4, 3)) for part in model.fictitious(u, r, p)])
+    assert np.array_equal(lost, again)
+    if getattr(model, "fictitious_at", "") == "reference":
+        assert np.array_equal(lost, -np.array(u))
+    else:
+        expected = (getattr(model, "placement", 1.0) - 1.0) * np.array(r)
+        assert np.array_equal(lost, np.broadcast_to(expected[:, None, None], lost.shape))

@@ -1,0 +1,117 @@
+"""Neighbourhoods of every lattice and metric: shells, opposite pairs, mutuality."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from property_cases import LATTICES, LATTICES_AND_NEIGHBOURS, NEIGHBOURS, scene_of
+
+from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
+from pbdkit.components.neighbours import Chebyshev, Coordination
+from pbdkit.scene.neighbourhood import build_neighbourhood
+
+combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_NEIGHBOURS)
+spacing = st.floats(0.3, 3.0)
+any_lattice = st.one_of(
+    st.builds(Square, a=spacing),
+    st.builds(Rectangular, a=spacing, b=spacing),
+    st.builds(CentredRectangular, a=spacing, b=spacing),
+    st.builds(Hexagonal, a=spacing),
+    st.builds(Oblique, a=spacing, b=spacing, angle=st.floats(20.0, 160.0)),
+)
+any_metric = st.builds(
+    lambda metric, shells: metric(shells=shells),
+    st.sampled_from([Coordination, Chebyshev]),
+    st.integers(1, 4),
+)
+
+
+def counts(lattice, metric):
+    """How many neighbours each shell has, asked of every sublattice."""
+    found = {
+        tuple(len(shell) for shell in metric.shells_around(lattice.cell(), s))
+        for s in range(len(lattice.cell().sites))
+    }
+    assert len(found) == 1
+    return found.pop()
+
+
+@pytest.mark.parametrize("a", [1.0, 0.1, 0.7, 1e6])
+@pytest.mark.parametrize(
+    ("lattice", "metric", "expected"),
+    [
+        (Square, Coordination, (4, 4, 4)),
+        (Hexagonal, Coordination, (6, 6, 6)),
+        (Square, Chebyshev, (8, 16)),
+        (Hexagonal, Chebyshev, (8, 16)),
+    ],
+)
+def test_shells_have_the_counts_of_the_paper(lattice, metric, expected, a):
+    assert counts(lattice(a=a), metric(shells=len(expected))) == expected
+
+
+def test_nearly_equal_distances_share_a_shell():
+    # Equal within 1e-6 relative (model.md, section 4).
+    assert counts(Rectangular(a=1.0, b=1.0 + 5e-7), Coordination(shells=1)) == (4,)
+    assert counts(Rectangular(a=1.0, b=1.0 + 5e-6), Coordination(shells=2)) == (2, 2)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(lattice=any_lattice, metric=any_metric)
+def test_slots_come_in_exactly_opposite_mutual_pairs(lattice, metric):
+    neighbourhood = build_neighbourhood(lattice.cell(), metric)
+    slots = [slot for own in neighbourhood.slots for slot in own]
+    by_key = {(s.source, s.target, s.cell): s for s in slots}
+    assert len(by_key) == len(slots) == 2 * len(neighbourhood.planes)
+    for slot in slots:
+        other = by_key[slot.target, slot.source, (-slot.cell[0], -slot.cell[1])]
+        assert (other.rest.x, other.rest.y) == (-slot.rest.x, -slot.rest.y)
+        assert other.site == (-slot.site[0], -slot.site[1])
+        assert other.shell == slot.shell
+    for own in neighbourhood.slots:
+        assert sum(s.rest.x for s in own) == 0.0
+        assert sum(s.rest.y for s in own) == 0.0
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(lattice=any_lattice, shells=st.integers(1, 4))
+def test_coordination_finds_the_smallest_distances(lattice, shells):
+    neighbourhood = build_neighbourhood(lattice.cell(), Coordination(shells=shells))
+    chosen = max(max(lengths) for lengths in neighbourhood.shells())
+    for s in range(len(lattice.cell().sites)):
+        near = lattice.cell().offsets(s, chosen * (1 + 1e-7))
+        assert len(neighbourhood.slots[s]) >= len(near)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(lattice=any_lattice, shells=st.integers(1, 4))
+def test_chebyshev_shell_n_is_index_distance_n(lattice, shells):
+    # A square of (2n + 1)² primitive cells less that of n - 1.
+    assert counts(lattice, Chebyshev(shells=shells)) == tuple(8 * n for n in range(1, shells + 1))
+
+
+@combinations
+def test_every_bond_has_the_rest_offset_of_its_particles(lattice, neighbours):
+    scene = scene_of(lattice=lattice, neighbours=neighbours)
+    X, (low, high) = scene.raster.reference(), scene.bonds.ends.T
+    rest = [np.hypot(*s.rest) for own in scene.neighbourhood.slots for s in own]
+    lengths = np.hypot(*(X[high] - X[low]).T)
+    # Sites up to 10 from the origin are rounded to 1e-15.
+    assert np.abs(lengths[:, None] - np.array(rest)).min(axis=1).max() < 1e-14
+    assert len({tuple(bond) for bond in scene.bonds.ends.tolist()}) == len(low)
+    assert (low < high).all()
+
+
+@combinations
+def test_with_its_frame_every_body_particle_has_all_neighbours(lattice, neighbours):
+    scene = scene_of(lattice=lattice, neighbours=neighbours)
+    ends = np.bincount(scene.bonds.ends.ravel(), minlength=scene.raster.count)
+    assert set(ends[scene.raster.body_rows]) == {len(scene.neighbourhood.slots[0])}
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("neighbours", NEIGHBOURS)
+def test_frame_maps_are_means(lattice, neighbours):
+    scene = scene_of(lattice=lattice, neighbours=neighbours)
+    total = np.bincount(scene.frame.map.point, scene.frame.map.weight)
+    np.testing.assert_allclose(total, 1.0, rtol=1e-15)

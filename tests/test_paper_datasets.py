@@ -1,0 +1,159 @@
+"""The datasets of the paper's cases: their shape, their files, and that they can be made again."""
+
+import json
+import subprocess
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+import xarray
+
+import pbdkit
+from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.running import run_into
+from pbdkit.scene.scene import build_scene
+
+CASES = ["a", "a-text", "b", "c", "d1", "d2", "e", "f1", "f2", "g"]
+TORN = ["d1", "d2", "f1", "f2", "g"]
+every_case = pytest.mark.parametrize("case", CASES)
+LEADER, FOLLOWER, FRAME = 0, 1, 2
+
+
+@cache
+def run(case):
+    """The dataset of a shipped experiment; one run serves all tests, none changes it."""
+    return pbdkit.run(f"paper/{case}", progress=False)
+
+
+def moved(case):
+    """u, (time, particle, axis)."""
+    ds = run(case)
+    return (ds.position - ds.reference).transpose("time", "particle", "axis")
+
+
+def track_x(case, number):
+    """The x displacement of one particle at every step."""
+    return moved(case).sel(particle=number, axis="x").values
+
+
+BASE = {
+    "time": (("time",), "int64"),
+    "axis": (("axis",), None),
+    "particle": (("particle",), "int64"),
+    "number": (("particle",), "int64"),
+    "site": (("particle", "index"), None),
+    "reference": (("particle", "axis"), "float64"),
+    "position": (("time", "particle", "axis"), "float64"),
+    "kind": (("time", "particle"), "int8"),
+    "bond": (("bond", "end"), "int64"),
+    "shell": (("bond",), None),
+    "pe1": (("time", "particle"), "float64"),
+    "pe2": (("time", "particle"), "float64"),
+    "track": (("step", "tracked", "axis"), "float64"),
+    "step": (("step",), "int64"),
+    "tracked": (("tracked",), "int64"),
+}
+FRACTURE = {
+    "broken_step": (("bond",), None),
+    "pe1_intact": (("time", "particle"), "float64"),
+    "broken_bonds": (("time",), "int64"),
+}
+ATTRIBUTES = [
+    "Conventions", "schema_version", "pbdkit_version", "experiment", "plugins", "status",
+    "stop_reason", "created",
+]  # fmt: skip
+
+
+@every_case
+def test_datasets_have_the_names_dims_and_dtypes_of_the_contract(case):
+    ds = run(case)
+    expected = BASE | (FRACTURE if case in TORN else {})
+    assert set(ds.variables) == set(expected)
+    for name, (dims, dtype) in expected.items():
+        assert ds[name].dims == dims, name
+        assert dtype is None or ds[name].dtype == dtype, name
+        assert np.issubdtype(ds[name].dtype, np.integer) or dtype == "float64" or name == "axis"
+    assert {"time", "axis", "number", "particle"} <= set(ds.coords)
+    assert ds.axis.values.tolist() == ["x", "y"]
+    assert np.array_equal(ds.particle, ds.number)
+    assert np.array_equal(ds.particle, np.arange(1, ds.sizes["particle"] + 1))
+    assert np.array_equal(ds.time, np.arange(ds.sizes["time"]))
+
+
+@every_case
+def test_datasets_have_the_attributes_of_the_contract(case):
+    ds = run(case)
+    assert set(ATTRIBUTES) <= set(ds.attrs)
+    assert ds.attrs["status"] == "complete"
+    assert "pbdkit" in json.loads(ds.attrs["plugins"])
+    experiment = json.loads(ds.attrs["experiment"])
+    assert experiment["frame"]["type"] in ("mean", "first")
+    assert experiment["solver"]["type"] == "stepping"
+    assert ds.kind.attrs["flag_values"].tolist() == [0, 1, 2]
+    assert ds.kind.attrs["flag_meanings"] == "leader follower frame"
+    for name in ("pe1", "pe2", "track", "position", "reference"):
+        assert ds[name].attrs["units"]
+        assert ds[name].attrs["long_name"]
+
+
+@every_case
+def test_bonds_are_sorted_once_each_and_have_a_body_end(case):
+    ds = run(case)
+    bond, body = ds.bond.values, (ds.kind[0] != FRAME).values
+    assert (bond[:, 0] < bond[:, 1]).all()
+    assert np.array_equal(np.unique(bond, axis=0), bond)
+    assert body[bond].any(axis=1).all()
+
+
+@every_case
+def test_leaders_lead_when_they_should_and_stand_where_they_should(case):
+    ds = run(case)
+    kind, u = ds.kind.values, moved(case).values
+    assert np.array_equal(kind[0], kind[1])
+    if case == "e":
+        return
+    right = (ds.site[:, 0].values == 9) & (kind[0] == LEADER)
+    assert right.sum() == 10
+    released = case in ("a", "a-text")
+    assert (kind[11:, right] == (FOLLOWER if released else LEADER)).all()
+    speed = 0.35 if case in "abc" else 1.2
+    expected = speed * np.minimum(np.arange(11), 10)[:, None]
+    np.testing.assert_allclose(u[:11, right, 0] - expected, 0.0, atol=1e-14)
+    assert not u[:, right, 1][kind[:, right] == LEADER].any()
+
+
+@pytest.mark.parametrize("case", ["a", "f2"])
+def test_a_rerun_from_the_dataset_alone_is_the_same_bit_for_bit(case):
+    again = pbdkit.rerun(run(case), progress=False)
+    assert again.drop_attrs().identical(run(case).drop_attrs())
+    assert again.attrs["experiment"] == run(case).attrs["experiment"]
+
+
+@every_case
+def test_the_file_is_identical_to_the_dataset_in_memory(case, tmp_path):
+    path = tmp_path / "out.nc"
+    run_into(NetcdfSink(path), build_scene(pbdkit.load(f"paper/{case}")), progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["out.nc"]
+    with xarray.open_dataset(path) as opened:
+        in_memory = run(case)
+        created = {"created": opened.attrs["created"]}
+        assert opened.load().identical(in_memory.assign_attrs(created))
+        for name, variable in in_memory.variables.items():
+            assert name == "axis" or opened[name].dtype == variable.dtype
+
+
+def test_the_file_opens_with_xarray_alone(tmp_path):
+    path = tmp_path / "out.nc"
+    subprocess.run(
+        [sys.executable, "-m", "pbdkit", "run", "paper/b", "-o", path, "--quiet"], check=True
+    )
+    program = (
+        "import sys; sys.modules['pbdkit'] = None\n"
+        "import xarray; ds = xarray.open_dataset(sys.argv[1]).load()\n"
+        "print(repr(float(ds.position.sel(time=100, particle=67, axis='y'))))\n"
+        "assert not [m for m in sys.modules if m.startswith('pbdkit.')]"
+    )
+    command = [sys.executable, "-c", program, path]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert float(printed) == float(run("b").position.sel(time=100, particle=67, axis="y"))
