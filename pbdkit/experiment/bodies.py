@@ -1,37 +1,70 @@
-"""Bodies: which sites of the lattice are particles (model.md, section 3). A closed family."""
+"""All bodies that an experiment can name; a closed family. Those made of others stand here."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from functools import reduce
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, SerializeAsAny
 
+from pbdkit.experiment.body import Body, Box, Floats, Grid, Sites
+from pbdkit.experiment.outlines import Disc, Dogbone, Polygon, Rectangle, Ring
 from pbdkit.experiment.parts import closed_part
-from pbdkit.interfaces import Component, Lattice
-from pbdkit.interfaces.lattice import Index
-
-Count = Annotated[int, Field(ge=1, le=2**31)]
 
 
-class Body(Component):
-    """An outline that is filled with the sites of a lattice."""
+class Union(Body):
+    """All that lies in one of its parts."""
 
-    @abstractmethod
-    def window(self, lattice: Lattice) -> tuple[Index, Index]:
-        """The smallest and the largest site index (i, j); sites between that exist are the body."""
+    type: Literal["union"] = "union"
+    of: Bodies
 
+    def boxes(self) -> list[Box]:
+        """Those of all parts."""
+        return [box for part in self.of for box in part.boxes()]
 
-class Grid(Body):
-    """`columns` × `rows` sites from (0, 0)."""
-
-    type: Literal["grid"] = "grid"
-    columns: Count
-    rows: Count
-
-    def window(self, lattice: Lattice) -> tuple[Index, Index]:
-        """(0, 0) to (columns - 1, rows - 1)."""
-        return (0, 0), (self.columns - 1, self.rows - 1)
+    def distance(self, at: Sites) -> Floats:
+        """The smallest."""
+        return reduce(np.minimum, (part.distance(at) for part in self.of))
 
 
-AnyBody = Annotated[SerializeAsAny[Body], closed_part(Body, Grid)]
+class Intersection(Body):
+    """All that lies in every part."""
+
+    type: Literal["intersection"] = "intersection"
+    of: Bodies
+
+    def boxes(self) -> list[Box]:
+        """Those of the first part."""
+        return self.of[0].boxes()
+
+    def distance(self, at: Sites) -> Floats:
+        """The largest."""
+        return reduce(np.maximum, (part.distance(at) for part in self.of))
+
+
+class Difference(Body):
+    """The first part less the others; sites on the outline of what is cut out stay."""
+
+    type: Literal["difference"] = "difference"
+    of: Bodies
+
+    def boxes(self) -> list[Box]:
+        """Those of the first part."""
+        return self.of[0].boxes()
+
+    def distance(self, at: Sites) -> Floats:
+        """The largest of the first distance and the others' negatives."""
+        first, *others = (part.distance(at) for part in self.of)
+        return reduce(np.maximum, (-other for other in others), first)
+
+
+AnyBody = Annotated[
+    SerializeAsAny[Body],
+    closed_part(
+        Body, Grid, Rectangle, Disc, Ring, Polygon, Dogbone, Union, Intersection, Difference
+    ),
+]
+Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]
+for _composed in (Union, Intersection, Difference):
+    _composed.model_rebuild()

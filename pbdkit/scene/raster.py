@@ -99,6 +99,18 @@ class Raster:
         n = np.arange(block.start[1], block.stop[1])[None, :] + self.first[1]
         return positions(self.lattice.cell(), block.sublattice, m, n)
 
+    def body_row_at_site(self, site: NDArray[np.int32]) -> Indices:
+        """The row of the body particle at each site (i, j), (entry, 2); -1 where there is none."""
+        cell = self.lattice.cell()
+        i, j = site[:, 0].astype(np.intp), site[:, 1].astype(np.intp)
+        s = _sublattices(cell)[i % cell.period[0], j % cell.period[1]]
+        m, n = i // cell.period[0] - self.first[0], j // cell.period[1] - self.first[1]
+        inside = (s >= 0) & (m >= 0) & (m < self.shape[1]) & (n >= 0) & (n < self.shape[2])
+        rows = np.full(len(site), -1, np.intp)
+        place = np.ravel_multi_index((s[inside], m[inside], n[inside]), self.shape)
+        rows[inside] = np.where(self.kind.ravel()[place] == FOLLOWER, self.row_at[place], -1)
+        return rows
+
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
         inside = self.kind[sublattice] == FOLLOWER
@@ -131,8 +143,8 @@ def build_raster(
     cell = lattice.cell()
     wanted = np.pad(body, layers)
     low = (origin[0] - layers, origin[1] - layers)
-    wanted &= _exists(cell, low, wanted.shape)
-    window = _dilated(wanted, layers) & _exists(cell, low, wanted.shape)
+    wanted &= existing(cell, low, wanted.shape)
+    window = _dilated(wanted, layers) & existing(cell, low, wanted.shape)
     i, j = np.nonzero(window)
     kinds = np.where(wanted[i, j], FOLLOWER, FRAME).astype(np.int8)
     i, j = i + low[0], j + low[1]
@@ -159,7 +171,16 @@ def _sublattices(cell: Cell) -> Indices:
     return found
 
 
-def _exists(cell: Cell, low: Index, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def positions_of_sites(lattice: Lattice, i: Indices, j: Indices) -> Vector:
+    """X of the sites (i, j), a component each; meaningless where the lattice has a hole."""
+    cell = lattice.cell()
+    p, q = cell.period
+    x, y = positions(cell, _sublattices(cell)[i % p, j % q], i // p, j // q)
+    return Vector(x + lattice.origin[0], y + lattice.origin[1])
+
+
+def existing(cell: Cell, low: Index, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which sites of a window of indices, from `low` on, the lattice has."""
     i, j = np.arange(low[0], low[0] + shape[0]), np.arange(low[1], low[1] + shape[1])
     sublattices = _sublattices(cell) >= 0
     return sublattices[np.ix_(i % cell.period[0], j % cell.period[1])]

@@ -7,12 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Vector
 from pbdkit.scene.bonds import BondTable, build_bond_table
+from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood
@@ -75,13 +74,23 @@ def _build(experiment: Experiment) -> Scene:
             "neighbours: they lie along one line only, so that rows do not feel each other; "
             "more shells, or chebyshev neighbours, connect them"
         )
+    if experiment.neighbours.nearness() and experiment.rule.weights(neighbourhood.slots[0][0]):
+        raise ExperimentError(
+            f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
+            "neighbours do not have; set neighbours.reevaluate: false",
+            ("neighbours",),
+        )
     layers = experiment.frame.depth(neighbourhood.reach)
-    low, high = experiment.body.window(experiment.lattice)
-    window = (high[0] - low[0] + 1, high[1] - low[1] + 1)
-    refuse_too_large(experiment, neighbourhood, window, layers)
-    raster = build_raster(
-        experiment.lattice, np.ones(window, bool), low, layers, neighbourhood.reach_in_cells
-    )
+    low, high = window(experiment.body, experiment.lattice)
+    extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
+    refuse_too_large(experiment, neighbourhood, extent, layers)
+    body, first = fill(experiment.body, experiment.lattice)
+    if layers and has_narrow_slot(body, layers):
+        warnings.append(
+            f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
+            "belong to both faces; widen it, or take fewer layers"
+        )
+    raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
     _check_diagnostics(experiment, raster)
     leading = build_leading(raster, experiment.leaders, experiment.steps)
     frame = build_frame(raster, experiment.frame)
