@@ -14,13 +14,16 @@ from pydantic import (
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
+    model_validator,
 )
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.bodies import AnyBody
 from pbdkit.experiment.faults import located, report
+from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.parts import brief, closed_part, fault, open_part
+from pbdkit.experiment.record import Record
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
     INTERFACES,
@@ -59,12 +62,6 @@ Name = Annotated[
 Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
 
 
-class Reference(Component):
-    """The run starts from the reference configuration."""
-
-    type: Literal["reference"] = "reference"
-
-
 class Stepping(Component):
     """One step after the other.
 
@@ -77,27 +74,12 @@ class Stepping(Component):
     memory: float = 0.0
 
 
-class Record(Strict):
-    """What is kept: every so many steps; time 0 and the last step always."""
-
-    every: Annotated[int, Field(ge=1)] = 1
-
-    def keeps(self, step: int, steps: int) -> bool:
-        """Whether that step of a run of `steps` is recorded."""
-        return step % self.every == 0 or step == steps
-
-    def count(self, steps: int) -> int:
-        """How many steps of a run of `steps` are recorded."""
-        return steps // self.every + 1 + (steps % self.every > 0)
-
-
 AnyLattice = Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
 AnyNeighbours = Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)]
 AnyRule = Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
 AnyFrame = Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)]
 AnyFracture = Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)]
 AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
-AnyInitial = Annotated[SerializeAsAny[Reference], closed_part(Reference, Reference)]
 AnySolver = Annotated[SerializeAsAny[Stepping], closed_part(Stepping, Stepping)]
 
 
@@ -128,6 +110,18 @@ class Experiment(Strict):
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
     solver: AnySolver = _default("stepping")
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        if self.record.at is not None and self.record.at[-1] > self.steps:
+            raise fault(f"step {self.record.at[-1]} is beyond the run's {self.steps}", key="record")
+        if self.neighbours.nearness() and self.fracture.can_break:
+            raise fault(
+                "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
+                "set neighbours.reevaluate: false or fracture: {type: none}",
+                key="fracture",
+            )
+        return self
 
     _source: Source = PrivateAttr(default_factory=Source)
     _registry: Registry = PrivateAttr()

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializeAsAny
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, SerializeAsAny, model_validator
 
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component, Pair
+
+Floats = NDArray[np.floating[Any]]
+Steps = Annotated[int, Field(ge=1)]
 
 
 class Motion(Component):
     """A prescribed motion, counted from the position at which it starts."""
 
     @abstractmethod
-    def offset(self, n: int) -> Pair:
-        """How far from its start the leader stands at the end of the motion's n-th step, n ≥ 1."""
+    def offset(self, n: int, start: Floats) -> Floats:
+        """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1.
+
+        `start` are the positions at which the motion found them, (particle, axis); so is what is
+        returned, or (axis,) where it is the same for all.
+        """
 
     @abstractmethod
     def knots(self) -> tuple[int, ...]:
-        """The steps n between which, and after which, the offset is linear in n."""
+        """The steps n between which, and after which, the offset changes as one formula in n."""
 
 
 class Hold(Motion):
@@ -28,9 +38,9 @@ class Hold(Motion):
 
     type: Literal["hold"] = "hold"
 
-    def offset(self, n: int) -> Pair:
+    def offset(self, n: int, start: Floats) -> Floats:
         """None."""
-        return (0.0, 0.0)
+        return np.zeros(2)
 
     def knots(self) -> tuple[int, ...]:
         """None."""
@@ -42,12 +52,11 @@ class Velocity(Motion):
 
     type: Literal["velocity"] = "velocity"
     velocity: Pair
-    steps: Annotated[int, Field(ge=1)]
+    steps: Steps
 
-    def offset(self, n: int) -> Pair:
+    def offset(self, n: int, start: Floats) -> Floats:
         """velocity · min(n, steps)."""
-        moved = min(n, self.steps)
-        return (self.velocity[0] * moved, self.velocity[1] * moved)
+        return np.array(self.velocity) * min(n, self.steps)
 
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
@@ -60,13 +69,83 @@ class Displace(Motion):
     type: Literal["displace"] = "displace"
     displacement: Pair
 
-    def offset(self, n: int) -> Pair:
+    def offset(self, n: int, start: Floats) -> Floats:
         """The displacement, from the first step on."""
-        return self.displacement
+        return np.array(self.displacement)
 
     def knots(self) -> tuple[int, ...]:
         """The first step."""
         return (1,)
 
 
-AnyMotion = Annotated[SerializeAsAny[Motion], closed_part(Motion, Hold, Velocity, Displace)]
+class Path(Motion):
+    """Stands `displacements[k]` from its start at its step `steps[k]`; linear between, from no
+    displacement at its step 0, and the last is kept."""
+
+    type: Literal["path"] = "path"
+    steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1)]
+    displacements: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Path:
+        if len(self.steps) != len(self.displacements):
+            raise ValueError(
+                f"as many displacements as steps are needed: {len(self.displacements)} given "
+                f"for {len(self.steps)}"
+            )
+        if any(a >= b for a, b in zip(self.steps, self.steps[1:], strict=False)):
+            raise ValueError(f"steps must increase, got {list(self.steps)}")
+        return self
+
+    def offset(self, n: int, start: Floats) -> Floats:
+        """Linear interpolation."""
+        steps = (0, *self.steps)
+        x, y = zip((0.0, 0.0), *self.displacements, strict=True)
+        return np.array([np.interp(n, steps, x), np.interp(n, steps, y)])
+
+    def knots(self) -> tuple[int, ...]:
+        """Its steps."""
+        return self.steps
+
+
+class Rotation(Motion):
+    """Turns about `centre` by `angle` degrees a step, counterclockwise, for `steps` steps."""
+
+    type: Literal["rotation"] = "rotation"
+    centre: Pair
+    angle: float
+    steps: Steps
+
+    def offset(self, n: int, start: Floats) -> Floats:
+        """(Q - 1)(start - centre), Q the rotation by angle · min(n, steps)."""
+        turned = math.radians(self.angle * min(n, self.steps))
+        # 1 - cos without cancellation, so that small turns keep their digits.
+        less, sine = 2 * math.sin(turned / 2) ** 2, math.sin(turned)
+        x, y = (np.asarray(start) - self.centre).T
+        return np.stack([-less * x - sine * y, sine * x - less * y], axis=-1)
+
+    def knots(self) -> tuple[int, ...]:
+        """The end of the motion."""
+        return (self.steps,)
+
+
+class Oscillation(Motion):
+    """Swings about its start: amplitude · sin(2πn / period), for ever."""
+
+    type: Literal["oscillation"] = "oscillation"
+    amplitude: Pair
+    period: Annotated[float, Field(gt=0.0)]
+
+    def offset(self, n: int, start: Floats) -> Floats:
+        """amplitude · sin(2πn / period)."""
+        return np.array(self.amplitude) * math.sin(2 * math.pi * n / self.period)
+
+    def knots(self) -> tuple[int, ...]:
+        """None: it swings for ever."""
+        return ()
+
+
+AnyMotion = Annotated[
+    SerializeAsAny[Motion],
+    closed_part(Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation),
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +15,18 @@ from pbdkit.experiment.leaders import LeaderGroup, Selection
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
+Floats = NDArray[np.floating[Any]]
+
 
 @dataclass(frozen=True)
 class Leading:
-    """A leader group with the rows and places of its particles."""
+    """A leader group with the rows, places and reference positions (particle, axis) of its
+    particles."""
 
     group: LeaderGroup
     rows: Indices
     place: Indices
+    reference: Floats
 
 
 def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> tuple[Leading, ...]:
@@ -33,10 +38,10 @@ def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> 
     found = []
     for n, group in enumerate(groups):
         rows = select(raster, group.select, ("leaders", n, "select"))
-        found.append(Leading(group, rows, raster.place[rows]))
+        found.append(Leading(group, rows, raster.place[rows], raster.reference(rows)))
     for n, later in enumerate(found):
         for k, earlier in enumerate(found[:n]):
-            _refuse_contradiction((k, earlier), (n, later), steps)
+            _refuse_contradiction(raster, (k, earlier), (n, later), steps)
     return tuple(found)
 
 
@@ -109,7 +114,7 @@ def _nearest(raster: Raster, points: Iterable[tuple[float, float]]) -> Indices:
 
 
 def _refuse_contradiction(
-    first: tuple[int, Leading], second: tuple[int, Leading], steps: int
+    raster: Raster, first: tuple[int, Leading], second: tuple[int, Leading], steps: int
 ) -> None:
     """Compares what two groups prescribe in every step in which both lead one particle."""
     (k, a), (n, b) = first, second
@@ -119,20 +124,23 @@ def _refuse_contradiction(
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
     if not len(shared) or begin > end:
         return
-    # b starts where a, which led the particle just before unless both begin together, left it.
-    start = _offset(a.group, begin - 1)
+    # b starts where a, which led the particles just before unless both begin together, left them.
+    at = raster.reference(shared)
+    start = _offset(a.group, begin - 1, at)
     knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
-    near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1)}
+    near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1, 2)}
     for step in sorted(step for step in near if begin <= step <= end):
-        one, other = _offset(a.group, step), start + _offset(b.group, step)
-        if np.abs(one - other).max() > 1e-12 * max(1.0, np.abs(one).max()):
+        one, other = _offset(a.group, step, at), start + _offset(b.group, step, at + start)
+        differs = np.abs(one - other).max(axis=1) > 1e-12 * max(1.0, np.abs(one).max())
+        if differs.any():
+            number = shared[np.argmax(differs)] + 1
             raise ExperimentError(
-                f"moves particle {shared[0] + 1} in step {step} otherwise than leaders.{k} does; "
+                f"moves particle {number} in step {step} otherwise than leaders.{k} does; "
                 "select it in one of them only, or let one end before the other begins",
                 ("leaders", n),
             )
 
 
-def _offset(group: LeaderGroup, step: int) -> NDArray[np.float64]:
+def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:
     n = step - group.from_ + 1
-    return np.array(group.motion.offset(n) if n >= 1 else (0.0, 0.0))
+    return np.zeros_like(start) + (group.motion.offset(n, start) if n >= 1 else 0.0)

@@ -1,0 +1,72 @@
+"""From where a run starts. A closed family."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, SerializeAsAny
+
+from pbdkit.experiment.parts import closed_part
+from pbdkit.interfaces import Component, Pair
+
+Floats = NDArray[np.floating[Any]]
+Gradient = Annotated[tuple[Pair, Pair], Field(strict=False)]
+
+
+class Initial(Component):
+    """The displacements of the body at time 0; nothing has moved before, and the frame follows."""
+
+    @abstractmethod
+    def displacement(
+        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
+    ) -> Floats | None:
+        """u of the body particles at X, (particle, axis), in the order of their numbers; `leads`
+        marks the leaders of step 1. None where everything starts at rest."""
+
+
+class Reference(Initial):
+    """The run starts from the reference configuration."""
+
+    type: Literal["reference"] = "reference"
+
+    def displacement(
+        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
+    ) -> None:
+        """None."""
+
+
+class Noise(Initial):
+    """Every follower starts off its site by up to ±`amplitude` along each axis, uniformly, drawn
+    from the experiment's seed in the order of the numbers; leaders of step 1 start on theirs."""
+
+    type: Literal["noise"] = "noise"
+    amplitude: Annotated[float, Field(ge=0.0)]
+
+    def displacement(
+        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
+    ) -> Floats:
+        """Uniform in [-amplitude, amplitude)."""
+        drawn = generator.uniform(-self.amplitude, self.amplitude, X.shape)
+        return np.where(leads[:, None], 0.0, drawn)
+
+
+class Affine(Initial):
+    """The body starts deformed: u = gradient · X + shift, leaders included."""
+
+    type: Literal["affine"] = "affine"
+    gradient: Gradient
+    shift: Pair = (0.0, 0.0)
+
+    def displacement(
+        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
+    ) -> Floats:
+        """u_a = Σ_b gradient[a][b] X_b + shift_a."""
+        (xx, xy), (yx, yy) = self.gradient
+        x, y = X.T
+        return np.stack([xx * x + xy * y + self.shift[0], yx * x + yy * y + self.shift[1]], axis=1)
+
+
+AnyInitial = Annotated[SerializeAsAny[Initial], closed_part(Initial, Reference, Noise, Affine)]

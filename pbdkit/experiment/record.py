@@ -1,0 +1,52 @@
+"""What is kept of a run."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_serializer, model_validator
+
+from pbdkit.interfaces.component import Strict
+
+Steps = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)]
+
+
+class Record(Strict):
+    """Every so many steps, or at chosen ones; time 0 and the last step always.
+
+    `dtype` is that of recorded positions and diagnostics; the run itself is not affected.
+    """
+
+    every: Annotated[int, Field(ge=1)] = 1
+    at: Steps | None = None
+    dtype: Literal["float64", "float32"] = "float64"
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Record:
+        if self.at is not None:
+            if "every" in self.model_fields_set:
+                raise ValueError("give `every` or `at`, not both")
+            if any(a >= b for a, b in zip(self.at, self.at[1:], strict=False)):
+                raise ValueError(f"`at` must increase, got {list(self.at[:8])}")
+        return self
+
+    @model_serializer
+    def _serialize(self) -> dict[str, Any]:
+        which = {"every": self.every} if self.at is None else {"at": list(self.at)}
+        return which | {"dtype": self.dtype}
+
+    def keeps(self, step: int, steps: int) -> bool:
+        """Whether that step of a run of `steps` is recorded."""
+        if step in (0, steps):
+            return True
+        if self.at is None:
+            return step % self.every == 0
+        place = bisect_left(self.at, step)
+        return place < len(self.at) and self.at[place] == step
+
+    def count(self, steps: int) -> int:
+        """How many steps of a run of `steps` are recorded."""
+        if self.at is None:
+            return steps // self.every + 1 + (steps % self.every > 0)
+        return len({0, steps, *(step for step in self.at if step <= steps)})
