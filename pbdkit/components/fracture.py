@@ -10,8 +10,11 @@ from pydantic import Field
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FractureModel, Slot, Vector, squared_length, where
+from pbdkit.interfaces.fracture import Segment
 
 Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
+
+Cracks = Annotated[tuple[Annotated[Segment, Field(strict=False)], ...], Field(strict=False)]
 
 
 class NoFracture(FractureModel):
@@ -42,7 +45,8 @@ class Threshold(FractureModel):
     The fictitious point that takes the lost neighbour's place stands at m_j + λ R
     (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
     contracts) or at X_k (`fictitious: reference`). `frame_bonds: false` spares the bonds to the
-    frame.
+    frame. `cracks` are segments [[x, y], [x, y]]; the bonds that cross them are broken from the
+    start.
     """
 
     type: Literal["threshold"] = "threshold"
@@ -50,6 +54,7 @@ class Threshold(FractureModel):
     placement: float = 1.0
     fictitious_at: Literal["cell", "reference"] = Field("cell", alias="fictitious")
     frame_bonds: bool = True
+    cracks: Cracks = ()
 
     def parameters(self) -> dict[str, float]:
         """λ - 1, and whether the reference position counts."""
@@ -61,6 +66,10 @@ class Threshold(FractureModel):
     def breaks_frame_bonds(self) -> bool:
         """As `frame_bonds` says."""
         return self.frame_bonds
+
+    def segments(self) -> tuple[Segment, ...]:
+        """The `cracks`."""
+        return self.cracks
 
     def constants(self, slot: Slot) -> tuple[float, ...]:
         """The squared threshold of the slot's shell.

@@ -1,40 +1,51 @@
-"""Neighbours fixed on the reference lattice (model.md, section 4)."""
+"""Who is whose neighbour: by shells or by weighted distance (model.md, section 4)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from pbdkit.interfaces import Cell, NeighbourMetric, Offset
+from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset
 
 Shells = Annotated[int, Field(ge=1, le=32)]
+Weight = Annotated[float, Field(gt=0.0)]
 
 
-class Coordination(NeighbourMetric):
+class LatticeNeighbours(NeighbourMetric):
+    """Common to neighbours in shells of the lattice, which stay as they are."""
+
+    shells: Shells = 1
+    reevaluate: bool = False
+
+    @model_validator(mode="after")
+    def _stay(self) -> LatticeNeighbours:
+        if self.reevaluate:
+            raise ValueError(
+                f"{self.type} neighbours are defined on the lattice and cannot be re-evaluated; "
+                "take euclidean ones, which have a radius"
+            )
+        return self
+
+
+class Coordination(LatticeNeighbours):
     """Shells of distinct distance on the infinite lattice, equal within 1e-6 relative."""
 
     type: Literal["coordination"] = "coordination"
-    shells: Shells = 1
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """The `shells` smallest distances; multiples of a cell vector give that many at least."""
         radius = self.shells * min(math.hypot(*v) for v in cell.vectors) * (1 + 1e-6)
-        shells: list[list[Offset]] = []
-        for offset in cell.offsets(sublattice, radius):
-            if shells and offset.length <= shells[-1][0].length * (1 + 1e-6):
-                shells[-1].append(offset)
-            else:
-                shells.append([offset])
-        return shells[: self.shells]
+        offsets = cell.offsets(sublattice, radius)
+        return _ranked(offsets, [o.length for o in offsets])[: self.shells]
 
 
-class Chebyshev(NeighbourMetric):
+class Chebyshev(LatticeNeighbours):
     """Index distance max(|Δp|, |Δq|) in the primitive basis; shell n is distance exactly n."""
 
     type: Literal["chebyshev"] = "chebyshev"
-    shells: Shells = 1
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Every offset up to index distance `shells`, grouped by it."""
@@ -52,3 +63,51 @@ class Chebyshev(NeighbourMetric):
         along_p = math.hypot(qb * a.x - qa * b.x, qb * a.y - qa * b.y) / abs(det)
         along_q = math.hypot(pa * b.x - pb * a.x, pa * b.y - pb * a.y) / abs(det)
         return self.shells * (along_p + along_q) * (1 + 1e-9)
+
+
+class Euclidean(NeighbourMetric):
+    """All within √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9); a shell is a distinct distance.
+
+    Unequal weights make the neighbourhood, and with it the body, anisotropic. With `reevaluate`
+    the neighbours are found anew at every step, in the intermediate configuration.
+    """
+
+    type: Literal["euclidean"] = "euclidean"
+    radius: Annotated[float, Field(gt=0.0)]
+    weights: Annotated[tuple[Weight, Weight], Field(strict=False)] = (1.0, 1.0)
+    reevaluate: bool = False
+
+    def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
+        """Ranked by weighted distance."""
+        near = self.radius * (1 + 1e-9)
+        found = sorted(
+            ((self._distance(o), o) for o in cell.offsets(sublattice, near / self._shrinkage())),
+            key=lambda pair: pair[0],
+        )
+        inside = [(distance, o) for distance, o in found if distance <= near]
+        return _ranked([o for _, o in inside], [distance for distance, _ in inside])
+
+    def nearness(self) -> Nearness | None:
+        """The same distance in the current configuration, if `reevaluate`."""
+        return Nearness(self.radius, self.weights) if self.reevaluate else None
+
+    def _distance(self, offset: Offset) -> float:
+        (wx, wy), (x, y) = self.weights, offset.rest
+        return math.sqrt(wx * x * x + wy * y * y)
+
+    def _shrinkage(self) -> float:
+        """The smallest ratio of weighted to plain distance."""
+        return math.sqrt(min(self.weights)) * (1 - 1e-9)
+
+
+def _ranked(offsets: Sequence[Offset], distances: Sequence[float]) -> list[list[Offset]]:
+    """Shells of equal distance, within 1e-6 relative; the distances come sorted."""
+    shells: list[list[Offset]] = []
+    first = -1.0
+    for offset, distance in zip(offsets, distances, strict=True):
+        if shells and distance <= first * (1 + 1e-6):
+            shells[-1].append(offset)
+        else:
+            shells.append([offset])
+            first = distance
+    return shells

@@ -6,7 +6,7 @@ from pbdkit.interfaces.diagnostic import Diagnostic, Moment, Variable
 from pbdkit.interfaces.fracture import FractureModel
 from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
-from pbdkit.interfaces.neighbours import NeighbourMetric, Slot
+from pbdkit.interfaces.neighbours import Nearness, NeighbourMetric, Slot
 from pbdkit.interfaces.rule import FollowerRule, Here, Setting
 
 INTERFACES: dict[str, type[Component]] = {
@@ -33,6 +33,7 @@ __all__ = [
     "Here",
     "Lattice",
     "Moment",
+    "Nearness",
     "NeighbourMetric",
     "Offset",
     "Pair",

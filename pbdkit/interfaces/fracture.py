@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from pbdkit.interfaces.arithmetic import Vector
-from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.neighbours import Slot
+
+Segment = tuple[Pair, Pair]
+"""A straight crack, from one point to another (lattice units)."""
 
 
 class FractureModel(Component):
@@ -29,6 +32,10 @@ class FractureModel(Component):
     def parameters(self) -> dict[str, float]:
         """The numbers that the functions see as ``p.name``; by default the model's own."""
         return self.numeric_parameters()
+
+    def segments(self) -> Sequence[Segment]:
+        """Cracks that are there from the start: all bonds that cross them are broken at step 0."""
+        return ()
 
     @abstractmethod
     def constants(self, slot: Slot) -> tuple[float, ...]:

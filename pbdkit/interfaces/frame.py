@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.lattice import Cell, Index
 
 Indices = NDArray[np.intp]
 
@@ -18,7 +19,8 @@ class FrameMap:
     """u of frame point `point[e]` is the sum over its entries e of weight[e] · u[body[e]].
 
     `point` counts the frame points from 0 in the order of their numbers, sorted; `body` are
-    rows of the particle table. With `lag` 1 the body's displacements of the step before count.
+    rows of the particle table. `weight` is a number an entry, (entry,), or a matrix an entry,
+    (entry, axis, axis). With `lag` 1 the body's displacements of the step before count.
     """
 
     point: Indices
@@ -28,12 +30,23 @@ class FrameMap:
 
 
 class FrameSites(ABC):
-    """The frame of a scene, as a policy sees it."""
+    """The frame of a scene, as a policy sees it: the lattice's `cell`, the `site` index (i, j)
+    of every frame point in the order of the numbers, (point, 2), and the smallest and largest
+    site index of the body, `low` and `high`."""
+
+    cell: Cell
+    site: NDArray[np.int32]
+    low: Index
+    high: Index
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
         """(point, body): each frame point with every body particle that is nearest to it in the
         reference configuration, distance ≤ d_min(1 + 1e-9) + 1e-12; sorted by both."""
+
+    @abstractmethod
+    def body_at(self, site: NDArray[np.int32]) -> Indices:
+        """The row of the body particle at each site (i, j), (entry, 2); -1 where there is none."""
 
 
 class FramePolicy(Component):

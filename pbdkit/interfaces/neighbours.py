@@ -27,6 +27,14 @@ class Slot:
     shell: int
 
 
+@dataclass(frozen=True)
+class Nearness:
+    """Who is near in the current configuration: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9)."""
+
+    radius: float
+    weights: tuple[float, float]
+
+
 class NeighbourMetric(Component):
     """Chooses the neighbours of a site on the infinite lattice, by shells.
 
@@ -40,3 +48,8 @@ class NeighbourMetric(Component):
 
         Offsets come from `cell.offsets(sublattice, radius)`, which lists all within a radius.
         """
+
+    def nearness(self) -> Nearness | None:
+        """How neighbours are found anew at every step; by default they stay as they are at
+        step 0, as in a solid."""
+        return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
@@ -137,7 +137,16 @@ class Recorder:
             for variable in diagnostic.variables():
                 _refuse_unknown(diagnostic, variable, known, {c.name for c in columns})
                 columns.append(layout.diagnostic_column(variable, diagnostic.every_step))
-        return columns
+        return [self._as_recorded(column) for column in columns]
+
+    def _as_recorded(self, column: Column) -> Column:
+        """The column with the dtype that the experiment asks for."""
+        short = self._scene.experiment.record.dtype == "float32"
+        return (
+            replace(column, dtype="f4")
+            if short and column.grows and column.dtype == "f8"
+            else column
+        )
 
     def _measured(self, diagnostics: list[Diagnostic], moment: StateMoment) -> Values:
         values: Values = {}

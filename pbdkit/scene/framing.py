@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import Cell, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.lattice import Offset
+from pbdkit.interfaces.lattice import Index, Offset
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,29 @@ class Frame:
     map: FrameMap
     body_place: Indices
 
+    def follow(self, body: Floats, out: Floats) -> None:
+        """Writes the frame's displacements into `out`; both are (axis, flat place)."""
+        u = body[:, self.body_place]
+        weighted = self.map.weight * u if self.map.weight.ndim == 1 else _turned(self.map.weight, u)
+        for plane, values in zip(out, weighted, strict=True):
+            plane[self.place] = np.bincount(self.map.point, values, len(self.place))
+
 
 def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
     """The policy's map for this raster; None where the scene has no frame."""
     rows = np.flatnonzero(raster.table_kind == FRAME)
     if not len(rows):
         return None
-    follow = policy.follow(RasterFrame(raster, rows))
+    inside = raster.site[raster.body_rows]
+    frame = RasterFrame(
+        raster,
+        rows,
+        raster.lattice.cell(),
+        raster.site[rows],
+        tuple(inside.min(axis=0).tolist()),
+        tuple(inside.max(axis=0).tolist()),
+    )
+    follow = policy.follow(frame)
     alone = np.setdiff1d(np.arange(len(rows)), follow.point)
     if len(alone):
         raise ExperimentError(
@@ -48,6 +65,14 @@ class RasterFrame(FrameSites):
 
     raster: Raster
     frame_rows: Indices
+    cell: Cell
+    site: NDArray[np.int32]
+    low: Index
+    high: Index
+
+    def body_at(self, site: NDArray[np.int32]) -> Indices:
+        """Looks the sites up on the raster."""
+        return self.raster.body_row_at_site(site)
 
     def nearest(self) -> tuple[Indices, Indices]:
         """Searches outwards from every frame point, shell of sites by shell, until all have met
@@ -89,6 +114,12 @@ class RasterFrame(FrameSites):
         return points[open_], self.raster.row_at[
             np.ravel_multi_index((target, m, n), self.raster.shape)
         ]
+
+
+def _turned(matrices: Floats, u: Floats) -> Floats:
+    """matrix · u for every entry, (axis, entry)."""
+    turned: Floats = np.einsum("eab,be->ae", matrices, u)
+    return turned
 
 
 def _with_ties(distance: Floats) -> Floats:

@@ -8,6 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces import Pair, Vector
+from pbdkit.scene.bonds import bonds_in, plane_block
+from pbdkit.scene.cracks import crosses
+from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
 
 Floats = NDArray[np.floating[Any]]
@@ -33,8 +38,43 @@ class State:
 
 
 def initial_state(scene: Scene) -> State:
-    """The reference configuration, with no bond broken."""
-    shape = (2, *scene.raster.shape)
-    planes = (len(scene.neighbourhood.planes), *scene.raster.shape[1:])
-    broken = np.full(planes, -1, np.int32) if scene.has_fracture else None
-    return State(0, np.zeros(shape), np.zeros(shape), broken, (None,) * len(scene.leading))
+    """The state at time 0: the body as the experiment starts it, the frame following, bonds across
+    the given cracks broken at step 0. Nothing has moved before."""
+    u = np.zeros((2, *scene.raster.shape))
+    _displace(scene, u.reshape(2, -1))
+    broken = _broken_by_cracks(scene) if scene.has_fracture else None
+    return State(0, u, u.copy(), broken, (None,) * len(scene.leading))
+
+
+def _displace(scene: Scene, u: Floats) -> None:
+    """Writes the body's and the frame's displacements, (axis, flat place)."""
+    raster, body = scene.raster, scene.raster.body_rows
+    leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
+    generator = np.random.default_rng(scene.experiment.seed)
+    initial = scene.experiment.initial.displacement(raster.reference(body), leads, generator)
+    if initial is not None:
+        u[:, raster.place[body]] = initial.T
+        if scene.frame:
+            scene.frame.follow(u, u)
+
+
+def _broken_by_cracks(scene: Scene) -> NDArray[np.int32]:
+    """(plane, cell, cell): 0 where a bond crosses a crack of the experiment, else -1."""
+    raster, planes = scene.raster, scene.neighbourhood.planes
+    broken = np.full((len(planes), *raster.shape[1:]), -1, np.int32)
+    for n, plane in enumerate(planes):
+        block = plane_block(raster, plane)
+        for a, b in scene.experiment.fracture.segments() if block else ():
+            assert block is not None
+            crack = (_from_origin(scene, a), _from_origin(scene, b))
+            start = raster.reference_planes(block)
+            end = Vector(start.x + plane.slot.rest.x, start.y + plane.slot.rest.y)
+            crossed = crosses(start, end, crack) & bonds_in(raster, block, plane, frame_too=True)
+            broken[(n, *block.slices()[1:])][crossed] = 0
+    return broken
+
+
+def _from_origin(scene: Scene, point: Pair) -> Pair:
+    """A point as the rasters count: from the lattice's site (0, 0)."""
+    x, y = scene.experiment.lattice.origin
+    return point[0] - x, point[1] - y

@@ -1,0 +1,36 @@
+"""What moves followers: a rule's move, then relaxation and memory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.experiment.model import Stepping
+from pbdkit.stepping.state import Floats
+
+
+class Followers(ABC):
+    """The followers of a scene, and how they find their neighbours."""
+
+    @abstractmethod
+    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+        """Writes the displacements of all body particles into `new`, from the intermediate
+        configuration m; `new` comes holding those of the step before. Particles without any
+        neighbour stay. What it writes for leaders is overwritten."""
+
+
+def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
+    """u + relaxation · move + memory · (u - before), elementwise for one component.
+
+    Raises ValueError where the move is not one value a particle.
+    """
+    if np.shape(move) not in ((), np.shape(here)):
+        raise ValueError(
+            f"it returned the shape {np.shape(move)} for particles of shape {np.shape(here)}: "
+            "it is not elementwise"
+        )
+    there = here + (move if solver.relaxation == 1.0 else solver.relaxation * move)
+    return there + solver.memory * (here - before) if solver.memory != 0.0 else there

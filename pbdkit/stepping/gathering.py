@@ -1,0 +1,62 @@
+"""Followers whose neighbours are found anew at every step, by distance (model.md, section 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Here, Nearness, Vector
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.raster import positions
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.following import Followers, target
+from pbdkit.stepping.parameters import named
+from pbdkit.stepping.state import Floats
+
+
+class GatheringFollowers(Followers):
+    """Moves the followers of a scene in which neighbours come and go.
+
+    The same `gather` and `apply` run on tables: a row a pair of neighbours, a row a particle.
+    """
+
+    def __init__(self, scene: Scene, near: Nearness) -> None:
+        raster = scene.raster
+        self._scene = scene
+        self._rule = scene.experiment.rule
+        self._parameters = named(self._rule.parameters(scene.setting()))
+        self._place, self._body = raster.place, raster.body_rows
+        self._X = np.stack(positions(raster.lattice.cell(), *raster.cells()))
+        self._scale = np.sqrt(np.array(near.weights))
+        self._radius = near.radius * (1 + 1e-9)
+
+    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+        """Bonds do not last here, so that none can be broken."""
+        u = m.reshape(2, -1)[:, self._place]
+        j, k = self._pairs(self._X + u)
+        d, r = Vector(*(u[:, k] - u[:, j])), Vector(*(self._X[:, k] - self._X[:, j]))
+        count = len(self._place)
+        total = tuple(
+            np.bincount(j, np.broadcast_to(part, j.shape), count)
+            for part in self._rule.gather(d, r, (), self._parameters)
+        )
+        move = self._rule.apply(total, Here(Vector(*u), Vector(*self._X)), self._parameters)
+        movable = self._body[np.bincount(j, minlength=count)[self._body] > 0]
+        place = self._place[movable]
+        flat = new.reshape(2, -1)
+        for here, step, plane in zip(u, move, flat, strict=True):
+            before = plane[self._place]
+            moved = target(here, step, before, self._scene.experiment.solver)
+            plane[self._place[self._body]] = here[self._body]
+            plane[place] = moved[movable]
+
+    def _pairs(self, x: Floats) -> tuple[Indices, Indices]:
+        """(j, k): every body particle j with each of its neighbours k, sorted."""
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(x.T * self._scale)
+        pairs = tree.query_pairs(self._radius, output_type="ndarray").astype(np.intp)
+        both = np.concatenate([pairs, pairs[:, ::-1]])
+        both = both[np.isin(both[:, 0], self._body)]
+        j, k = both[np.lexsort((both[:, 1], both[:, 0]))].T
+        return j, k

@@ -1,0 +1,86 @@
+"""Followers whose neighbours are fixed: one shifted view a slot, block of rows by block of rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.following import Followers, target
+from pbdkit.stepping.fracturing import Fracturing
+from pbdkit.stepping.parameters import named
+from pbdkit.stepping.state import Floats
+from pbdkit.stepping.sums import Present, difference, planes, presence, sum_over_slots
+
+BLOCK_CELLS = 16384
+"""Places a block: small enough for its temporaries to stay in the cache."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is constant on one block: its slots with weights and presence, X where the rule wants
+    it, and where followers can move (None: everywhere)."""
+
+    block: Block
+    slots: tuple[Slot, ...]
+    weights: dict[Slot, tuple[float, ...]]
+    present: list[Present]
+    X: Vector
+    movable: Present
+
+
+class SlotFollowers(Followers):
+    """Moves the followers of a scene whose neighbours stay as they are."""
+
+    def __init__(self, scene: Scene, fracturing: Fracturing | None) -> None:
+        self._scene = scene
+        self._rule = scene.experiment.rule
+        self._parameters = named(self._rule.parameters(scene.setting()))
+        self._fracturing = fracturing
+        self._parts = [part for s in range(scene.raster.shape[0]) for part in self._cut(s)]
+
+    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+        """Every block from m alone: their order does not matter."""
+        for part in self._parts:
+            self._move(part, m, new, broken_step)
+
+    def _cut(self, sublattice: int) -> list[_Part]:
+        whole = self._scene.raster.body_block(sublattice)
+        return [self._part(block) for block in whole.rows(BLOCK_CELLS)] if whole else []
+
+    def _part(self, block: Block) -> _Part:
+        raster, slots = self._scene.raster, self._scene.neighbourhood.slots[block.sublattice]
+        present = presence(raster, block, slots)
+        neighbours = sum(1 if there is None else there.astype(int) for there in present)
+        movable = (raster.kind[block.slices()] == FOLLOWER) & (neighbours > 0)
+        return _Part(
+            block,
+            slots,
+            {slot: self._rule.weights(slot) for slot in slots},
+            present,
+            raster.reference_planes(block) if self._rule.uses_reference else Vector(0.0, 0.0),
+            None if movable.all() else movable,
+        )
+
+    def _move(
+        self, part: _Part, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None
+    ) -> None:
+        u = planes(m, part.block)
+
+        def contribution(slot: Slot) -> tuple[Any, ...]:
+            d = difference(m, part.block, slot)
+            if self._fracturing and broken_step is not None:
+                d = self._fracturing.seen(d, u, part.block, slot, broken_step)
+            return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
+
+        total = sum_over_slots(part.slots, part.present, contribution)
+        move = self._rule.apply(total, Here(u, part.X), self._parameters)
+        out = planes(new, part.block)
+        for here, step, plane in zip(u, move, out, strict=True):
+            moved = target(here, step, plane, self._scene.experiment.solver)
+            plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)
