@@ -1,53 +1,72 @@
 """The lattice model of model.md in plain loops: slow, independent, a test oracle.
 
 Written from model.md alone, in positions x (not displacements), sharing no code with the package.
-Sections of model.md: 1 numbering and kinds, `build_body`, `leads`; 2 lattices, `read_lattice`,
-`site_point`; 3 grid bodies, `build_body`; 4 neighbours, `coordination_shells`,
-`chebyshev_shells`, `site_after`, `rest_offset`; 5 the step and the rules, `simulate`,
-`leader_position`, `move_follower`, `rule_target`; 6 fracture, `too_long`, `seen_place`; 7 the
-frame, `default_layers`, `assigned_to`, `frame_position`; 8 diagnostics, `pe1`, `simulate`.
+Sections of model.md: 1 numbering and kinds, `build_body`, `leads`; 2 lattices and 4 neighbours,
+plain_lattice.py, and `neighbours_now` where they are re-evaluated; 3 bodies, plain_bodies.py;
+5 the step and the rules, `simulate`, plain_motions.py, `move_follower`, `rule_target`; 6 fracture,
+`too_long`, `seen_place`, and the cracks of contract.md, `crosses`; 7 the frame, `framed`,
+`mirrored`, `frame_position`; 8 diagnostics, `pe1`, `simulate`.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-Point = tuple[float, float]
-Site = tuple[int, int]
-Part = dict[str, Any]
+import plain_bodies
+import plain_motions
+from plain_lattice import (
+    STAGGERED,
+    Lattice,
+    Part,
+    Point,
+    Site,
+    default_layers,
+    distance,
+    mean,
+    minus,
+    plus,
+    point,
+    read_lattice,
+    rest_offset,
+    shells_of,
+    side,
+    site_after,
+    site_point,
+    steps_within,
+    times,
+    within_radius,
+)
 
 LEADER, FOLLOWER, FRAME = 0, 1, 2
 NEVER = -1
-STAGGERED = ("hexagonal", "centred-rectangular")
 COVERED = {
     "lattice": ("square", "rectangular", "oblique", *STAGGERED),
-    "body": ("grid",),
-    "neighbours": ("coordination", "chebyshev"),
+    "body": (
+        *("grid", "rectangle", "disc", "ring", "polygon", "dogbone"),
+        *plain_bodies.SETS,
+    ),
+    "neighbours": ("coordination", "chebyshev", "euclidean"),
     "rule": ("barycentre", "mean-displacement", "distance-weighted", "mixed-coordinate"),
-    "frame": ("mean", "first", "none"),
+    "frame": ("mean", "first", "mirror", "none"),
     "fracture": ("none", "threshold"),
-    "initial": ("reference",),
+    "initial": ("reference", "noise", "affine"),
     "solver": ("stepping",),
 }
 DEFAULTS: dict[str, Part] = {
     "lattice": {"origin": (0.0, 0.0)},
     "body": {},
-    "neighbours": {"shells": 1, "reevaluate": False},
+    "neighbours": {"shells": 1, "weights": (1.0, 1.0), "reevaluate": False},
     "rule": {"axis": "x"},
     "frame": {"type": "mean", "layers": None, "lag": 0},
-    "fracture": {"type": "none", "placement": 1.0, "fictitious": "cell", "frame_bonds": True},
-    "initial": {"type": "reference"},
+    "fracture": {
+        "type": "none",
+        "placement": 1.0,
+        "fictitious": "cell",
+        "frame_bonds": True,
+        "cracks": (),
+    },
+    "initial": {"type": "reference", "shift": (0.0, 0.0)},
     "solver": {"type": "stepping", "relaxation": 1.0, "memory": 0.0},
 }
-
-
-class Lattice(NamedTuple):
-    """Section 2: first and second span the primitive cell; odd rows of a staggered one shift."""
-
-    a: float
-    first: Point
-    second: Point
-    staggered: bool
-    origin: Point
 
 
 class Neighbour(NamedTuple):
@@ -58,6 +77,13 @@ class Neighbour(NamedTuple):
     shell: int
 
 
+class Copied(NamedTuple):
+    """Section 7: the body particles that a frame point copies, and the signs it copies with."""
+
+    particles: list[int]
+    signs: Point
+
+
 class Body(NamedTuple):
     """All that is fixed at step 0; lists run over the particles in the order of their numbers."""
 
@@ -66,31 +92,10 @@ class Body(NamedTuple):
     X: list[Point]
     inside: list[bool]
     neighbours: list[list[Neighbour]]
-    assigned: dict[int, list[int]]
+    frame: dict[int, Copied]
 
 
 Bond = tuple[int, int]
-
-
-def plus(p: Point, q: Point) -> Point:
-    return (p[0] + q[0], p[1] + q[1])
-
-
-def minus(p: Point, q: Point) -> Point:
-    return (p[0] - q[0], p[1] - q[1])
-
-
-def times(c: float, p: Point) -> Point:
-    return (c * p[0], c * p[1])
-
-
-def distance(p: Point, q: Point) -> float:
-    return math.hypot(p[0] - q[0], p[1] - q[1])
-
-
-def mean(points: list[Point]) -> Point:
-    n = len(points)
-    return (math.fsum(p[0] for p in points) / n, math.fsum(p[1] for p in points) / n)
 
 
 def nearest(place: Point, members: list[int], X: list[Point]) -> list[int]:
@@ -105,92 +110,19 @@ def completed(experiment: Part) -> Part:
     for name, covered in COVERED.items():
         if parts[name]["type"] not in covered:
             raise ValueError(f"{name} type {parts[name]['type']!r}")
-    solver, fracture, shells = parts["solver"], parts["fracture"], parts["neighbours"]["shells"]
-    if parts["neighbours"]["reevaluate"] or solver.get("settle") is not None:
-        raise ValueError("neighbours re-evaluated, or a run that settles")
+    solver, fracture, near = parts["solver"], parts["fracture"], parts["neighbours"]
+    if solver.get("settle") is not None:
+        raise ValueError("a run that settles")
+    breaks = fracture["type"] != "none" or fracture["cracks"]
+    if near["reevaluate"] and (near["type"] != "euclidean" or breaks):
+        raise ValueError("neighbours re-evaluated that are not euclidean, or with fracture")
     if solver.get("precision", "float64") != "float64" or parts["rule"]["axis"] not in ("x", "y"):
         raise ValueError("a precision other than float64, or an axis other than x and y")
-    if fracture["type"] == "threshold" and len(fracture["thresholds"]) != shells:
-        raise ValueError("not one threshold a shell")
     if fracture["fictitious"] not in ("cell", "reference"):
         raise ValueError(f"fictitious {fracture['fictitious']!r}")
-    return {"steps": experiment["steps"], "leaders": experiment.get("leaders", []), **parts}
-
-
-def read_lattice(part: Part) -> Lattice:
-    kind, a = part["type"], float(part["a"])
-    if kind == "square":
-        second = (0.0, a)
-    elif kind == "rectangular":
-        second = (0.0, part["b"])
-    elif kind == "centred-rectangular":
-        second = (a / 2, part["b"] / 2)
-    elif kind == "hexagonal":
-        second = (a / 2, a * math.sqrt(3) / 2)
-    else:
-        angle = math.radians(part["angle"])
-        second = (part["b"] * math.cos(angle), part["b"] * math.sin(angle))
-    origin = (float(part["origin"][0]), float(part["origin"][1]))
-    return Lattice(a, (a, 0.0), second, kind in STAGGERED, origin)
-
-
-def site_point(lattice: Lattice, site: Site) -> Point:
-    i, j = site
-    if lattice.staggered:
-        shift = lattice.a / 2 if j % 2 == 1 else 0.0
-        return plus(lattice.origin, (i * lattice.a + shift, j * lattice.second[1]))
-    return plus(lattice.origin, rest_offset(lattice, (i, j)))
-
-
-def rest_offset(lattice: Lattice, step: Site) -> Point:
-    """Section 4: the offset of (dp, dq) primitive steps, the exact opposite of (-dp, -dq)."""
-    return plus(times(step[0], lattice.first), times(step[1], lattice.second))
-
-
-def site_after(lattice: Lattice, site: Site, step: Site) -> Site:
-    """Section 4: p = i - floor(j/2), q = j on the staggered lattices, (i, j) elsewhere."""
-    (i, j), (dp, dq) = site, step
-    if lattice.staggered:
-        p, q = i - j // 2 + dp, j + dq
-        return (p + q // 2, q)
-    return (i + dp, j + dq)
-
-
-def steps_within(reach: int) -> list[Site]:
-    span = range(-reach, reach + 1)
-    return [(p, q) for p in span for q in span if (p, q) != (0, 0)]
-
-
-def chebyshev_shells(shells: int) -> dict[Site, int]:
-    """Section 4: the shell of every primitive step to a neighbour."""
-    return {(p, q): max(abs(p), abs(q)) for p, q in steps_within(shells)}
-
-
-def coordination_shells(lattice: Lattice, shells: int) -> dict[Site, int]:
-    """Section 4: shell n is no further than n times the shorter primitive vector."""
-    (ax, ay), (bx, by) = lattice.first, lattice.second
-    shorter, longer = sorted((math.hypot(ax, ay), math.hypot(bx, by)))
-    row_spacing = abs(ax * by - ay * bx) / longer
-    reach = math.ceil(shells * shorter / row_spacing) + 1
-    by_distance = sorted((math.hypot(*rest_offset(lattice, s)), s) for s in steps_within(reach))
-    found: dict[Site, int] = {}
-    shell, shell_distance = 0, 0.0
-    for d, step in by_distance:
-        if d > shell_distance * (1 + 1e-6):
-            shell, shell_distance = shell + 1, d
-        if shell <= shells:
-            found[step] = shell
-    return found
-
-
-def default_layers(lattice: Lattice, shells: dict[Site, int]) -> int:
-    """Section 7: what the metric reaches in index distance, from an even or an odd row."""
-    reach = 0
-    for row in (0, 1):
-        for step in shells:
-            i, j = site_after(lattice, (0, row), step)
-            reach = max(reach, abs(i), abs(j - row))
-    return reach
+    noise = [point(pair) for pair in experiment.get("_noise", [])]
+    leaders = experiment.get("leaders", [])
+    return {"steps": experiment["steps"], "leaders": leaders, "_noise": noise, **parts}
 
 
 def assigned_to(f: int, X: list[Point], inside: list[bool], policy: str) -> list[int]:
@@ -199,32 +131,69 @@ def assigned_to(f: int, X: list[Point], inside: list[bool], policy: str) -> list
     return tied[:1] if policy == "first" else tied
 
 
-def build_body(experiment: Part) -> Body:
-    """Sections 1, 3, 7: body and frame sites, numbered by i, then j; who neighbours whom."""
-    lattice, near = read_lattice(experiment["lattice"]), experiment["neighbours"]
-    frame = experiment["frame"]
-    chebyshev = near["type"] == "chebyshev"
-    n = near["shells"]
-    shells = chebyshev_shells(n) if chebyshev else coordination_shells(lattice, n)
-    columns, rows = experiment["body"]["columns"], experiment["body"]["rows"]
-    grid = {(i, j) for i in range(columns) for j in range(rows)}
-    layers = default_layers(lattice, shells) if frame["layers"] is None else frame["layers"]
-    around = {(i + p, j + q) for i, j in grid for p, q in steps_within(layers)} - grid
-    sites = sorted(grid if frame["type"] == "none" else grid | around)
-    X = [site_point(lattice, site) for site in sites]
-    inside = [site in grid for site in sites]
+def mirrored(site: Site, experiment: Part) -> tuple[Site, Point]:
+    """Section 7: the site reflected in the outermost row or column, and R as a sign an axis."""
+    reflected, signs = list(site), [1.0, 1.0]
+    for axis, length in ((0, experiment["body"]["columns"]), (1, experiment["body"]["rows"])):
+        if not 0 <= site[axis] < length:
+            outermost = 0 if site[axis] < 0 else length - 1
+            reflected[axis], signs[axis] = 2 * outermost - site[axis], -1.0
+    return (reflected[0], reflected[1]), (signs[0], signs[1])
+
+
+def framed(
+    experiment: Part, sites: list[Site], X: list[Point], inside: list[bool]
+) -> dict[int, Copied]:
+    """Section 7: what every frame point copies, by the policy of the frame."""
+    policy = experiment["frame"]["type"]
+    outer = [f for f in range(len(X)) if not inside[f]]
+    if policy != "mirror":
+        return {f: Copied(assigned_to(f, X, inside, policy), (1.0, 1.0)) for f in outer}
+    lattice_type = experiment["lattice"]["type"]
+    if experiment["body"]["type"] != "grid" or lattice_type not in ("square", "rectangular"):
+        raise ValueError("a mirror frame of anything but a square or rectangular grid")
+    frame = {}
+    for f in outer:
+        site, signs = mirrored(sites[f], experiment)
+        if site not in sites or not inside[sites.index(site)]:
+            raise ValueError(f"the mirror image of site {sites[f]} is not in the body")
+        frame[f] = Copied([sites.index(site)], signs)
+    return frame
+
+
+def neighbours_of(
+    lattice: Lattice, sites: list[Site], members: set[Site], shells: dict[Site, int]
+) -> list[list[Neighbour]]:
+    """Section 4: the neighbours of every particle at step 0; frame points are not each other's."""
     index_of = {site: index for index, site in enumerate(sites)}
     neighbours: list[list[Neighbour]] = []
     for site in sites:
         neighbours.append([])
         for step, shell in shells.items():
             other = site_after(lattice, site, step)
-            if other in index_of and (site in grid or other in grid):
+            if other in index_of and (site in members or other in members):
                 offset = rest_offset(lattice, step)
                 neighbours[-1].append(Neighbour(index_of[other], offset, shell))
-    outer = [f for f in range(len(X)) if not inside[f]]
-    assigned = {f: assigned_to(f, X, inside, frame["type"]) for f in outer}
-    return Body(lattice, sites, X, inside, neighbours, assigned)
+    return neighbours
+
+
+def build_body(experiment: Part) -> Body:
+    """Sections 1, 3, 7: body and frame sites, numbered by i, then j; who neighbours whom."""
+    lattice, frame = read_lattice(experiment["lattice"]), experiment["frame"]
+    fracture, shells = experiment["fracture"], shells_of(lattice, experiment["neighbours"])
+    shell_count = max(shells.values(), default=0)
+    if fracture["type"] == "threshold" and len(fracture["thresholds"]) != shell_count:
+        raise ValueError("not one threshold a shell")
+    members = plain_bodies.body_sites(lattice, experiment["body"])
+    if not members:
+        raise ValueError("no site in the body")
+    layers = default_layers(lattice, shells) if frame["layers"] is None else frame["layers"]
+    around = {(i + p, j + q) for i, j in members for p, q in steps_within(layers)} - members
+    sites = sorted(members if frame["type"] == "none" else members | around)
+    X = [site_point(lattice, site) for site in sites]
+    inside = [site in members for site in sites]
+    neighbours = neighbours_of(lattice, sites, members, shells)
+    return Body(lattice, sites, X, inside, neighbours, framed(experiment, sites, X, inside))
 
 
 def bonds_of(body: Body) -> dict[Bond, Neighbour]:
@@ -261,15 +230,25 @@ def leads(group: Part, step: int) -> bool:
 
 def leader_position(group: Part, j: int, step: int, history: list[list[Point]]) -> Point:
     """Section 5.1: the motion counts from `from` and starts where the particle then is."""
-    first, motion = int(group.get("from", 1)), group["motion"]
-    start, count = history[first - 1][j], step - first + 1
-    if motion["type"] == "hold":
-        return start
-    if motion["type"] == "velocity":
-        return plus(start, times(min(count, motion["steps"]), motion["velocity"]))
-    if motion["type"] == "displace":
-        return plus(start, motion["displacement"])
-    raise ValueError(f"motion type {motion['type']!r}")
+    first = int(group.get("from", 1))
+    return plain_motions.displaced(history[first - 1][j], group["motion"], step - first + 1)
+
+
+def crosses(crack: tuple[Point, Point], P: Point, Q: Point) -> bool:
+    """Whether P and Q are on two sides of the crack's line, which counts as its left, and the
+    crack's ends not strictly on one side of theirs."""
+    a, b = crack
+    parted = (side(a, b, P) >= 0) != (side(a, b, Q) >= 0)
+    from_a, from_b = side(P, Q, a), side(P, Q, b)
+    one_side = (from_a > 0 and from_b > 0) or (from_a < 0 and from_b < 0)
+    return parted and not one_side
+
+
+def cracked(body: Body, bonds: dict[Bond, Neighbour], fracture: Part) -> dict[Bond, int]:
+    """The bonds that cross a crack, frame bonds among them: broken at step 0."""
+    cracks = [(point(a), point(b)) for a, b in fracture["cracks"]]
+    ends = {bond: (body.X[bond[0]], body.X[bond[1]]) for bond in bonds}
+    return {bond: 0 for bond in bonds if any(crosses(crack, *ends[bond]) for crack in cracks)}
 
 
 def too_long(body: Body, j: int, near: Neighbour, m: list[Point], fracture: Part) -> bool:
@@ -296,12 +275,20 @@ def seen_place(
     return plus(m[j], times(fracture["placement"], near.offset))
 
 
-def rule_target(body: Body, rule: Part, j: int, here: Point, seen: list[Point]) -> Point:
-    """Section 5: the rules; seen are the places of j's neighbours, fictitious ones among them."""
+def neighbours_now(body: Body, near: Part, j: int, m: list[Point]) -> list[int]:
+    """Section 4: fixed at step 0, or all that are within the radius in m."""
+    if not near["reevaluate"]:
+        return [neighbour.particle for neighbour in body.neighbours[j]]
+    return [k for k in range(len(m)) if k != j and within_radius(minus(m[k], m[j]), near)]
+
+
+def rule_target(
+    body: Body, rule: Part, j: int, here: Point, ks: list[int], seen: list[Point]
+) -> Point:
+    """Section 5: the rules; seen are the places of the ks, j's neighbours, or fictitious ones."""
     X = body.X
     if rule["type"] == "mean-displacement":
-        rest = [X[near.particle] for near in body.neighbours[j]]
-        return plus(X[j], mean([minus(place, X_k) for place, X_k in zip(seen, rest, strict=True)]))
+        return plus(X[j], mean([minus(place, X[k]) for place, k in zip(seen, ks, strict=True)]))
     if rule["type"] == "distance-weighted":
         weights = [distance(place, here) for place in seen]
         total = math.fsum(weights)
@@ -324,19 +311,48 @@ def move_follower(
     body: Body, experiment: Part, j: int, m: list[Point], before: Point, broken: dict[Bond, int]
 ) -> Point:
     """Section 5: m_j + w (target - m_j) + b (x_j(t) - x_j(t-1)); with no neighbours it stays."""
-    if not body.neighbours[j]:
+    fracture, solver, near = (experiment[part] for part in ("fracture", "solver", "neighbours"))
+    ks = neighbours_now(body, near, j, m)
+    if not ks:
         return m[j]
-    fracture, solver = experiment["fracture"], experiment["solver"]
-    seen = [seen_place(body, j, near, m, broken, fracture) for near in body.neighbours[j]]
-    target = rule_target(body, experiment["rule"], j, m[j], seen)
+    if near["reevaluate"]:
+        seen = [m[k] for k in ks]
+    else:
+        seen = [seen_place(body, j, n, m, broken, fracture) for n in body.neighbours[j]]
+    target = rule_target(body, experiment["rule"], j, m[j], ks, seen)
     relaxed = times(solver["relaxation"], minus(target, m[j]))
     remembered = times(solver["memory"], minus(m[j], before))
     return plus(m[j], plus(relaxed, remembered))
 
 
 def frame_position(body: Body, f: int, x: list[Point]) -> Point:
-    """Section 7: u_f = mean u_a."""
-    return plus(body.X[f], mean([minus(x[a], body.X[a]) for a in body.assigned[f]]))
+    """Section 7: u_f = mean u_a, or R u_b in the mirror."""
+    copied = body.frame[f]
+    u_x, u_y = mean([minus(x[a], body.X[a]) for a in copied.particles])
+    return plus(body.X[f], (copied.signs[0] * u_x, copied.signs[1] * u_y))
+
+
+def affine(initial: Part, X: Point) -> Point:
+    """u = gradient X + shift."""
+    (xx, xy), (yx, yy) = initial["gradient"]
+    return plus((xx * X[0] + xy * X[1], yx * X[0] + yy * X[1]), point(initial["shift"]))
+
+
+def initial_positions(body: Body, experiment: Part, followers: set[int]) -> list[Point]:
+    """Time 0: affine moves every body particle, noise (as drawn for every body particle) the
+    followers of step 1 only; the frame stands where its policy puts it, whatever its lag."""
+    initial, drawn = experiment["initial"], experiment["_noise"]
+    members = [j for j, is_inside in enumerate(body.inside) if is_inside]
+    x = list(body.X)
+    if initial["type"] == "affine":
+        for j in members:
+            x[j] = plus(x[j], affine(initial, x[j]))
+    if initial["type"] == "noise":
+        for j, noise in zip(members, drawn, strict=True):
+            x[j] = plus(x[j], noise) if j in followers else x[j]
+    for f in body.frame:
+        x[f] = frame_position(body, f, x)
+    return x
 
 
 def pe1(body: Body, j: int, x: list[Point], left_out: set[Bond]) -> float:
@@ -348,7 +364,7 @@ def pe1(body: Body, j: int, x: list[Point], left_out: set[Bond]) -> float:
     return math.fsum((distance(x[j], x[k]) - distance(body.X[j], body.X[k])) ** 2 for k in kept)
 
 
-def simulate(experiment: dict[str, Any]) -> dict[str, Any]:
+def simulate(experiment: Part) -> Part:
     """Runs an experiment (contract.md, as a dict) and returns every step of it in plain lists."""
     experiment = completed(experiment)
     fracture, lag, steps = experiment["fracture"], experiment["frame"]["lag"], experiment["steps"]
@@ -364,8 +380,9 @@ def simulate(experiment: dict[str, Any]) -> dict[str, Any]:
         in_body = LEADER if leading(j, step) is not None else FOLLOWER
         return in_body if body.inside[j] else FRAME
 
-    history: list[list[Point]] = [list(body.X)]
-    broken: dict[Bond, int] = {}
+    followers = {j for j in everyone if kind(j, 1) == FOLLOWER}
+    history = [initial_positions(body, experiment, followers)]
+    broken = cracked(body, bonds, fracture)
     for step in range(1, steps + 1):
         x, before = history[-1], history[max(step - 2, 0)]
         m = list(x)
@@ -380,7 +397,7 @@ def simulate(experiment: dict[str, Any]) -> dict[str, Any]:
         for j in everyone:
             if kind(j, step) == FOLLOWER:
                 new[j] = move_follower(body, experiment, j, m, before[j], broken)
-        for f in body.assigned:
+        for f in body.frame:
             new[f] = frame_position(body, f, x if lag == 1 else new)
         history.append(new)
 

@@ -150,7 +150,7 @@ class Dogbone(Body):
         y = np.abs(at.y - (self.origin[1] + self.width / 2))
         along = np.clip(x - self.gauge_length / 2, 0.0, self.radius)
         arc = self.gauge_width / 2 + self.radius - np.sqrt(self.radius**2 - along**2)
-        past = x - self.gauge_length / 2 > self._fillet() * (1 + 1e-12)
+        past = x - self.gauge_length / 2 >= self._fillet() * (1 - 1e-12)
         half = np.where(past, self.width / 2, np.minimum(arc, self.width / 2))
         beyond: Floats = np.maximum(y - half, x - self.length / 2)
         return beyond
