@@ -36,10 +36,14 @@ class Coordination(LatticeNeighbours):
     type: Literal["coordination"] = "coordination"
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """The `shells` smallest distances; multiples of a cell vector give that many at least."""
+        """The `shells` smallest distances between any two sites; multiples of a cell vector give
+        that many at least. A sublattice may have no neighbour in some of them."""
         radius = self.shells * min(math.hypot(*v) for v in cell.vectors) * (1 + 1e-6)
-        offsets = cell.offsets(sublattice, radius)
-        return _ranked(offsets, [o.length for o in offsets])[: self.shells]
+        around = [cell.offsets(s, radius) for s in range(len(cell.sites))]
+        everywhere = sorted((o for own in around for o in own), key=lambda o: o.length)
+        ranks = _ranked(everywhere, [o.length for o in everywhere])[: self.shells]
+        lengths = [(shell[0].length, shell[-1].length) for shell in ranks]
+        return [[o for o in around[sublattice] if a <= o.length <= b] for a, b in lengths]
 
 
 class Chebyshev(LatticeNeighbours):

@@ -161,6 +161,11 @@ class Experiment(Strict):
     def __hash__(self) -> int:
         return hash(tuple(self.__dict__.values()))
 
+    @property
+    def shows_bonds(self) -> bool:
+        """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
+        return self.fracture.can_break or any(d.uses_bonds for d in self.diagnostics)
+
     def components(self) -> list[Component]:
         """Every part of an open interface."""
         parts = [self.lattice, self.neighbours, self.rule, self.frame, self.fracture]

@@ -29,6 +29,10 @@ class Motion(Component):
         """
 
     @abstractmethod
+    def rests_after(self) -> int | None:
+        """The step n from which on the offset stays as it is; None where it never does."""
+
+    @abstractmethod
     def knots(self) -> tuple[int, ...]:
         """The steps n between which, and after which, the offset changes as one formula in n."""
 
@@ -41,6 +45,10 @@ class Hold(Motion):
     def offset(self, n: int, start: Floats) -> Floats:
         """None."""
         return np.zeros(2)
+
+    def rests_after(self) -> int:
+        """At once."""
+        return 1
 
     def knots(self) -> tuple[int, ...]:
         """None."""
@@ -58,6 +66,10 @@ class Velocity(Motion):
         """velocity · min(n, steps)."""
         return np.array(self.velocity) * min(n, self.steps)
 
+    def rests_after(self) -> int:
+        """The last of its steps."""
+        return self.steps
+
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
         return (self.steps,)
@@ -72,6 +84,10 @@ class Displace(Motion):
     def offset(self, n: int, start: Floats) -> Floats:
         """The displacement, from the first step on."""
         return np.array(self.displacement)
+
+    def rests_after(self) -> int:
+        """The first step."""
+        return 1
 
     def knots(self) -> tuple[int, ...]:
         """The first step."""
@@ -103,6 +119,10 @@ class Path(Motion):
         x, y = zip((0.0, 0.0), *self.displacements, strict=True)
         return np.array([np.interp(n, steps, x), np.interp(n, steps, y)])
 
+    def rests_after(self) -> int:
+        """The last of its steps."""
+        return self.steps[-1]
+
     def knots(self) -> tuple[int, ...]:
         """Its steps."""
         return self.steps
@@ -124,6 +144,10 @@ class Rotation(Motion):
         x, y = (np.asarray(start) - self.centre).T
         return np.stack([-less * x - sine * y, sine * x - less * y], axis=-1)
 
+    def rests_after(self) -> int:
+        """The last of its steps."""
+        return self.steps
+
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
         return (self.steps,)
@@ -139,6 +163,9 @@ class Oscillation(Motion):
     def offset(self, n: int, start: Floats) -> Floats:
         """amplitude · sin(2πn / period)."""
         return np.array(self.amplitude) * math.sin(2 * math.pi * n / self.period)
+
+    def rests_after(self) -> None:
+        """Never."""
 
     def knots(self) -> tuple[int, ...]:
         """None: it swings for ever."""

@@ -17,7 +17,7 @@ class Here(NamedTuple):
 
     `u` is its displacement in the intermediate configuration; `X` its reference position from the
     lattice's site (0, 0), so that no digit depends on where the body lies, given to rules that
-    declare `uses_reference`, otherwise zeros.
+    declare `uses_reference`, otherwise None.
     """
 
     u: Vector

@@ -49,14 +49,29 @@ def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
         tuple(inside.max(axis=0).tolist()),
     )
     follow = policy.follow(frame)
+    _refuse_unfit(follow, len(rows), raster)
     alone = np.setdiff1d(np.arange(len(rows)), follow.point)
     if len(alone):
         raise ExperimentError(
             f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
-            "and it would anchor the body",
-            ("frame",),
+            "and it would anchor the body"
         )
     return Frame(raster.place[rows], follow, raster.place[follow.body])
+
+
+def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
+    entries = len(follow.point)
+    shapes = [(entries,), (entries, 2, 2)]
+    if len(follow.body) != entries or np.shape(follow.weight) not in shapes:
+        raise ExperimentError("its map needs one point, body and weight (or 2 × 2 matrix) an entry")
+    if entries and not (follow.point.min() >= 0 and follow.point.max() < points):
+        raise ExperimentError(f"its map names a frame point outside 0 to {points - 1}")
+    if entries and (np.diff(follow.point) < 0).any():
+        raise ExperimentError("its map is not sorted by frame point")
+    if not np.isin(follow.body, raster.body_rows).all():
+        raise ExperimentError("its map follows what is no particle of the body")
+    if not np.isfinite(follow.weight).all() or follow.lag not in (0, 1):
+        raise ExperimentError("its map has weights that are not finite, or a lag other than 0 or 1")
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> 
     found = []
     for n, group in enumerate(groups):
         rows = select(raster, group.select, ("leaders", n, "select"))
+        _refuse_infinite(group, raster.reference(rows), steps, ("leaders", n, "motion"))
         found.append(Leading(group, rows, raster.place[rows], raster.reference(rows)))
     for n, later in enumerate(found):
         for k, earlier in enumerate(found[:n]):
@@ -139,6 +140,15 @@ def _refuse_contradiction(
                 "select it in one of them only, or let one end before the other begins",
                 ("leaders", n),
             )
+
+
+def _refuse_infinite(
+    group: LeaderGroup, at: Floats, steps: int, where: tuple[str | int, ...]
+) -> None:
+    last = group.last(steps) - group.from_ + 1
+    for n in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
+        if n >= 1 and not np.isfinite(at + group.motion.offset(n, at)).all():
+            raise ExperimentError(f"leaves the finite numbers at its step {n}", where)
 
 
 def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:

@@ -6,8 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, NeighbourMetric, Offset, Slot, Vector
+from pbdkit.interfaces import Cell, Lattice, NeighbourMetric, Offset, Slot, Vector
 
 
 @dataclass(frozen=True)
@@ -56,41 +58,62 @@ class Neighbourhood:
         )
 
 
+def checked_cell(lattice: Lattice) -> Cell:
+    """The lattice's cell; ExperimentError where it is degenerate or its sites share an index."""
+    cell = lattice.cell()
+    a, b = cell.vectors
+    indices = [site.index for site in cell.sites]
+    inside = all(0 <= i < cell.period[0] and 0 <= j < cell.period[1] for i, j in indices)
+    if not np.isfinite([*a, *b]).all() or a.x * b.y - a.y * b.x == 0.0:
+        raise ExperimentError(f"the cell vectors {tuple(a)} and {tuple(b)} span no area")
+    if len(set(indices)) < len(indices) or not inside:
+        raise ExperimentError(
+            f"the basis sites have the indices {indices}: they must differ and lie within the "
+            f"period {cell.period}"
+        )
+    return cell
+
+
 def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
     """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual."""
     exact = _ExactVectors()
     chosen = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
     slots = tuple(_slots_of(s, shells, exact) for s, shells in enumerate(chosen))
     by_key = {(s.source, s.target, s.cell): s for own in slots for s in own}
+    _refuse_gaps(slots, len(by_key))
     planes = []
     for slot in by_key.values():
         opposite = by_key.get((slot.target, slot.source, (-slot.cell[0], -slot.cell[1])))
         if opposite is None or opposite.shell != slot.shell:
             raise ExperimentError(
                 f"'{metric.type}' is not mutual: the neighbour at site index offset {slot.site} "
-                "does not have this one in the same shell; a body at rest would drift",
-                ("neighbours",),
+                "does not have this one in the same shell; a body at rest would drift"
             )
         if slot.site > (0, 0):
             planes.append(BondPlane(slot, opposite))
     return Neighbourhood(slots, tuple(planes))
 
 
+def _refuse_gaps(slots: tuple[tuple[Slot, ...], ...], different: int) -> None:
+    if not all(slots):
+        raise ExperimentError("some sites have no neighbour at all: more shells, a larger radius")
+    if sum(map(len, slots)) > different:
+        raise ExperimentError("a neighbour is listed in two shells, or twice in one")
+    shells = {slot.shell for own in slots for slot in own}
+    if shells != set(range(1, max(shells) + 1)):
+        raise ExperimentError(f"a shell is empty: only shells {sorted(shells)} have neighbours")
+
+
 def _slots_of(
     source: int, shells: Sequence[Sequence[Offset]], exact: _ExactVectors
 ) -> tuple[Slot, ...]:
-    slots = [
-        (
-            shell,
-            *exact.of(o.rest),
-            Slot(source, o.target, o.cell, o.site, exact.value(o.rest), shell),
-        )
-        for shell, offsets in enumerate(shells, 1)
-        for o in offsets
-    ]
-    if not slots:
-        raise ExperimentError("no site has any neighbour", ("neighbours",))
-    return tuple(slot for *_, slot in sorted(slots, key=lambda s: s[:3]))
+    found = []
+    for shell, offsets in enumerate(shells, 1):
+        for o in offsets:
+            number, negative, rest = exact.of(o.rest)
+            slot = Slot(source, o.target, o.cell, o.site, rest, shell)
+            found.append((shell, number, negative, slot))
+    return tuple(slot for *_, slot in sorted(found, key=lambda entry: entry[:3]))
 
 
 class _ExactVectors:
@@ -101,20 +124,25 @@ class _ExactVectors:
 
     def __init__(self) -> None:
         self._known: list[Vector] = []
+        self._near: dict[tuple[int, int], int] = {}
 
-    def of(self, v: Vector) -> tuple[int, int]:
-        """(which known vector, sign: 0 for itself and 1 for its negative)."""
-        for n, known in enumerate(self._known):
-            tolerance = 1e-9 * (abs(known.x) + abs(known.y))
-            if abs(v.x - known.x) + abs(v.y - known.y) <= tolerance:
-                return n, 0
-            if abs(v.x + known.x) + abs(v.y + known.y) <= tolerance:
-                return n, 1
+    def of(self, v: Vector) -> tuple[int, bool, Vector]:
+        """(which known vector, whether negated, the value to use)."""
+        for negative in (False, True):
+            sign = -1.0 if negative else 1.0
+            number = self._near.get(self._key(Vector(sign * v.x, sign * v.y)))
+            if number is not None:
+                known = self._known[number]
+                return number, negative, Vector(-known.x, -known.y) if negative else known
         self._known.append(Vector(v.x + 0.0, v.y + 0.0))
-        return len(self._known) - 1, 0
+        number = len(self._known) - 1
+        x, y = self._key(v)
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                self._near.setdefault((x + dx, y + dy), number)
+        return number, False, self._known[number]
 
-    def value(self, v: Vector) -> Vector:
-        """The value to use for v."""
-        n, negative = self.of(v)
-        known = self._known[n]
-        return Vector(-known.x, -known.y) if negative else known
+    def _key(self, v: Vector) -> tuple[int, int]:
+        """The place on a grid much finer than any lattice and much coarser than rounding."""
+        unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
+        return math.floor(v.x / unit), math.floor(v.y / unit)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Vector
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
-from pbdkit.scene.filling import fill, has_narrow_slot, window
+from pbdkit.scene.constants import SceneConstants, ask_for_constants
+from pbdkit.scene.filling import Mask, fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
-from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood
+from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
 from pbdkit.scene.raster import Raster, build_raster, positions
 from pbdkit.scene.sizes import refuse_too_large
 
@@ -23,12 +23,14 @@ from pbdkit.scene.sizes import refuse_too_large
 class Scene:
     """An experiment on its lattice.
 
-    `frame` is None without one; `leading` are the leader groups; `warnings` are for the user.
+    `constants` are what the elementwise functions are called with; `frame` is None without one;
+    `leading` are the leader groups; `warnings` are for the user.
     """
 
     experiment: Experiment
     neighbourhood: Neighbourhood
     raster: Raster
+    constants: SceneConstants
     frame: Frame | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
@@ -41,19 +43,12 @@ class Scene:
     @property
     def shows_bonds(self) -> bool:
         """Whether the dataset has a table of bonds."""
-        return self.has_fracture or any(d.uses_bonds for d in self.experiment.diagnostics)
+        return self.experiment.shows_bonds
 
     @cached_property
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
-
-    def setting(self) -> Setting:
-        """What a rule may derive its constants from."""
-        cell = self.experiment.lattice.cell()
-        x, y = positions(cell, *self.raster.cells(self.raster.body_rows))
-        lower, upper = Vector(x.min(), y.min()), Vector(x.max(), y.max())
-        return Setting(cell, self.neighbourhood.slots, lower, upper)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -65,54 +60,65 @@ def build_scene(experiment: Experiment) -> Scene:
 
 
 def _build(experiment: Experiment) -> Scene:
-    cell = experiment.lattice.cell()
-    neighbourhood = build_neighbourhood(cell, experiment.neighbours)
-    with _blaming("fracture"):
-        warnings = experiment.fracture.check(neighbourhood.shells())
-    if not neighbourhood.spans_plane():
-        warnings.append(
-            "neighbours: they lie along one line only, so that rows do not feel each other; "
-            "more shells, or chebyshev neighbours, connect them"
-        )
-    if experiment.neighbours.nearness() and experiment.rule.weights(neighbourhood.slots[0][0]):
+    neighbours, frame, fracture = experiment.neighbours, experiment.frame, experiment.fracture
+    with blaming(experiment.lattice, "when asked for its cell", "lattice"):
+        cell = checked_cell(experiment.lattice)
+    with blaming(neighbours, "when asked for the neighbours", "neighbours"):
+        neighbourhood = build_neighbourhood(cell, neighbours)
+    with blaming(fracture, "when asked about the rest lengths", "fracture"):
+        warnings = list(fracture.check(neighbourhood.shells()))
+    with blaming(frame, "when asked for its depth", "frame"):
+        layers = frame.depth(neighbourhood.reach)
+    low, high = window(experiment.body, experiment.lattice)
+    extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
+    refuse_too_large(experiment, neighbourhood, extent, layers)
+    body, first = fill(experiment.body, experiment.lattice)
+    warnings += _doubts(neighbourhood, body, layers)
+    raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
+    _check_diagnostics(experiment, raster)
+    constants = ask_for_constants(experiment, _setting(raster, neighbourhood))
+    if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
             f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
             "neighbours do not have; set neighbours.reevaluate: false",
             ("neighbours",),
         )
-    layers = experiment.frame.depth(neighbourhood.reach)
-    low, high = window(experiment.body, experiment.lattice)
-    extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
-    refuse_too_large(experiment, neighbourhood, extent, layers)
-    body, first = fill(experiment.body, experiment.lattice)
+    leading = build_leading(raster, experiment.leaders, experiment.steps)
+    with blaming(frame, "when asked whom its points follow", "frame"):
+        following = build_frame(raster, frame)
+    return Scene(experiment, neighbourhood, raster, constants, following, leading, tuple(warnings))
+
+
+def _setting(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+    cell = raster.lattice.cell()
+    x, y = positions(cell, *raster.cells(raster.body_rows))
+    lower, upper = Vector(x.min(), y.min()), Vector(x.max(), y.max())
+    return Setting(cell, neighbourhood.slots, lower, upper)
+
+
+def _doubts(neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
+    doubts = []
+    if not neighbourhood.spans_plane():
+        doubts.append(
+            "neighbours: they lie along one line only, so that rows do not feel each other; "
+            "more shells, or chebyshev neighbours, connect them"
+        )
     if layers and has_narrow_slot(body, layers):
-        warnings.append(
+        doubts.append(
             f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
             "belong to both faces; widen it, or take fewer layers"
         )
-    raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
-    _check_diagnostics(experiment, raster)
-    leading = build_leading(raster, experiment.leaders, experiment.steps)
-    frame = build_frame(raster, experiment.frame)
-    return Scene(experiment, neighbourhood, raster, frame, leading, tuple(warnings))
+    return doubts
 
 
 def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
     taken: dict[str, int] = {}
     for n, diagnostic in enumerate(experiment.diagnostics):
-        with _blaming("diagnostics", n):
+        with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
             diagnostic.check(raster.count)
+            diagnostic.coordinates()
             for variable in diagnostic.variables():
                 if variable.name in taken:
                     other = f"diagnostics.{taken[variable.name]} does too"
                     raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
                 taken[variable.name] = n
-
-
-@contextmanager
-def _blaming(*part: str | int) -> Iterator[None]:
-    """Errors raised inside are about this part of the experiment."""
-    try:
-        yield
-    except ExperimentError as error:
-        raise ExperimentError(str(error), (*part, *error.where)) from None

@@ -44,9 +44,14 @@ def estimate(
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
-    shows_bonds = experiment.fracture.can_break or any(d.uses_bonds for d in experiment.diagnostics)
     state = 2 * 2 * 8 + experiment.fracture.can_break * planes * (4 + 1)
-    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16 + shows_bonds * planes * BOND_BYTES
+    table = (
+        1
+        + 8
+        + 2 * 4
+        + experiment.rule.uses_reference * 16
+        + experiment.shows_bonds * planes * BOND_BYTES
+    )
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
     records = experiment.record.count(experiment.steps)
     per_record = particles * (2 * 8 + 1) + sum(
@@ -54,7 +59,7 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     )
     every_step = sum(_bytes_a_record(d, particles) for d in experiment.diagnostics if d.every_step)
     once = particles * (2 * 8 + 2 * 4 + 2 * 8)
-    if shows_bonds:
+    if experiment.shows_bonds:
         once += math.ceil(particles * planes * (2 * 8 + 1 + 4 * experiment.fracture.can_break))
     output = once + records * per_record + (experiment.steps + 1) * every_step
     return Sizes(particles, memory, output)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import FractureModel, Slot, Vector, where
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.raster import Block
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.parameters import named
 from pbdkit.stepping.sums import difference
 
 Steps = NDArray[np.int32]
@@ -22,7 +22,7 @@ class Fracturing:
 
     def __init__(self, scene: Scene) -> None:
         self._model: FractureModel = scene.experiment.fracture
-        self._parameters = named(self._model.parameters())
+        self._parameters = scene.constants.fracture
         self._breakable = []
         self._plane_of: dict[Slot, tuple[int, bool]] = {}
         frame_too = self._model.breaks_frame_bonds()
@@ -30,7 +30,7 @@ class Fracturing:
             self._plane_of |= {plane.slot: (n, True), plane.opposite: (n, False)}
             if block := plane_block(scene.raster, plane):
                 where_ = bonds_in(scene.raster, block, plane, frame_too)
-                constants = self._model.constants(plane.slot)
+                constants = scene.constants.limits[plane.slot]
                 self._breakable.append((n, plane.slot, block, where_, constants))
 
     def break_bonds(self, m: NDArray[Any], broken_step: Steps, step: int) -> None:
@@ -39,7 +39,8 @@ class Fracturing:
             _, rows, columns = block.slices()
             plane = broken_step[n, rows, columns]
             d = difference(m, block, slot)
-            breaks = self._model.breaks(d, slot.rest, constants, self._parameters)
+            with np.errstate(all="ignore"), blaming(self._model, f"at step {step}"):
+                breaks = self._model.breaks(d, slot.rest, constants, self._parameters)
             plane[breakable & (plane < 0) & breaks] = step
 
     def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, broken_step: Steps) -> Vector:
@@ -47,7 +48,8 @@ class Fracturing:
         broken = self.broken(block, slot, broken_step)
         if not broken.any():
             return d
-        lost = self._model.fictitious(u, slot.rest, self._parameters)
+        with blaming(self._model, "to place a fictitious point"):
+            lost = self._model.fictitious(u, slot.rest, self._parameters)
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
 
     def broken(self, block: Block, slot: Slot, broken_step: Steps) -> NDArray[np.bool_]:

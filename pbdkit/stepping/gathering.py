@@ -10,7 +10,6 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import positions
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
-from pbdkit.stepping.parameters import named
 from pbdkit.stepping.state import Floats
 
 
@@ -24,7 +23,7 @@ class GatheringFollowers(Followers):
         raster = scene.raster
         self._scene = scene
         self._rule = scene.experiment.rule
-        self._parameters = named(self._rule.parameters(scene.setting()))
+        self._parameters = scene.constants.rule
         self._place, self._body = raster.place, raster.body_rows
         self._X = np.stack(positions(raster.lattice.cell(), *raster.cells()))
         self._scale = np.sqrt(np.array(near.weights))

@@ -13,9 +13,8 @@ from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.parameters import named
 from pbdkit.stepping.state import Floats
-from pbdkit.stepping.sums import Present, difference, planes, presence, sum_over_slots
+from pbdkit.stepping.sums import Present, difference, planes, presence, read_only, sum_over_slots
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
@@ -23,12 +22,11 @@ BLOCK_CELLS = 16384
 
 @dataclass(frozen=True)
 class _Part:
-    """What is constant on one block: its slots with weights and presence, X where the rule wants
+    """What is constant on one block: its slots with presence, X where the rule wants
     it, and where followers can move (None: everywhere)."""
 
     block: Block
     slots: tuple[Slot, ...]
-    weights: dict[Slot, tuple[float, ...]]
     present: list[Present]
     X: Vector
     movable: Present
@@ -40,7 +38,7 @@ class SlotFollowers(Followers):
     def __init__(self, scene: Scene, fracturing: Fracturing | None) -> None:
         self._scene = scene
         self._rule = scene.experiment.rule
-        self._parameters = named(self._rule.parameters(scene.setting()))
+        self._parameters = scene.constants.rule
         self._fracturing = fracturing
         self._parts = [part for s in range(scene.raster.shape[0]) for part in self._cut(s)]
 
@@ -61,22 +59,21 @@ class SlotFollowers(Followers):
         return _Part(
             block,
             slots,
-            {slot: self._rule.weights(slot) for slot in slots},
             present,
-            raster.reference_planes(block) if self._rule.uses_reference else Vector(0.0, 0.0),
+            raster.reference_planes(block) if self._rule.uses_reference else Vector(None, None),
             None if movable.all() else movable,
         )
 
     def _move(
         self, part: _Part, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None
     ) -> None:
-        u = planes(m, part.block)
+        u, weights = read_only(planes(m, part.block)), self._scene.constants.weights
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
             if self._fracturing and broken_step is not None:
                 d = self._fracturing.seen(d, u, part.block, slot, broken_step)
-            return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
+            return self._rule.gather(d, slot.rest, weights[slot], self._parameters)
 
         total = sum_over_slots(part.slots, part.present, contribution)
         move = self._rule.apply(total, Here(u, part.X), self._parameters)

@@ -22,6 +22,13 @@ def planes(u: NDArray[Any], block: Block) -> Vector:
     return Vector(u[0, s, rows, columns], u[1, s, rows, columns])
 
 
+def read_only(v: Vector) -> Vector:
+    """The same, as components hand it to a rule: nobody writes to the state but the stepper."""
+    for plane in v:
+        plane.flags.writeable = False
+    return v
+
+
 def difference(u: NDArray[Any], block: Block, slot: Slot) -> Vector:
     """u_k - u_j along a slot, for every j of the block."""
     here, there = planes(u, block), planes(u, block.seen_through(slot))

@@ -1,0 +1,41 @@
+"""The numbers that a scene's elementwise functions are called with, asked for once."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import dataclass
+from typing import Any
+
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Setting, Slot
+from pbdkit.registry.blame import blaming
+
+Constants = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SceneConstants:
+    """Parameters as tuples with names (``p.K``), and by slot the rule's weights and, where bonds
+    can break, the fracture model's constants."""
+
+    rule: Any
+    weights: dict[Slot, Constants]
+    fracture: Any
+    limits: dict[Slot, Constants]
+
+
+def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
+    """What rule and fracture model answer; what they refuse is about their part."""
+    slots = [slot for own in setting.slots for slot in own]
+    with blaming(experiment.rule, "when asked for its constants", "rule"):
+        rule = _named(experiment.rule.parameters(setting))
+        weights = {slot: tuple(experiment.rule.weights(slot)) for slot in slots}
+    fracture = experiment.fracture
+    with blaming(fracture, "when asked for its constants", "fracture"):
+        parameters = _named(fracture.parameters())
+        limits = {s: tuple(fracture.constants(s)) for s in slots} if fracture.can_break else {}
+    return SceneConstants(rule, weights, parameters, limits)
+
+
+def _named(values: dict[str, float]) -> Any:
+    return namedtuple("Parameters", values)(**values)

@@ -1,0 +1,52 @@
+"""What the leaders prescribe in a step, and for how many steps that stays so."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import Floats, State
+
+Led = list[tuple[Indices, Floats]]
+"""(place, u) of the particles that lead, u as (axis, particle)."""
+Starts = tuple[Floats | None, ...]
+
+
+def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
+    """The leaders of a step with their displacements, and where each motion has started."""
+    led: Led = []
+    starts = list(state.starts)
+    for n, leading in enumerate(scene.leading):
+        if not leading.group.leads(step):
+            continue
+        begun = starts[n]
+        if begun is None:
+            starts[n] = begun = state.u.reshape(2, -1)[:, leading.place].copy()
+        n_th = step - leading.group.from_ + 1
+        offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
+        led.append((leading.place, begun + np.atleast_2d(offset).T))
+    return led, tuple(starts)
+
+
+def steady_steps(scene: Scene, step: int, most: int) -> int:
+    """How many steps from `step` on have the same leaders at the same places, at most `most`, at
+    least 1."""
+    for leading in scene.leading:
+        group = leading.group
+        begins, ends = group.from_, group.last(step + most)
+        if begins <= step <= ends:
+            most = min(most, ends - step + 1)
+            rests = group.motion.rests_after()
+            if rests is None or step - begins + 1 < rests:
+                return 1
+        elif step < begins:
+            most = min(most, begins - step)
+    return most
+
+
+def place(u: Floats, led: Led) -> None:
+    """Puts leaders where they are prescribed."""
+    flat = u.reshape(2, -1)
+    for places, values in led:
+        flat[:, places] = values
