@@ -26,7 +26,14 @@ class ExperimentError(PbdkitError):
 
 
 class PluginError(PbdkitError):
-    """A distribution that the experiment names is missing or broken."""
+    """A distribution that the experiment names is missing or broken, or a component of it fails.
+
+    `where` is the path of the field that asks for it, where one does.
+    """
+
+    def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
+        super().__init__(message)
+        self.where = tuple(where)
 
 
 class DivergedError(PbdkitError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -12,12 +13,12 @@ from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
-from pbdkit.experiment.source import Source, read_text
+from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
+from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.results.stopping import asked_to_stop
 from pbdkit.scene.forecast import refuse_too_much_output
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import initial_state
@@ -36,6 +37,12 @@ class Report:
     outcome: Outcome
     particles: int
     wall_s: float
+    engine: str
+
+    @property
+    def ns_per_particle_step(self) -> float:
+        """Wall time of stepping and recording together."""
+        return self.wall_s * 1e9 / (self.particles * max(1, self.outcome.steps))
 
 
 def load(
@@ -66,7 +73,7 @@ def run(
     """
     sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
     refuse_too_much_output(scene)
-    report = run_into(sink, scene, progress)
+    report = run_into(sink, scene, progress=progress)
     dataset = sink.dataset()
     if report.outcome.status == "diverged":
         raise DivergedError(report.outcome.stop_reason, dataset)
@@ -79,22 +86,31 @@ def rerun(
     """The same run again, bit for bit, from the experiment that the dataset carries."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = read_text(dataset.attrs["experiment"], "dataset")
-    return run(Experiment.build(source, components), progress=progress)
+    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
+    try:
+        experiment = Experiment.build(source, components)
+    except ExperimentError as error:
+        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
+        if given is None or components:
+            raise
+        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+    return run(experiment, progress=progress)
 
 
-def run_into(sink: Sink, scene: Scene, progress: bool) -> Report:
-    """Steps the scene to its end and records it into the sink."""
+def run_into(
+    sink: Sink, scene: Scene, *, progress: bool, stopping: Callable[[], bool] = lambda: False
+) -> Report:
+    """Steps the scene to its end, or until `stopping` says so, and records it into the sink."""
     recorder = Recorder(scene, sink)
     begun = time.perf_counter()
-    recorder.begin()
     try:
-        with progress_bar(scene.experiment.steps, progress) as show, asked_to_stop() as stopping:
+        recorder.begin()
+        with progress_bar(scene.experiment.steps, progress) as show:
             outcome = _step_through(scene, recorder, show, stopping)
     except BaseException:
         sink.abandon()
         raise
-    return Report(outcome, scene.raster.count, time.perf_counter() - begun)
+    return Report(outcome, scene.raster.count, time.perf_counter() - begun, "numpy")
 
 
 def _step_through(
@@ -108,11 +124,12 @@ def _step_through(
             state = stepper.advance(state)
             recorder.observe(state)
             show(state.step)
+        if state.step < steps:
+            recorder.observe_last(state)
+            outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
     except FloatingPointError as error:
         reason = f"{error} left the finite numbers under rule '{scene.experiment.rule.type}'"
         outcome = Outcome("diverged", reason, state.step)
-    if outcome.status == "complete" and state.step < steps:
-        outcome = Outcome("interrupted", f"interrupted after step {state.step}", state.step)
     recorder.finish(state, outcome)
     return outcome
 
@@ -121,6 +138,7 @@ def _experiment(
     given: Experiment | Mapping[str, Any] | str | Path, components: Components
 ) -> Experiment:
     if isinstance(given, Experiment):
+        Registry(components)  # what is handed over is checked, needed or not
         return given
     if isinstance(given, Mapping):
         return Experiment.build(Source(data=dict(given)), components)

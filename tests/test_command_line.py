@@ -84,7 +84,7 @@ def test_an_existing_output_is_kept_unless_forced(call: Call) -> None:
 
 
 WRONG = {
-    "unknown command": (2, ["rnu"], "No such command 'rnu'"),
+    "unknown command": (2, ["rnu"], "there is no command 'rnu'; did you mean 'run'?"),
     "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
     "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "--set steps=0: steps: "),
     "unknown type": (2, ["run", "e.json", "--set", "rule.type=x"], "unknown type 'x'"),

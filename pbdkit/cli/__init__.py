@@ -29,9 +29,11 @@ class Commands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """The command of that name."""
+        """The command of that name, or a usage error with the nearest right one."""
         if name not in COMMANDS:
-            return None
+            from pbdkit.interfaces.naming import did_you_mean
+
+            ctx.fail(f"there is no command '{name}'{did_you_mean(name, COMMANDS)}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
         return command
 
@@ -55,6 +57,8 @@ def main(arguments: list[str] | None = None) -> None:
     """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
     broken plugin, 4 diverged, 6 storage failed, 130 interrupted."""
     given = sys.argv[1:] if arguments is None else arguments
+    if debug := "--debug" in given:
+        given = [argument for argument in given if argument != "--debug"]
     try:
         code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
     except click.exceptions.Abort:
@@ -62,10 +66,9 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         code = _failed("interrupted", 130)
     except click.ClickException as error:
-        error.show()
-        code = error.exit_code
+        code = _failed(error.format_message(), error.exit_code)
     except Exception as error:
-        if "--debug" in given:
+        if debug:
             traceback.print_exc()
         code = _report(error)
     sys.exit(code or 0)

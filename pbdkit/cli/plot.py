@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
+
+FORMATS = (".png", ".svg", ".pdf")
 
 
 @click.command()
@@ -14,7 +17,6 @@ import click
 @click.option("--color", metavar="VARIABLE", help="Colour by a variable, e.g. pe1.")
 @click.option("--contours", is_flag=True, help="Fill contours of the variable.")
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers.")
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
 def plot(
     file: Path,
     output: Path | None,
@@ -22,21 +24,25 @@ def plot(
     color: str | None,
     contours: bool,
     numbers: bool,
-    force: bool,
 ) -> None:
     """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
     from pbdkit.errors import ExperimentError, StorageError
     from pbdkit.results.accessor import open as open_result
-    from pbdkit.results.picture import figure
+    from pbdkit.results.picture import draw, figure
 
     path = output or file.with_suffix(".png")
-    if path.exists() and not force:
-        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
+    if path.suffix not in FORMATS:
+        raise ExperimentError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+    if file.suffix in (".yaml", ".yml", ".json"):
+        raise ExperimentError(f"{file}: is an experiment; run it first, then plot its result")
+    look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
     with open_result(file) as dataset:
-        last = int(dataset["time"][-1])
-        drawn = figure(dataset, times or (last,), color=color, contours=contours, numbers=numbers)
+        if len(times) > 1:
+            drawn: Any = figure(dataset, times, **look)
+        else:
+            drawn = draw(dataset, next(iter(times), None), **look).figure
     try:
         drawn.savefig(path)
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{path}: cannot be written: {error}") from None
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
     click.echo(f"{path} written")

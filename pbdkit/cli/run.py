@@ -31,7 +31,9 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
+    from pbdkit.cli.stopping import asked_to_stop
     from pbdkit.running import load, run_into
+    from pbdkit.scene.forecast import forecast
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
@@ -39,20 +41,22 @@ def run(
     _refuse_existing(path, force)
     scene = build_scene(loaded)
     if not quiet:
-        for warning in scene.warnings:
+        for warning in forecast(scene).warnings:
             click.echo(f"warning: {warning}", err=True)
 
     from pbdkit.results.netcdf import NetcdfSink
 
     silent = quiet or as_json or not sys.stderr.isatty()
-    report = run_into(NetcdfSink(path), scene, progress=not silent)
+    sink = NetcdfSink(path, replace=force)
+    with asked_to_stop() as stopping:
+        report = run_into(sink, scene, progress=not silent, stopping=stopping)
     if as_json:
         click.echo(json.dumps(_figures(report, path)))
-    elif not quiet:
+    elif not quiet and report.outcome.status == "complete":
         outcome = report.outcome
         size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
         click.echo(f"{outcome.status}: {size}, written to {path}")
-    return _exit_code(report)
+    return _exit_code(report, path)
 
 
 def _refuse_existing(path: Path, force: bool) -> None:
@@ -69,15 +73,14 @@ def _refuse_existing(path: Path, force: bool) -> None:
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
-    work = report.particles * max(1, report.outcome.steps)
     return {
         "status": report.outcome.status,
         "steps": report.outcome.steps,
         "particles": report.particles,
         "wall_s": round(report.wall_s, 6),
-        "ns_per_particle_step": round(report.wall_s * 1e9 / work, 3),
+        "ns_per_particle_step": round(report.ns_per_particle_step, 3),
         "peak_memory_mib": _peak_memory_mib(),
-        "engine": "numpy",
+        "engine": report.engine,
         "output": str(path),
     }
 
@@ -92,13 +95,13 @@ def _peak_memory_mib() -> float | None:
     return round(getrusage(RUSAGE_SELF).ru_maxrss / unit, 1)
 
 
-def _exit_code(report: Report) -> int:
+def _exit_code(report: Report, path: Path) -> int:
     codes = {"diverged": 4, "interrupted": 130}
     code = codes.get(report.outcome.status, 0)
     if code:
         click.echo(
             f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
-            "what was recorded before is kept",
+            f"what was recorded until then is in {path}",
             err=True,
         )
     return code

@@ -48,6 +48,12 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "value_error":
         return where, message
     hint = ""
+    if (
+        fault["type"] == "int_type"
+        and isinstance(fault["input"], float)
+        and fault["input"] % 1 == 0
+    ):
+        hint = f"; write {int(fault['input'])}"
     if fault["type"] == "literal_error" and isinstance(fault["input"], str):
         hint = did_you_mean(fault["input"], re.findall(r"'([^']*)'", context["expected"]))
     return where, f"{message}, got {brief(fault['input'])}{hint}"

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.bodies import AnyBody
 from pbdkit.experiment.faults import located, report
 from pbdkit.experiment.initial import AnyInitial
@@ -186,4 +186,6 @@ class Experiment(Strict):
             )
         except ValidationError as error:
             raise report(error, source) from None
+        except PluginError as error:
+            raise PluginError(source.message(error.where, str(error)), error.where) from None
         self._registry, self._source = registry, source

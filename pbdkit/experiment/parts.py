@@ -8,7 +8,7 @@ from typing import Any, Union
 from pydantic import BeforeValidator, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.registry.registry import Registry
@@ -59,6 +59,8 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
         part = find(name)
     except ExperimentError as error:
         raise fault(str(error), key="type") from None
+    except PluginError as error:
+        raise PluginError(str(error), (info.field_name or "", "type")) from None
     parameters = {k: v for k, v in value.items() if k != "type"}
     return part.model_validate(parameters, context=info.context)
 

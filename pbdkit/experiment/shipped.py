@@ -36,7 +36,8 @@ def read_experiment(name: str) -> Source:
     if name in names:
         return read_text(shipped_text(name), name)
     what = "is a folder" if is_folder else "is no file and no shipped experiment"
-    hint = did_you_mean(name, names)
+    near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    hint = did_you_mean(name, [*near, *names])
     raise ExperimentError(f"{name}: {what}{hint} (`pbdkit experiments` lists them)")
 
 

@@ -43,7 +43,8 @@ class Strict(BaseModel):
         unknown = [k for k in data if k not in cls.known_keys()] if isinstance(data, dict) else []
         if unknown:
             known = [k for k in cls.known_keys() if k != "type"]
-            taken = f"known here: {', '.join(known)}" if known else "nothing can be set here"
+            whose = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
+            taken = f"known: {', '.join(known)}" if known else f"'{whose}' takes nothing"
             message = f"unknown key{did_you_mean(str(unknown[0]), known)} ({taken})"
             raise PydanticCustomError("key", "{text}", {"text": message, "key": unknown[0]})
         return data

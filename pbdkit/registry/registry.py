@@ -11,6 +11,9 @@ from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.registry.loading import Plugin, check_component, load_builtin, load_installed
 
+GIVEN = "components"
+"""How classes that were handed over in Python appear among the plugins."""
+
 
 class Registry:
     """The built-in components, those handed over in Python, and, once needed, the installed ones.
@@ -20,7 +23,7 @@ class Registry:
 
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
         self._builtin = load_builtin()
-        self._given = Plugin("components", "", "", "ok", components=tuple(components))
+        self._given = Plugin(GIVEN, "", "", "ok", components=tuple(components))
         for component in self._given.components:
             try:
                 check_component(component)
@@ -73,10 +76,14 @@ class Registry:
         }
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
-        """The distributions that these components come from, with their versions."""
+        """The distributions that these components come from, with their versions; under GIVEN the
+        types of those that come from none."""
         classes = {type(component) for component in used}
         loaded = [self._builtin, *self.__dict__.get("installed", ())]
-        return {p.distribution: p.version for p in loaded if classes & set(p.components)}
+        found = {p.distribution: p.version for p in loaded if classes & set(p.components)}
+        offered = {c for p in loaded for c in p.components}
+        given = sorted({c.type_name() for c in classes - offered})
+        return found | ({GIVEN: ", ".join(given)} if given else {})
 
     def name_of(self, component: Component) -> str:
         """The type by which an experiment finds this component again, with its distribution where

@@ -66,13 +66,20 @@ class PbdAccessor:
         self._dataset = dataset
 
     def plot(
-        self, time: int | Iterable[int] | None = None, color: str | None = None, **options: Any
+        self,
+        time: int | Iterable[int] | None = None,
+        color: str | None = None,
+        *,
+        contours: bool = False,
+        numbers: bool = False,
+        ax: Axes | None = None,
     ) -> Axes | Figure:
         """A picture: the Axes of one step (default the last), or a Figure of several.
 
-        `options` are those of `picture.draw` and `picture.figure`: contours, numbers, and ax for
-        one step. Raises ExperimentError as they do.
+        `contours`, `numbers` and, for one step, `ax` are those of `picture.draw`, and what is
+        raised is too.
         """
+        look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
         if isinstance(time, Iterable):
-            return picture.figure(self._dataset, time, color=color, **options)
-        return picture.draw(self._dataset, time, color=color, **options)
+            return picture.figure(self._dataset, time, **look)
+        return picture.draw(self._dataset, time, ax=ax, **look)

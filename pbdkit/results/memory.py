@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class MemorySink(Sink):
     """Grows every column in memory."""
 
-    def begin(self, columns: list[Column], sizes: dict[str, int], records: int) -> None:
-        """Allocates the columns that grow with the records."""
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """Nothing is allocated before it comes."""
         self._columns = columns
         self._sizes = sizes
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,16 +20,19 @@ BATCH_BYTES = 2**20
 """Entries are written, and chunked, in batches of about so much: one particle's history and one
 snapshot both stay cheap to read."""
 
+FULL_BYTES = 2**20
+
 
 class NetcdfSink(Sink):
     """Writes beside `path` under a temporary name; `finish` syncs it and renames it to `path`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, replace: bool = False) -> None:
         self._path = path
-        self._temporary = path.with_name(f".pbdkit-{os.getpid()}.partial")
+        self._replace = replace
+        self._temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{id(self):x}.partial")
         self._file: Any = None
 
-    def begin(self, columns: list[Column], sizes: dict[str, int], records: int) -> None:
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
         """Opens the file, so that what cannot be written is known before the first step."""
         self._columns = {c.name: c for c in columns}
         self._waiting: dict[str, list[Any]] = {c.name: [] for c in columns if c.grows}
@@ -42,7 +46,7 @@ class NetcdfSink(Sink):
             for dim in dict.fromkeys(d for c in columns for d in c.dims):
                 self._file.createDimension(dim, sizes.get(dim))
             for column in columns:
-                self._define(column, sizes, records)
+                self._define(column, sizes, planned)
 
     def put(self, values: Values) -> None:
         """Keeps growing columns until a batch is full."""
@@ -62,8 +66,30 @@ class NetcdfSink(Sink):
             self._file.setncatts(attributes)
             self._file.close()
             _sync(self._temporary)
-            self._temporary.replace(self._path)
+        self._give_name()
+        with suppress(OSError):  # the result is there; some file systems cannot sync a folder
             _sync(self._path.parent)
+
+    def _give_name(self) -> None:
+        """Renames; what somebody else has put there meanwhile is replaced only on request."""
+        if self._replace:
+            with self._storing():
+                self._temporary.replace(self._path)
+            return
+        try:
+            os.link(self._temporary, self._path)
+        except FileExistsError:
+            kept = self._path.with_name(f"{self._path.stem}-{os.getpid()}{self._path.suffix}")
+            self._temporary.replace(kept)
+            raise StorageError(
+                f"{self._path}: appeared while this run was going on and is left as it is; "
+                f"this result is in {kept}"
+            ) from None
+        except OSError:  # no hard links on this file system
+            with self._storing():
+                self._temporary.rename(self._path)
+        else:
+            self._temporary.unlink()
 
     def abandon(self) -> None:
         """Removes the temporary file."""
@@ -72,13 +98,13 @@ class NetcdfSink(Sink):
         with suppress(OSError):
             self._temporary.unlink(missing_ok=True)
 
-    def _define(self, column: Column, sizes: dict[str, int], records: int) -> None:
+    def _define(self, column: Column, sizes: dict[str, int], planned: dict[str, int]) -> None:
         dtype: Any = str if column.dtype == "str" else column.dtype
         chunks = None
         if column.grows:
             inner = [max(1, sizes[d]) for d in column.dims[1:]]
             entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
-            self._batch[column.name] = max(1, min(BATCH_BYTES // entry, max(records, 1)))
+            self._batch[column.name] = max(1, min(BATCH_BYTES // entry, planned[column.dims[0]]))
             chunks = (self._batch[column.name], *inner)
         variable = self._file.createVariable(
             column.name, dtype, column.dims, chunksizes=chunks, fill_value=False
@@ -104,8 +130,14 @@ class NetcdfSink(Sink):
             yield
         except (OSError, RuntimeError) as error:
             self.abandon()
-            reason = getattr(error, "strerror", None) or error
-            raise StorageError(f"{self._path}: cannot be written: {reason}") from None
+            raise StorageError(f"{self._path}: cannot be written: {self._reason(error)}") from None
+
+    def _reason(self, error: Exception) -> str:
+        """The library says little of a full disk."""
+        with suppress(OSError):
+            if shutil.disk_usage(self._path.parent).free < FULL_BYTES:
+                return "the disk is full; free some space, or record fewer steps"
+        return str(getattr(error, "strerror", None) or error)
 
 
 def _sync(path: Path) -> None:

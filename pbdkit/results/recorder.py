@@ -27,9 +27,9 @@ class Sink(ABC):
     """Where a dataset goes while it is made. `abandon` leaves nothing behind."""
 
     @abstractmethod
-    def begin(self, columns: list[Column], sizes: dict[str, int], records: int) -> None:
-        """The columns to come, the sizes of the dimensions that do not grow, and how many
-        records are planned."""
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """The columns to come, the sizes of the dimensions that do not grow, and how many entries
+        are planned along those that do."""
 
     @abstractmethod
     def put(self, values: Values) -> None:
@@ -87,7 +87,8 @@ class Recorder:
         }
         experiment = self._scene.experiment
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
-        self._sink.begin(columns, sizes, experiment.record.count(experiment.steps))
+        records = experiment.record.count(experiment.steps)
+        self._sink.begin(columns, sizes, {"time": records, "step": experiment.steps + 1})
         self._sink.put(known)
 
     def observe(self, state: State) -> None:
@@ -96,6 +97,12 @@ class Recorder:
         steps, record = self._scene.experiment.steps, self._scene.experiment.record
         with np.errstate(all="ignore"):
             self._observe(state, record.keeps(state.step, steps), bool(self._stepped))
+
+    def observe_last(self, state: State) -> None:
+        """Records the step at which a run stops before its end."""
+        if state.step > self._last_recorded:
+            with np.errstate(all="ignore"):
+                self._observe(state, recorded=True, stepped=False)
 
     def _observe(self, state: State, recorded: bool, stepped: bool) -> None:
         moment = StateMoment(state, self._tables)
@@ -114,10 +121,7 @@ class Recorder:
             self._sink.put(values)
 
     def finish(self, state: State, outcome: Outcome) -> None:
-        """Hands over what is known at the end, and the attributes. The last step of a run that was
-        interrupted is recorded too."""
-        if outcome.status == "interrupted" and state.step > self._last_recorded:
-            self._observe(state, recorded=True, stepped=False)
+        """Hands over what is known at the end, and the attributes."""
         if self._scene.has_fracture:
             self._sink.put({"broken_step": StateMoment(state, self._tables).broken_step()})
         self._sink.finish(self._attributes(outcome))
