@@ -21,12 +21,15 @@ from pbdkit.results.progress import progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
 from pbdkit.scene.forecast import refuse_too_much_output
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stepping.choice import Choice, choose, make_engine
+from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 if TYPE_CHECKING:
     import xarray
 
+LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
+"""An engine is called for so long at most, so that progress shows and interruptions are heard."""
 Components = Iterable[type[Component]]
 
 
@@ -37,7 +40,7 @@ class Report:
     outcome: Outcome
     particles: int
     wall_s: float
-    engine: str
+    choice: Choice
 
     @property
     def ns_per_particle_step(self) -> float:
@@ -101,27 +104,34 @@ def run_into(
     sink: Sink, scene: Scene, *, progress: bool, stopping: Callable[[], bool] = lambda: False
 ) -> Report:
     """Steps the scene to its end, or until `stopping` says so, and records it into the sink."""
+    engine, choice = make_engine(scene, choose(scene))
     recorder = Recorder(scene, sink)
     begun = time.perf_counter()
     try:
         recorder.begin()
         with progress_bar(scene.experiment.steps, progress) as show:
-            outcome = _step_through(scene, recorder, show, stopping)
+            outcome = _step_through(scene, engine, recorder, show, stopping)
     except BaseException:
         sink.abandon()
         raise
-    return Report(outcome, scene.raster.count, time.perf_counter() - begun, "numpy")
+    return Report(outcome, scene.raster.count, time.perf_counter() - begun, choice)
 
 
 def _step_through(
-    scene: Scene, recorder: Recorder, show: Callable[[int], None], stopping: Callable[[], bool]
+    scene: Scene,
+    engine: Engine,
+    recorder: Recorder,
+    show: Callable[[int], None],
+    stopping: Callable[[], bool],
 ) -> Outcome:
-    steps, stepper, state = scene.experiment.steps, Stepper(scene), initial_state(scene)
+    steps, state = scene.experiment.steps, initial_state(scene)
+    patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
     outcome = Outcome("complete", "all steps done", steps)
     try:
         recorder.observe(state)
         while state.step < steps and not stopping():
-            state = stepper.advance(state)
+            wanted = recorder.next_after(state.step) - state.step
+            state = engine.advance(state, min(wanted, patience))
             recorder.observe(state)
             show(state.step)
         if state.step < steps:

@@ -56,6 +56,8 @@ def run(
         outcome = report.outcome
         size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
         click.echo(f"{outcome.status}: {size}, written to {path}")
+        threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""
+        click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
     return _exit_code(report, path)
 
 
@@ -80,7 +82,8 @@ def _figures(report: Report, path: Path) -> dict[str, Any]:
         "wall_s": round(report.wall_s, 6),
         "ns_per_particle_step": round(report.ns_per_particle_step, 3),
         "peak_memory_mib": _peak_memory_mib(),
-        "engine": report.engine,
+        "engine": report.choice.engine,
+        "threads": report.choice.threads,
         "output": str(path),
     }
 

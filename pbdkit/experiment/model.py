@@ -66,10 +66,14 @@ class Stepping(Component):
     """One step after the other.
 
     `relaxation` w and `memory` b apply to any rule's move, for followers only:
-    x(t+1) = m + w · move + b · (x(t) - x(t-1)).
+    x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
+    best; `precision` is that of the run's own numbers; `threads` for the compiled engine.
     """
 
     type: Literal["stepping"] = "stepping"
+    engine: Literal["auto", "numpy", "compiled"] = "auto"
+    precision: Literal["float64", "float32"] = "float64"
+    threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
     relaxation: Annotated[float, Field(gt=0.0)] = 1.0
     memory: float = 0.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_serializer, model_validator
@@ -44,6 +44,13 @@ class Record(Strict):
             return step % self.every == 0
         place = bisect_left(self.at, step)
         return place < len(self.at) and self.at[place] == step
+
+    def next_after(self, step: int, steps: int) -> int:
+        """The first recorded step after `step`, in a run of `steps`."""
+        if self.at is None:
+            return min(steps, (step // self.every + 1) * self.every)
+        place = bisect_right(self.at, step)
+        return min(steps, self.at[place]) if place < len(self.at) else steps
 
     def count(self, steps: int) -> int:
         """How many steps of a run of `steps` are recorded."""

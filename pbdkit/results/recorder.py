@@ -98,6 +98,11 @@ class Recorder:
         with np.errstate(all="ignore"):
             self._observe(state, record.keeps(state.step, steps), bool(self._stepped))
 
+    def next_after(self, step: int) -> int:
+        """The next step after `step` at which something is taken."""
+        experiment = self._scene.experiment
+        return step + 1 if self._stepped else experiment.record.next_after(step, experiment.steps)
+
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""
         if state.step > self._last_recorded:

@@ -44,7 +44,8 @@ def estimate(
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
-    state = 2 * 2 * 8 + experiment.fracture.can_break * planes * (4 + 1)
+    value = 8 if experiment.solver.precision == "float64" else 4
+    state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1)
     table = (
         1
         + 8

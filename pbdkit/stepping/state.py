@@ -40,7 +40,7 @@ class State:
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
     the given cracks broken at step 0. Nothing has moved before."""
-    u = np.zeros((2, *scene.raster.shape))
+    u = np.zeros((2, *scene.raster.shape), scene.experiment.solver.precision)
     _displace(scene, u.reshape(2, -1))
     broken = _broken_by_cracks(scene) if scene.has_fracture else None
     return State(0, u, u.copy(), broken, (None,) * len(scene.leading))

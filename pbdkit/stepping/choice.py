@@ -1,0 +1,94 @@
+"""Which engine steps a scene, on how many threads, and why."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.stepper import Stepper
+
+PATIENCE_S = 3.0
+"""Compiling pays where the numpy engine would take longer than about this (measured: importing
+numba and loading a kernel .5 s, making a new one 1 to 5 s)."""
+CALL_S, VALUE_S = 25e-6, 2.5e-9
+"""What the numpy engine takes a step and slot, and a step, slot and particle (measured)."""
+TWO_THREADS_PAY = 100_000
+"""Particles from which a second thread pays, with a margin (measured: from 40 000)."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The engine's name, its threads, and the reason in words."""
+
+    engine: str
+    threads: int
+    reason: str
+
+
+def choose(scene: Scene) -> Choice:
+    """What the experiment asks for, or what serves it best.
+
+    Raises ExperimentError where the compiled engine is asked for and cannot be had.
+    """
+    solver = scene.experiment.solver
+    obstacle = _obstacle(scene)
+    if solver.engine == "compiled" and obstacle:
+        raise scene.experiment.located(
+            ExperimentError(f"the compiled engine cannot be had: {obstacle}", ("solver", "engine"))
+        )
+    if solver.engine == "numpy":
+        return Choice("numpy", 1, "asked for")
+    seconds = _numpy_seconds(scene)
+    if solver.engine == "auto" and seconds < PATIENCE_S:
+        return Choice("numpy", 1, "small: there is nothing to gain by compiling")
+    if obstacle:
+        return Choice("numpy", 1, f"slower than it could be: {obstacle}")
+    threads = solver.threads
+    if threads == "auto":
+        threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
+    reason = (
+        "asked for" if solver.engine == "compiled" else f"numpy would take about {seconds:.0f} s"
+    )
+    return Choice("compiled", threads, reason)
+
+
+def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
+    """The engine, and what it came to: where `auto` meets a rule that does not compile, numpy."""
+    if choice.engine == "numpy":
+        return Stepper(scene), choice
+    from pbdkit.stepping.compiled.stepper import CompiledStepper
+
+    try:
+        return CompiledStepper(scene, choice.threads), choice
+    except PluginError as error:
+        if scene.experiment.solver.engine == "compiled":
+            raise
+        reason = f"slower than it could be: {str(error).splitlines()[0]}"
+        return Stepper(scene), Choice("numpy", 1, reason)
+
+
+def _obstacle(scene: Scene) -> str:
+    """Why the compiled engine cannot step this scene; empty where it can."""
+    if find_spec("numba") is None:
+        return "numba is not installed: pip install 'pbdkit[fast]'"
+    if scene.experiment.neighbours.nearness():
+        return "neighbours are found anew at every step"
+    if max(map(len, scene.neighbourhood.slots)) > 31:
+        return "more than 31 neighbours"
+    return ""
+
+
+def _numpy_seconds(scene: Scene) -> float:
+    slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
+    a_step = slots * (CALL_S + VALUE_S * scene.raster.count / len(scene.neighbourhood.slots))
+    return a_step * scene.experiment.steps
+
+
+def _processors() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,1 @@
+"""The compiled engine: the same elementwise functions, inlined into generated kernels (numba)."""

@@ -1,0 +1,98 @@
+"""How far the leaders' motion can have reached: nothing beyond is touched.
+
+At rest a rule moves nothing, exactly; so a step can only move particles that adjoin one that has
+moved. The first step looks at every particle and finds those that are not at rest; from then on the
+box around them, and around leaders that are not at home, grows by one bond a step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.leaders import Led
+from pbdkit.stepping.state import Floats
+
+Box = NDArray[np.int64]
+"""(first row, last row + 1, first column, last column + 1) of repeat cells."""
+
+
+class Reach:
+    """`blocks` hold the body's cells of each sublattice, (sublattice, 4); `box` what has been
+    reached, `growth` how it grows in a step, (4,)."""
+
+    def __init__(self, scene: Scene) -> None:
+        raster = scene.raster
+        self._shape = raster.shape
+        self.blocks = np.zeros((raster.shape[0], 4), np.int64)
+        for s in range(raster.shape[0]):
+            if block := raster.body_block(s):
+                (i0, j0), (i1, j1) = block.start, block.stop
+                self.blocks[s] = i0, i1, j0, j1
+        self._everything = np.array([0, raster.shape[1], 0, raster.shape[2]], np.int64)
+        self._bond = _growth(scene)
+        self.forget()
+
+    def forget(self) -> None:
+        """What has moved is not known: the next step looks at everything."""
+        self._known = False
+        self.box, self.growth = self._everything.copy(), np.zeros(4, np.int64)
+
+    def before(self, led: Led, count: int) -> int:
+        """Takes the leaders of the coming steps in; returns how many of `count` can be made in
+        one go."""
+        if not self._known:
+            return 1
+        for place, values in led:
+            away = place[(values != 0.0).any(axis=0)]
+            if len(away):
+                _, i, j = np.unravel_index(away, self._shape)
+                self._join(_around(i, j))
+        return count
+
+    def after(self, now: Floats, before: Floats) -> None:
+        """Looks once at what the first step has moved."""
+        if self._known:
+            np.clip(self.box, 0, self._everything.max(), out=self.box)
+            return
+        self._known = True
+        moved = (now != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
+        i, j = np.nonzero(moved)
+        self.box = _around(i, j) if len(i) else np.array([0, 0, 0, 0], np.int64)
+        self._empty = not len(i)
+        self.growth = self._bond.copy() if len(i) else np.zeros(4, np.int64)
+
+    def _join(self, box: Box) -> None:
+        if self._empty:
+            self.box, self.growth, self._empty = box, self._bond.copy(), False
+        self.box[::2] = np.minimum(self.box[::2], box[::2])
+        self.box[1::2] = np.maximum(self.box[1::2], box[1::2])
+
+
+def _around(i: NDArray[np.intp], j: NDArray[np.intp]) -> Box:
+    return np.array([i.min(), i.max() + 1, j.min(), j.max() + 1], np.int64)
+
+
+def _growth(scene: Scene) -> Box:
+    """How far, in cells, a step carries a motion along each direction: by a bond, or by a frame
+    point that follows one particle and is a neighbour of another."""
+    steps = [slot.cell for own in scene.neighbourhood.slots for slot in own]
+    carried = [np.array(steps)]
+    if scene.frame:
+        _, i, j = np.unravel_index(scene.frame.place[scene.frame.map.point], scene.raster.shape)
+        _, m, n = np.unravel_index(scene.frame.body_place, scene.raster.shape)
+        kinds = scene.raster.kind
+        for own in scene.neighbourhood.slots:
+            for slot in own:
+                # The particle at (p, q) sees the frame point at (i, j) through this slot.
+                p, q = i - slot.cell[0], j - slot.cell[1]
+                inside = (p >= 0) & (p < kinds.shape[1]) & (q >= 0) & (q < kinds.shape[2])
+                p, q, b, c = p[inside], q[inside], m[inside], n[inside]
+                follows = kinds[slot.source, p, q] == 1
+                carried.append(np.stack([p - b, q - c], axis=1)[follows])
+    most = np.concatenate(carried)
+    return np.array(
+        [min(most[:, 0].min(), 0), max(most[:, 0].max(), 0),
+         min(most[:, 1].min(), 0), max(most[:, 1].max(), 0)], np.int64
+    )  # fmt: skip

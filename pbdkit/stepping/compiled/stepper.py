@@ -1,0 +1,228 @@
+"""The compiled engine: whole intervals of steps in one call, on what the motion has reached."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numba.np.ufunc.parallel import get_thread_count
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Slot, Vector
+from pbdkit.interfaces.frame import Indices
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.bonds import bonds_in, plane_block
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compiled.kernels import load_kernel
+from pbdkit.stepping.compiled.reach import Reach
+from pbdkit.stepping.compiled.source import Wanted, write_kernel
+from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.leaders import prescribe, steady_steps
+from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.sums import presence
+
+Bits = NDArray[np.unsignedinteger[Any]]
+
+
+class CompiledStepper(Engine):
+    """Steps scenes of fixed neighbours with a kernel made for them.
+
+    Lost bonds are one bit a bond and end in `lost`, which is made anew from a state that did not
+    come from here; all else of the state is the same arrays that the numpy engine uses.
+    """
+
+    name = "compiled"
+
+    def __init__(self, scene: Scene, threads: int = 1) -> None:
+        self.threads = threads
+        self._scene = scene
+        self._bits = bits_for(scene)
+        self._masks = _masks(scene, self._bits)
+        self._spared = _spared(scene, self._bits)
+        self._reach = Reach(scene)
+        self._last: State | None = None
+        with blaming(scene.experiment.rule, "to compile"):
+            wanted = self._wanted()
+            source = write_kernel(scene.experiment.lattice.cell(), scene.neighbourhood, wanted)
+            fracture = scene.experiment.fracture if scene.has_fracture else None
+            self._run = load_kernel(source, scene.experiment.rule, fracture)
+            self._constant = self._constant_arguments()
+            self._compile()
+
+    def advance(self, state: State, steps: int = 1) -> State:
+        """As many steps a call as the leaders stay where they are."""
+        if state is not self._last:
+            self._lost = _lost(self._scene, state, self._bits)
+            self._reach.forget()
+        end = state.step + steps
+        while state.step < end:
+            state = self._some_steps(state, end)
+        self._last = state
+        return state
+
+    def _some_steps(self, state: State, end: int) -> State:
+        step = state.step + 1
+        led, starts = prescribe(self._scene, state, step)
+        count = steady_steps(self._scene, step, end - state.step)
+        count = self._reach.before(led, count)
+        places = np.concatenate([p for p, _ in led]) if led else np.empty(0, np.intp)
+        values = np.concatenate([v for _, v in led], axis=1) if led else np.empty((2, 0))
+        with blaming(self._scene.experiment.rule, f"at step {step}"):
+            self._call(state, count, places, values.astype(state.u.dtype))
+        u, new = state.u, state.previous
+        now, before = (new, u) if count % 2 else (u, new)
+        self._reach.after(now, before)
+        return State(state.step + count, now, before, state.broken_step, starts)
+
+    def _call(self, state: State, count: int, places: Indices, values: Floats) -> None:
+        """Makes `count` steps in the arrays of the state; with none it only compiles."""
+        u, new, c = state.u, state.previous, self._constant
+        broken = c["broken"] if state.broken_step is None else state.broken_step
+        kept = np.empty_like(values)
+        if self.threads > 1:
+            numba.set_num_threads(min(self.threads, get_thread_count()))
+        self._run(
+            u[0], u[1], new[0], new[1], self._masks, self._lost, self._spared,
+            self._scene.raster.kind, broken, c["limits"], state.step, count, self._reach.blocks,
+            self._reach.box, self._reach.growth, 4 * self.threads, places, values[0], values[1],
+            kept[0], kept[1], c["points"], c["entries"], c["bodies"], c["weights"], c["rule"],
+            c["fracture"], c["solver"], c["first"],
+        )  # fmt: skip
+
+    def _compile(self) -> None:
+        """A call of no steps, so that what does not compile is known before the first."""
+        u = np.zeros((2, 1, 1, 1), self._scene.experiment.solver.precision)
+        broken = np.zeros((1, 1, 1), np.int32) if self._scene.has_fracture else None
+        state, self._lost = State(0, u, u.copy(), broken, ()), np.zeros((1, 1, 1), self._bits)
+        self._call(state, 0, np.empty(0, np.intp), np.empty((2, 0), state.u.dtype))
+
+    def _wanted(self) -> Wanted:
+        scene = self._scene
+        rule, solver, constants = scene.experiment.rule, scene.experiment.solver, scene.constants
+        slot = scene.neighbourhood.slots[0][0]
+        number = np.float64(1.0)
+        parts = rule.gather(
+            Vector(number, number), slot.rest, constants.weights[slot], constants.rule
+        )
+        frame = scene.frame
+        return Wanted(
+            contributions=len(parts),
+            fracture=scene.has_fracture,
+            some_bonds_last=self._spared.size > 1,
+            some_missing=self._masks.size > 1,
+            reference=rule.uses_reference,
+            relaxed=solver.relaxation != 1.0,
+            memory=solver.memory != 0.0,
+            frame=frame is not None,
+            frame_matrices=frame is not None and frame.map.weight.ndim == 3,
+            lag=frame is not None and frame.map.lag == 1,
+            limits=max((len(c) for c in constants.limits.values()), default=0),
+            parallel=self.threads > 1,
+            single=solver.precision == "float32",
+            rule_parameters=constants.rule._fields,
+            fracture_parameters=constants.fracture._fields,
+            weights=constants.weights,
+        )
+
+    def _constant_arguments(self) -> dict[str, Any]:
+        scene = self._scene
+        solver, constants, frame = scene.experiment.solver, scene.constants, scene.frame
+        slots = scene.neighbourhood.slots
+        number = np.dtype(solver.precision)
+        width = max((len(c) for c in constants.limits.values()), default=0)
+        limits = np.zeros((len(slots), max(map(len, slots)), max(width, 1)), number)
+        for s, own in enumerate(slots):
+            for k, slot in enumerate(own):
+                for n, value in enumerate(constants.limits.get(slot, ())):
+                    limits[s, k, n] = value
+        none = np.empty(0, np.intp)
+        entries = none
+        if frame:
+            counts = np.bincount(frame.map.point, minlength=len(frame.place))
+            entries = np.concatenate([[0], np.cumsum(counts)])
+        return {
+            "limits": limits,
+            "broken": np.empty((0, 0, 0), np.int32),
+            "points": frame.place if frame else none,
+            "entries": entries,
+            "bodies": frame.body_place if frame else none,
+            "weights": (frame.map.weight if frame else np.empty(0)).astype(number),
+            "rule": np.array([*constants.rule, 0.0], number),
+            "fracture": np.array([*constants.fracture, 0.0], number),
+            "solver": np.array([solver.relaxation, solver.memory], number),
+            "first": np.array(scene.raster.first, np.int64),
+        }
+
+
+def bits_for(scene: Scene) -> Any:
+    """The smallest unsigned integer with a bit for every slot and one more."""
+    most = max(map(len, scene.neighbourhood.slots))
+    for dtype, bits in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32)):
+        if most < bits:
+            return dtype
+    raise ValueError(f"{most} neighbours are too many to compile; the numpy engine takes them")
+
+
+def _masks(scene: Scene, dtype: Any) -> Bits:
+    """Bit k: neighbour k is there; the bit after the last slot: the particle can move. A single
+    place where every neighbour of every particle is there and blocks hold followers alone."""
+    raster = scene.raster
+    masks, trivial = np.zeros(raster.shape, dtype), True
+    for s, slots in enumerate(scene.neighbourhood.slots):
+        block = raster.body_block(s)
+        if block is None:
+            continue
+        mask = np.zeros(raster.kind[block.slices()].shape, dtype)
+        for k, there in enumerate(presence(raster, block, slots)):
+            mask |= dtype(1 << k) if there is None else there.astype(dtype) << dtype(k)
+            trivial &= there is None
+        movable = (raster.kind[block.slices()] == FOLLOWER) & (mask > 0)
+        masks[block.slices()] = mask | movable.astype(dtype) << dtype(len(slots))
+        trivial &= bool(movable.all())
+    return np.zeros((1, 1, 1), dtype) if trivial else masks
+
+
+def _spared(scene: Scene, dtype: Any) -> Bits:
+    """Bit k: the bond along slot k cannot break. A single place where every bond can."""
+    spared = np.zeros((1, 1, 1), dtype)
+    if not scene.has_fracture:
+        return spared
+    every = scene.experiment.fracture.breaks_frame_bonds()
+    spared = np.full(scene.raster.shape, np.iinfo(dtype).max, dtype)
+    for plane in scene.neighbourhood.planes:
+        block = plane_block(scene.raster, plane)
+        if block is None:
+            continue
+        can = bonds_in(scene.raster, block, plane, frame_too=every)
+        for slot, seen in ((plane.slot, block), (plane.opposite, block.seen_through(plane.slot))):
+            clear = dtype(np.iinfo(dtype).max ^ (1 << _place_of(scene, slot)))
+            spared[seen.slices()] &= np.where(can, clear, np.iinfo(dtype).max).astype(dtype)
+    swept = [(s, scene.raster.body_block(s)) for s in range(len(scene.neighbourhood.slots))]
+    some_last = any(
+        (spared[block.slices()] & dtype((1 << len(scene.neighbourhood.slots[s])) - 1)).any()
+        for s, block in swept
+        if block
+    )
+    return spared if some_last else np.zeros((1, 1, 1), dtype)
+
+
+def _lost(scene: Scene, state: State, dtype: Any) -> Bits:
+    """Bit k: the bond along slot k is broken; both ends know."""
+    if state.broken_step is None:
+        return np.zeros((1, 1, 1), dtype)
+    lost = np.zeros(scene.raster.shape, dtype)
+    for n, plane in enumerate(scene.neighbourhood.planes):
+        block = plane_block(scene.raster, plane)
+        if block is None:
+            continue
+        _, rows, columns = block.slices()
+        broken = (state.broken_step[n, rows, columns] >= 0).astype(dtype)
+        for slot, seen in ((plane.slot, block), (plane.opposite, block.seen_through(plane.slot))):
+            lost[seen.slices()] |= broken << dtype(_place_of(scene, slot))
+    return lost
+
+
+def _place_of(scene: Scene, slot: Slot) -> int:
+    return scene.neighbourhood.slots[slot.source].index(slot)

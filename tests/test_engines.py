@@ -1,0 +1,210 @@
+"""Every engine gives the numbers of the numpy engine, to the last bit."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
+from scene_strategies import experiments, pulled_apart
+
+import pbdkit
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping import choice
+from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+TORN = {
+    "type": "threshold",
+    "thresholds": [1.4371],
+    "placement": 0.9,
+    "cracks": [[[2.31, -1.7], [2.37, 1.2]]],
+}
+
+
+def sheet(**parts):
+    experiment = {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": 9, "rows": 7},
+        "rule": {"type": "barycentre"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            pull_right(0.3, 0.1) | {"until": 9},
+        ],
+        "steps": 40,
+    }
+    return experiment | parts
+
+
+def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
+    """However many steps are made in one call, and whoever made the steps before."""
+    reference, oracle = initial_state(scene), Stepper(scene)
+    states = [initial_state(scene) for _ in engines]
+    for steps in calls:
+        reference = oracle.advance(reference, steps)
+        for n, engine in enumerate(engines):
+            states[n] = engine.advance(states[n], steps)
+            for name in ("u", "previous", "broken_step"):
+                np.testing.assert_array_equal(getattr(states[n], name), getattr(reference, name))
+            assert states[n].step == reference.step
+
+
+thoroughly = settings(
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@thoroughly
+@given(experiments())
+def test_the_kernels_logic_on_random_scenes(experiment):
+    compare_interpreted(experiment)
+
+
+@thoroughly
+@given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
+def test_the_kernels_logic_on_torn_scenes(experiment):
+    compare_interpreted(experiment)
+
+
+def compare_interpreted(experiment):
+    """The kernel's source run by Python itself: compiling each scene would take seconds."""
+    try:
+        scene = build_scene(pbdkit.Experiment(**experiment))
+    except pbdkit.ExperimentError:
+        assume(False)
+    assume(not experiment["neighbours"].get("reevaluate"))
+    assume(max(map(len, scene.neighbourhood.slots)) <= 31)
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
+        patch.setattr(numba.config, "DISABLE_JIT", 1)
+        assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 2, 3, 4))
+
+
+COMPONENTS = {
+    **{f"rule {name}": {"rule": rule} for name, rule in RULES.items()},
+    **{f"lattice {name}": {"lattice": part} for name, part in LATTICES.items()},
+    **{f"neighbours {name}": {"neighbours": part} for name, part in NEIGHBOURS.items()},
+    **{f"frame {name}": {"frame": part} for name, part in FRAMES.items()},
+    "mirror frame": {"frame": {"type": "mirror"}},
+    "euclidean": {"neighbours": {"type": "euclidean", "radius": 1.5, "weights": [1.0, 1.2]}},
+    "fracture": {"fracture": TORN},
+    "fracture, frame spared": {"fracture": TORN | {"frame_bonds": False}},
+    "fracture, reference": {"fracture": TORN | {"fictitious": "reference"}},
+    "fracture, no frame": {"fracture": TORN, "frame": {"type": "none"}},
+    "relaxed, with memory": {"solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.2}},
+    "noise": {"initial": {"type": "noise", "amplitude": 0.1}},
+    "disc": {"body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]}, "leaders": []},
+}
+
+
+@pytest.mark.parametrize("parts", COMPONENTS.values(), ids=COMPONENTS)
+def test_compiled_equals_numpy(parts):
+    if isinstance(parts.get("rule"), str):
+        parts = {"rule": {"type": parts["rule"]}}
+    scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
+    assert_bitwise_equal(scene, CompiledStepper(scene))
+
+
+@pytest.mark.parametrize("parts", [{}, {"fracture": TORN}], ids=["whole", "torn"])
+def test_any_number_of_threads_gives_the_same(parts):
+    body = {"type": "grid", "columns": 60, "rows": 50}
+    scene = build_scene(pbdkit.Experiment(**sheet(body=body, **parts)))
+    assert_bitwise_equal(scene, CompiledStepper(scene, 1), CompiledStepper(scene, 2))
+
+
+@pytest.mark.parametrize("name", ["paper/d2", "paper/f2"])
+def test_a_whole_run_is_the_same(name):
+    experiment = pbdkit.load(name, settings=["steps=80", "record.every=7"])
+    compiled = pbdkit.load(name, settings=["steps=80", "record.every=7", "solver.engine=compiled"])
+    one, other = pbdkit.run(experiment, progress=False), pbdkit.run(compiled, progress=False)
+    for variable in one.variables:
+        np.testing.assert_array_equal(one[variable], other[variable])
+
+
+@pytest.mark.parametrize("engine", ["numpy", "compiled"])
+def test_single_precision_stays_close(engine):
+    solver = {"type": "stepping", "engine": engine, "precision": "float32"}
+    exact = pbdkit.run(sheet(steps=200), progress=False)
+    single = pbdkit.run(sheet(steps=200, solver=solver), progress=False)
+    error = abs(single.position - exact.position).max()
+    assert 0.0 < error < 5e-6
+
+
+class Halfway(pbdkit.FollowerRule):
+    type: str = "halfway"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return SHARE * total[0] / total[2], SHARE * total[1] / total[2]
+
+
+SHARE = 0.5
+
+
+def test_an_edited_rule_never_runs_an_old_kernel(monkeypatch):
+    scene = build_scene(pbdkit.Experiment(**sheet(rule=Halfway())))
+    assert_bitwise_equal(scene, CompiledStepper(scene))
+    monkeypatch.setitem(globals(), "SHARE", 0.25)
+    assert_bitwise_equal(scene, CompiledStepper(scene))
+
+
+class Uncompilable(Halfway):
+    type: str = "uncompilable"
+
+    @staticmethod
+    def apply(total, here, p):
+        return globals()["SHARE"] * total[0], 0.1 * total[1]
+
+
+def test_a_rule_that_does_not_compile_runs_slower_and_says_so(monkeypatch):
+    monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
+    scene = build_scene(pbdkit.Experiment(**sheet(rule=Uncompilable(type="uncompilable"))))
+    engine, made = make_engine(scene, choose(scene))
+    assert engine.name == made.engine == "numpy"
+    assert "slower than it could be: FollowerRule 'uncompilable' failed" in made.reason
+
+
+def test_small_scenes_are_not_compiled():
+    scene = build_scene(pbdkit.load("paper/a"))
+    assert choose(scene).engine == "numpy"
+
+
+def test_large_scenes_are_compiled_unless_something_stands_in_the_way(monkeypatch):
+    experiment = sheet(body={"type": "grid", "columns": 400, "rows": 400}, steps=5000)
+    scene = build_scene(pbdkit.Experiment(**experiment))
+    assert choose(scene).engine == "compiled"
+    monkeypatch.setattr(choice, "find_spec", lambda name: None)
+    assert choose(scene).engine == "numpy"
+    assert "pip install 'pbdkit[fast]'" in choose(scene).reason
+    asked = experiment | {"solver": {"type": "stepping", "engine": "compiled"}}
+    with pytest.raises(pbdkit.ExperimentError, match=r"solver.engine: .* numba is not installed"):
+        choose(build_scene(pbdkit.Experiment(**asked)))
+
+
+def test_reevaluated_neighbours_cannot_be_compiled():
+    near = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
+    solver = {"type": "stepping", "engine": "compiled"}
+    with pytest.raises(pbdkit.ExperimentError, match="found anew at every step"):
+        pbdkit.run(sheet(neighbours=near, solver=solver), progress=False)
+
+
+def test_nothing_beyond_the_reach_of_the_leaders_is_touched():
+    body = {"type": "grid", "columns": 80, "rows": 30}
+    leaders = [{"select": {"edge": "left"}, "motion": {"type": "displace", "displacement": [1, 0]}}]
+    scene = build_scene(pbdkit.Experiment(**sheet(body=body, leaders=leaders)))
+    engine, state = CompiledStepper(scene), initial_state(scene)
+    state = engine.advance(state, 20)
+    marked = np.nan
+    state.u[:, :, 50:, :] = marked  # whoever looks there spoils what it computes
+    state.previous[:, :, 50:, :] = marked
+    state = engine.advance(state, 15)
+    assert np.isfinite(state.u[:, :, :40, :]).all()
+    assert (state.u[0, 0, 2:36, 5] > 0).all()
