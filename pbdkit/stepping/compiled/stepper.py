@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numba
 import numpy as np
-from numba.np.ufunc.parallel import get_thread_count
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot, Vector
@@ -36,7 +36,7 @@ class CompiledStepper(Engine):
     name = "compiled"
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
-        self.threads = threads
+        self.threads = min(threads, os.cpu_count() or 1)
         self._scene = scene
         self._bits = bits_for(scene)
         self._masks = _masks(scene, self._bits)
@@ -82,7 +82,7 @@ class CompiledStepper(Engine):
         broken = c["broken"] if state.broken_step is None else state.broken_step
         kept = np.empty_like(values)
         if self.threads > 1:
-            numba.set_num_threads(min(self.threads, get_thread_count()))
+            numba.set_num_threads(self.threads)
         self._run(
             u[0], u[1], new[0], new[1], self._masks, self._lost, self._spared,
             self._scene.raster.kind, broken, c["limits"], state.step, count, self._reach.blocks,
