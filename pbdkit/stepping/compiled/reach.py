@@ -1,8 +1,9 @@
 """How far the leaders' motion can have reached: nothing beyond is touched.
 
 At rest a rule moves nothing, exactly; so a step can only move particles that adjoin one that has
-moved. The first step looks at every particle and finds those that are not at rest; from then on the
-box around them, and around leaders that are not at home, grows by one bond a step.
+moved. Where that is plain from the scene nothing has moved before the leaders do; elsewhere the
+first step looks at every particle and finds those that are not at rest. From then on the box around
+what has moved, and around leaders that are not at home, grows by one bond a step.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces import Here, Vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.leaders import Led
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.sums import presence
 
 Box = NDArray[np.int64]
 """(first row, last row + 1, first column, last column + 1) of repeat cells."""
@@ -32,12 +35,15 @@ class Reach:
                 self.blocks[s] = i0, i1, j0, j1
         self._everything = np.array([0, raster.shape[1], 0, raster.shape[2]], np.int64)
         self._bond = _growth(scene)
-        self.forget()
-
-    def forget(self) -> None:
-        """What has moved is not known: the next step looks at everything."""
-        self._known = False
+        self._rests = _rests_by_construction(scene)
+        self._known = self._empty = False
         self.box, self.growth = self._everything.copy(), np.zeros(4, np.int64)
+
+    def begin(self, state: State) -> None:
+        """A state that did not come from here: what has moved is known only where nothing has."""
+        self._known = self._empty = self._rests and state.step == 0
+        self.box = np.zeros(4, np.int64) if self._known else self._everything.copy()
+        self.growth = np.zeros(4, np.int64)
 
     def before(self, led: Led, count: int) -> int:
         """Takes the leaders of the coming steps in; returns how many of `count` can be made in
@@ -68,6 +74,30 @@ class Reach:
             self.box, self.growth, self._empty = box, self._bond.copy(), False
         self.box[::2] = np.minimum(self.box[::2], box[::2])
         self.box[1::2] = np.maximum(self.box[1::2], box[1::2])
+
+
+def _rests_by_construction(scene: Scene) -> bool:
+    """Whether the reference configuration stays as it is: every neighbour is there, all start at
+    rest, no bond is broken or breaks at rest, and the rule's move from there is zero."""
+    experiment, constants = scene.experiment, scene.constants
+    rule, fracture = experiment.rule, experiment.fracture
+    if experiment.initial.type != "reference" or rule.uses_reference or fracture.segments():
+        return False
+    home, zero = Vector(np.float64(0.0), np.float64(0.0)), np.float64(0.0)
+    for s, slots in enumerate(scene.neighbourhood.slots):
+        block = scene.raster.body_block(s)
+        if block and any(there is not None for there in presence(scene.raster, block, slots)):
+            return False
+        parts = [rule.gather(home, k.rest, constants.weights[k], constants.rule) for k in slots]
+        total = tuple(sum(part, zero) for part in zip(*parts, strict=True))
+        move = rule.apply(total, Here(home, Vector(None, None)), constants.rule)
+        if any(component != 0.0 for component in move):
+            return False
+        if fracture.can_break and any(
+            fracture.breaks(home, k.rest, constants.limits[k], constants.fracture) for k in slots
+        ):
+            return False
+    return True
 
 
 def _around(i: NDArray[np.intp], j: NDArray[np.intp]) -> Box:

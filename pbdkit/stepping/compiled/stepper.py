@@ -55,7 +55,7 @@ class CompiledStepper(Engine):
         """As many steps a call as the leaders stay where they are."""
         if state is not self._last:
             self._lost = _lost(self._scene, state, self._bits)
-            self._reach.forget()
+            self._reach.begin(state)
         end = state.step + steps
         while state.step < end:
             state = self._some_steps(state, end)
