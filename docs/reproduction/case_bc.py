@@ -1,0 +1,170 @@
+"""Cases b and c: the Poisson effect by mixed coordinates, with one and two shells."""
+
+import numpy as np
+from claims import Claim, Section
+from drawing import configurations, histories
+from runs import Floats, Sheet, run
+
+COLUMN, ROW = 4, 5
+TIMES = [1, 10, 20, 100]
+
+
+def narrowing(sheet: Sheet) -> Floats:
+    """How much nearer the outer rows are than at rest, (time, column)."""
+    return sheet.u[:, :, 0, 1] - sheet.u[:, :, -1, 1]
+
+
+def edge_excess(column: Floats) -> float:
+    """By which share PE1 of a column is larger in its outer rows than in its middle ones."""
+    return float(column[[0, -1]].mean() / column[4:6].mean() - 1)
+
+
+def half_time(sheet: Sheet) -> int:
+    """The first step with half the contraction of 67 at step 100."""
+    y = sheet.u[:, COLUMN, ROW, 1]
+    return int(np.flatnonzero(y <= y[100] / 2)[0])
+
+
+def section_b() -> Section:
+    """All of case b."""
+    b = run("paper/b")
+    pictures = [
+        (
+            configurations(b, TIMES, "b-pe1.png"),
+            "Figure 10: case b, configurations and PE1 at times 1, 10, 20, 100",
+        ),
+        (
+            histories(
+                {
+                    "K = −0.004 (paper/b)": (b, COLUMN, ROW),
+                    "K = −0.008": (run("paper/b", "rule.K=-0.008"), COLUMN, ROW),
+                },
+                "b-67.png",
+                100,
+            ),
+            "Figure 11: x, y and PE1 of particle 67",
+        ),
+    ]
+    words = (
+        "As a without release; mixed coordinates: `paper/b`. The paper gives no K; −0.004 is ours."
+    )
+    return Section("Case b: the Poisson effect", words, _claims_b(), pictures)
+
+
+def _claims_b() -> list[Claim]:
+    b = run("paper/b")
+    narrow, y = narrowing(b)[99], b.u[:, COLUMN, ROW, 1]
+    wider = narrowing(run("paper/b", "rule.K=0.004"))[99]
+    slow = run("paper/b", "solver.relaxation=0.5", "steps=200")
+    strong = run("paper/b", "rule.K=-0.008")
+    pe1 = b.of("pe1")
+    near, middle = ({s: edge_excess(pe1[s, c]) for s in (9, 19, 99)} for c in (8, 4))
+    in_a = edge_excess(run("paper/a").of("pe1")[9, 8])
+    return [
+        Claim(
+            "lateral contraction can be seen",
+            f"step 99: the outer rows are nearer by {narrow.max():.3f} (of 9) at column "
+            f"{int(narrow.argmax()) + 1}; with K = +0.004 they part by {-wider.min():.3f}",
+            bool(narrow.max() > 0.01),
+        ),
+        Claim(
+            "there is a relaxation time, because the followers need time",
+            f"67 has half of its contraction of step 100 at step {half_time(b)}, "
+            f"{half_time(b) - 10} steps after the leaders stopped",
+            half_time(b) > 11,
+        ),
+        Claim(
+            "[the relaxation time] is due to the rules expression and can be tuned",
+            f"not by K: half of the contraction at step {half_time(strong)} with K = −0.008, "
+            f"{half_time(b)} with −0.004; by the relaxation, 0.5: step {half_time(slow)}",
+            half_time(strong) != half_time(b),
+            "`solver.relaxation`, which the paper does not have",
+            half_time(slow) > half_time(b),
+        ),
+        Claim(
+            "PE1 … here is more evident the edge effect leading to concavity toward left",
+            "PE1 left of the leaders is larger at the edge than in the middle row by "
+            f"{near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20, 100 ({in_a:.2%} in "
+            "case a): its lines are concave toward the left, to be seen at time 100. In the middle "
+            f"of the sheet they are concave toward the right by then ({middle[99]:.1%})",
+            near[99] > 0.02 and near[99] > in_a,
+        ),
+        Claim(
+            "the point is above the central line so their y coordinate decrease",
+            f"u_y of 67 falls to {y[100]:.4f} at step 100 and never rises",
+            bool(y[100] < 0 and (np.diff(y) <= 1e-15).all()),
+        ),
+    ]
+
+
+def section_c() -> Section:
+    """All of case c."""
+    names = {"1 shell (paper/b)": "paper/b", "2 shells (paper/c)": "paper/c"}
+    names["24 neighbours (paper/c-chebyshev)"] = "paper/c-chebyshev"
+    pictures = [
+        (
+            configurations(run("paper/c"), TIMES, "c-pe1.png"),
+            "Figure 12: case c, configurations and PE1 at times 1, 10, 20, 100",
+        ),
+        (
+            histories({k: (run(v), COLUMN, ROW) for k, v in names.items()}, "c-67.png", 100),
+            "Figures 11 and 13: x, y and PE1 of particle 67",
+        ),
+    ]
+    words = "As b with the second shell: `paper/c`."
+    return Section("Case c: the importance of the gradient", words, _claims_c(), pictures)
+
+
+def _less(name: str) -> tuple[Floats, list[int]]:
+    """Contraction of 67 at steps 9, 19, 99, and the steps at which it exceeds case b's."""
+    y, first = -run(name).u[:, COLUMN, ROW, 1], -run("paper/b").u[:, COLUMN, ROW, 1]
+    return y[[9, 19, 99]], [int(s) for s in np.flatnonzero(y > first + 1e-15)]
+
+
+def _claims_c() -> list[Claim]:
+    b, c, wide = run("paper/b"), run("paper/c"), run("paper/c-chebyshev")
+    first, _ = _less("paper/b")
+    second, above = _less("paper/c")
+    third, above_24 = _less("paper/c-chebyshev")
+    narrow = [narrowing(sheet)[99].max() for sheet in (b, c, wide)]
+    times = [s + 1 for s in (9, 19, 99) if narrowing(c)[s].max() < narrowing(b)[s].max()]
+    bow = [s.of("pe1")[9, 8, 0] / s.of("pe1")[9, 8, 5] - 1 for s in (b, c)]
+    values = ", ".join(f"{p:.4f} and {q:.4f}" for p, q in zip(first, second, strict=True))
+    return [
+        Claim(
+            "lateral contraction can be seen in a less pronounced way",
+            f"largest narrowing at step 99: {narrow[0]:.3f} in b, {narrow[1]:.3f} in c "
+            f"({narrow[2]:.3f} with 24 neighbours). Of the paper's times this holds at {times}",
+            bool(narrow[1] < narrow[0]),
+        ),
+        Claim(
+            "a lower lateral contraction [of 67], with respect the first gradient case",
+            f"−u_y of 67 at steps 9, 19 and 99 is {values} in b and c: c contracts more at steps "
+            f"{above[0]} to {above[-1]} and less after. With 24 neighbours it is "
+            f"{', '.join(f'{v:.4f}' for v in third)}, more at steps {above_24[0]} to "
+            f"{above_24[-1]}",
+            not above,
+            f"steps after {above[-1]}",
+            bool(second[2] < first[2]),
+        ),
+        Claim(
+            "with a larger number of neighbours the effect is amortized",
+            f"−u_y of 67 at step 99: {first[2]:.4f} with 4 neighbours, {second[2]:.4f} with 8, "
+            f"{third[2]:.4f} with 24",
+            bool(first[2] > second[2] > third[2]),
+        ),
+        Claim(
+            "the PE1 plot enhances the convexity of the first line of follower",
+            f"PE1 left of the leaders at step 9 is larger at the edge than in the middle by "
+            f"{bow[0]:.2%} in b and {bow[1]:.2%} in c",
+            bool(bow[1] > 2 * bow[0] > 0),
+        ),
+        Claim(
+            "its evolution with time is quite different",
+            f"half of the contraction of step 100 is reached at step {half_time(c)} in c, "
+            f"{half_time(b)} in b, {half_time(wide)} with 24 neighbours; from step 50 to 100 it "
+            f"grows by {c.u[100, 4, 5, 1] / c.u[50, 4, 5, 1] - 1:.0%} in c and "
+            f"{b.u[100, 4, 5, 1] / b.u[50, 4, 5, 1] - 1:.0%} in b",
+            half_time(c) < 0.9 * half_time(b),
+        ),
+    ]
