@@ -90,7 +90,7 @@ def state_with(scene: Scene, u: Any) -> State:
     raster, frame = scene.raster, scene.frame
     for axis in (0, 1):
         plane = state.u[axis].reshape(-1)
-        plane[raster.place[raster.body_rows]] = np.asarray(u)[:, axis]
+        plane[raster.place_of(raster.body_rows)] = np.asarray(u)[:, axis]
         if frame:
             values = frame.map.weight * plane[frame.body_place]
             plane[frame.place] = np.bincount(frame.map.point, values, len(frame.place))
@@ -100,7 +100,7 @@ def state_with(scene: Scene, u: Any) -> State:
 
 def body_of(scene: Scene, state: State) -> Any:
     """u of the body, (body particle, axis), of a state."""
-    return state.u.reshape(2, -1)[:, scene.raster.place[scene.raster.body_rows]].T.copy()
+    return state.u.reshape(2, -1)[:, scene.raster.place_of(scene.raster.body_rows)].T.copy()
 
 
 def advanced(scene: Scene, u: Any, steps: int) -> Any:
@@ -115,7 +115,7 @@ def advanced(scene: Scene, u: Any, steps: int) -> Any:
 
 def body_sites(scene: Scene) -> Any:
     """(body particle, index)."""
-    return scene.raster.site[scene.raster.body_rows]
+    return scene.raster.site_of(scene.raster.body_rows)
 
 
 def followers_of(scene: Scene) -> Any:

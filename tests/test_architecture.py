@@ -16,6 +16,7 @@ ORDER = [
     "stepping",
     "results",
     "running",
+    "benching",
     "cli",
 ]
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)

@@ -31,7 +31,7 @@ def test_affine_leaders_all_round_make_an_affine_interior(lattice, neighbours, r
     body, reach = scene.raster, scene.neighbourhood.reach
     gradient, shift = np.array([[0.2, -0.1], [0.3, 0.4]]), np.array([0.5, -0.7])
     expected = body.reference() @ gradient.T + shift
-    outside = (body.site < reach) | (body.site > 6 - reach)
+    outside = (body.site_table() < reach) | (body.site_table() > 6 - reach)
     rim = [n for n in body.body_rows.tolist() if outside[n].any()]
     leaders = [displace([n + 1], *expected[n].tolist()) for n in rim]
     u = displacements(7, 7, leaders=leaders, steps=400, solver=RELAXED, **parts)[-1]
@@ -52,7 +52,7 @@ def test_affine_leaders_all_round_make_an_affine_interior(lattice, neighbours, r
 def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbours, stretch):
     parts = {"lattice": lattice, "neighbours": neighbours}
     raster = scene_of(6, 6, **parts).raster
-    X, ends = raster.reference(), np.isin(raster.site[:, 0], (0, 5))
+    X, ends = raster.reference(), np.isin(raster.site_table()[:, 0], (0, 5))
     expected = np.stack([stretch * X[:, 0], np.zeros(len(X))], axis=1)
     rows = [n for n in raster.body_rows.tolist() if ends[n]]
     leaders = [displace([n + 1], *expected[n].tolist()) for n in rows]
@@ -76,7 +76,7 @@ def test_case_6_a_component_without_leader_stays_put():
     assert "rows do not feel each other" in scene.warnings[0]
     one = int(scene.raster.body_rows[0]) + 1
     u = displacements(lattice=flat, leaders=[displace([one], 1.0, 0.5)], steps=50)[-1]
-    row = scene.raster.site[:, 1]
+    row = scene.raster.site_table()[:, 1]
     assert not u[row >= 1].any()
     assert u[row == 0].any(axis=1).all()
 
@@ -96,7 +96,7 @@ def test_case_9_coincident_particles_stay_under_distance_weights(frame):
     at_origin = -scene.raster.reference(scene.raster.body_rows)
     if frame == "mean":
         # The frame copies displacements and is not at the origin: look at who does not see it.
-        inside = ((scene.raster.site[scene.raster.body_rows] % (4, 3)) != 0).all(axis=1)
+        inside = ((scene.raster.site_of(scene.raster.body_rows) % (4, 3)) != 0).all(axis=1)
     else:
         inside = np.ones(20, bool)
     u = advanced(scene, at_origin, 20)
@@ -185,7 +185,7 @@ def test_case_14_leaders_all_round_give_a_symmetric_spectrum_and_settle():
 
 def test_case_23_a_step_is_jacobi_every_follower_sees_the_same_configuration():
     scene = scene_of(5, 4)
-    site = scene.raster.site[scene.raster.body_rows].tolist()
+    site = scene.raster.site_of(scene.raster.body_rows).tolist()
     u = np.random.default_rng(2).normal(size=(20, 2))
     expected = np.zeros_like(u)
     for n, (i, j) in enumerate(site):

@@ -70,7 +70,7 @@ def test_the_steps_to_a_tolerance_are_predicted_within_5_percent(columns):
     pull = {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [1, 0]}}
     predicted = np.log(1e-6) / np.log(slowest(columns))
     u = displacements(columns, 4, leaders=[HOLD_LEFT, pull], steps=int(predicted * 1.1))
-    site = scene_of(columns, 4).raster.site[:, 0]
+    site = scene_of(columns, 4).raster.site_table()[:, 0]
     equilibrium = np.clip(site, 0, columns - 1) / (columns - 1)
     error = np.abs(u[:, :, 0] - equilibrium).max(axis=1)
     counted = int(np.argmax(error < 1e-6))
@@ -115,7 +115,7 @@ def test_the_body_lags_behind_moving_leaders_by_the_formula():
     steps = 1500  # ten relaxation times of 147 steps
     u = displacements(columns, 3, leaders=[HOLD_LEFT, pull_right(v, 0.0, steps)], steps=steps)
     length = columns - 1
-    site = np.clip(scene_of(columns, 3).raster.site[:, 0], 0, length)
+    site = np.clip(scene_of(columns, 3).raster.site_table()[:, 0], 0, length)
     lag = (v * steps * site / length - u[-1, :, 0]).max()
     predicted = 4 * v * length**2 / (9 * np.sqrt(3))
     assert predicted == pytest.approx(0.3242, abs=5e-5)

@@ -119,7 +119,7 @@ SYMMETRIES = [
 def test_mirrored_loading_gives_mirrored_displacements(lattice, neighbours, flips, rows, rule):
     parts = {"lattice": lattice, "neighbours": neighbours, "rows": rows, "steps": 8}
     body, last = scene_of(**parts).raster, np.array([5, rows - 1])
-    number = {tuple(s): n for n, s in enumerate(body.site.tolist(), 1)}
+    number = {tuple(s): n for n, s in enumerate(body.site_table().tolist(), 1)}
     image = {s: tuple(np.where(flips, last - s, s).tolist()) for s in number}
     loads = {(0, 1): (0.3, 0.1), (3, 4): (-0.2, 0.4), (5, 2): (0.5, -0.1)}
     sign = np.where(flips, -1.0, 1.0)
@@ -132,7 +132,7 @@ def test_mirrored_loading_gives_mirrored_displacements(lattice, neighbours, flip
     # Mixed coordinates contract where x grows: under a mirror of x K changes its sign.
     one = run(loads, -0.004)
     other = run({image[s]: np.array(load) * sign for s, load in loads.items()}, -0.004 * sign[0])
-    images = [number[image[tuple(s)]] - 1 for s in body.site[body.body_rows].tolist()]
+    images = [number[image[tuple(s)]] - 1 for s in body.site_of(body.body_rows).tolist()]
     np.testing.assert_allclose(
         other[:, images], one[:, body.body_rows] * sign, rtol=0, atol=ROUNDING
     )

@@ -45,9 +45,10 @@ def run(
             click.echo(f"warning: {warning}", err=True)
 
     from pbdkit.results.netcdf import NetcdfSink
+    from pbdkit.results.overlapping import OverlappingSink
 
     silent = quiet or as_json or not sys.stderr.isatty()
-    sink = NetcdfSink(path, replace=force)
+    sink = OverlappingSink(NetcdfSink(path, replace=force))
     with asked_to_stop() as stopping:
         report = run_into(sink, scene, progress=not silent, stopping=stopping)
     if as_json:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,15 @@ Gradient = Annotated[tuple[Pair, Pair], Field(strict=False)]
 class Initial(Component):
     """The displacements of the body at time 0; nothing has moved before, and the frame follows."""
 
+    at_rest: ClassVar[bool] = False
+    """Whether everything starts where it rests; `displacement` is then not asked."""
+
     @abstractmethod
     def displacement(
         self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> Floats | None:
+    ) -> Floats:
         """u of the body particles at X, (particle, axis), in the order of their numbers; `leads`
-        marks the leaders of step 1. None where everything starts at rest."""
+        marks the leaders of step 1."""
 
 
 class Reference(Initial):
@@ -32,10 +35,13 @@ class Reference(Initial):
 
     type: Literal["reference"] = "reference"
 
+    at_rest: ClassVar[bool] = True
+
     def displacement(
         self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> None:
-        """None."""
+    ) -> Floats:
+        """Zeros."""
+        return np.zeros_like(X)
 
 
 class Noise(Initial):

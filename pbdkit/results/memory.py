@@ -23,9 +23,9 @@ class MemorySink(Sink):
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
 
     def put(self, values: Values) -> None:
-        """Copies, so that what was recorded stays whatever the run does."""
+        """Keeps what it is given."""
         for name, value in values.items():
-            self._entries[name].append(np.array(value))
+            self._entries[name].append(value)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """Keeps the attributes."""

@@ -26,6 +26,16 @@ class Tables:
         self.scene = scene
         self.raster = scene.raster
 
+    def add_reference(self, u: Floats) -> Floats:
+        """X + u, (particle, axis), in place; X is kept where it is wanted more than twice."""
+        experiment = self.scene.experiment
+        if experiment.record.count(experiment.steps) > 2:
+            u += self.reference
+            return u
+        for rows in self.raster.chunks():
+            u[rows[0] : rows[-1] + 1] += self.raster.reference(rows)
+        return u
+
     @cached_property
     def reference(self) -> Floats:
         """X, (particle, axis)."""
@@ -58,11 +68,7 @@ class StateMoment(Moment):
 
     @cached_property
     def _u(self) -> Floats:
-        return self._table(self._state.u)
-
-    def _table(self, u: Floats, rows: Indices | slice = slice(None)) -> Floats:
-        place = self._tables.raster.place[rows]
-        return np.stack([plane.ravel()[place] for plane in u], axis=1)
+        return self._tables.raster.table(self._state.u)
 
     def rows(self, numbers: tuple[int, ...]) -> Indices:
         """Numbers count from 1 in the order of the rows."""
@@ -70,20 +76,24 @@ class StateMoment(Moment):
 
     def displacement(self, rows: Indices | None = None) -> Floats:
         """The whole table is made once a moment; a few rows are made without it."""
-        return self._u if rows is None else self._table(self._state.u, rows)
+        if rows is None:
+            return self._u
+        place = self._tables.raster.place_of(rows)
+        return np.stack([plane.ravel()[place] for plane in self._state.u], axis=1)
 
     def previous_displacement(self) -> Floats:
         """From the buffer of the step before."""
-        return self._table(self._state.previous)
+        return self._tables.raster.table(self._state.previous)
 
     def reference(self, rows: Indices | None = None) -> Floats:
         """X."""
-        return self._tables.reference if rows is None else self._tables.reference[rows]
+        return self._tables.reference if rows is None else self._tables.raster.reference(rows)
 
     def position(self) -> Floats:
-        """x = X + u, (particle, axis)."""
-        position: Floats = self._tables.reference + self._u
-        return position
+        """x = X + u, (particle, axis), in float64 whatever the run's precision."""
+        return self._tables.add_reference(
+            self._tables.raster.table(self._state.u).astype(float, copy=False)
+        )
 
     def kind(self) -> NDArray[np.int8]:
         """(particle,): the role during this step."""
@@ -119,4 +129,4 @@ class StateMoment(Moment):
             (total,) = sum_over_slots(slots, present, contribution)
             body = raster.kind[block.slices()] == FOLLOWER
             sums[block.slices()] = np.where(body, total, 0.0)
-        return sums.ravel()[raster.place]
+        return raster.table(sums[None])[:, 0]

@@ -54,7 +54,11 @@ class NetcdfSink(Sink):
             if not self._columns[name].grows:
                 self._store(name, slice(None), value)
                 continue
-            self._waiting[name].append(np.array(value))
+            if self._batch[name] == 1:
+                self._store(name, self._written[name], value)
+                self._written[name] += 1
+                continue
+            self._waiting[name].append(value)
             if len(self._waiting[name]) >= self._batch[name]:
                 self._flush(name)
 
@@ -120,7 +124,7 @@ class NetcdfSink(Sink):
             self._written[name] += len(entries)
             self._waiting[name] = []
 
-    def _store(self, name: str, where: slice, values: Any) -> None:
+    def _store(self, name: str, where: slice | int, values: Any) -> None:
         with self._storing():
             self._file.variables[name][where] = values
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -24,7 +26,8 @@ Values = dict[str, Any]
 
 
 class Sink(ABC):
-    """Where a dataset goes while it is made. `abandon` leaves nothing behind."""
+    """Where a dataset goes while it is made. It may keep what it is given: nobody changes that
+    afterwards. `abandon` leaves nothing behind."""
 
     @abstractmethod
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
@@ -67,29 +70,36 @@ class Recorder:
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
-        raster, columns = self._scene.raster, self._columns()
-        known: Values = {
-            "particle": np.arange(1, raster.count + 1),
-            "number": np.arange(1, raster.count + 1),
-            "axis": np.array(["x", "y"]),
-            "site": raster.site,
-            "reference": self._tables.reference,
-        }
+        columns, experiment = self._columns(), self._scene.experiment
+        known = self._known()
+        sizes = {"particle": self._scene.raster.count, "axis": 2, "index": 2}
         if self._scene.shows_bonds:
-            known |= {"bond": self._scene.bonds.ends, "shell": self._scene.bonds.shell}
-        for diagnostic in self._scene.experiment.diagnostics:
-            known |= diagnostic.coordinates()
-        sizes = {
-            dim: length
-            for c in columns
-            if c.name in known
-            for dim, length in zip(c.dims, np.shape(known[c.name]), strict=True)
-        }
-        experiment = self._scene.experiment
+            sizes |= {"bond": len(self._scene.bonds.ends), "end": 2}
+        for diagnostic in experiment.diagnostics:
+            sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
         records = experiment.record.count(experiment.steps)
         self._sink.begin(columns, sizes, {"time": records, "step": experiment.steps + 1})
-        self._sink.put(known)
+        for name, values in known.items():
+            self._sink.put({name: values()})
+
+    def _known(self) -> dict[str, Callable[[], Any]]:
+        """What is known before the first step; made one after the other, and not all at once."""
+        raster, scene = self._scene.raster, self._scene
+        numbers = np.arange(1, raster.count + 1)
+        known: dict[str, Callable[[], Any]] = {
+            "particle": lambda: numbers,
+            "number": lambda: numbers,
+            "axis": lambda: np.array(["x", "y"]),
+            "site": raster.site_table,
+            "reference": raster.reference,
+        }
+        if scene.shows_bonds:
+            known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
+        for diagnostic in scene.experiment.diagnostics:
+            for name, values in diagnostic.coordinates().items():
+                known[name] = partial(np.asarray, values)
+        return known
 
     def observe(self, state: State) -> None:
         """Takes what is wanted of this step. Raises FloatingPointError where a recorded value has
@@ -164,7 +174,7 @@ class Recorder:
                 measured = diagnostic.measure(moment)
                 for variable, value in zip(diagnostic.variables(), measured, strict=True):
                     _refuse_unfit(variable, value, self._shapes[variable.name], moment.step)
-                    values[variable.name] = value
+                    values[variable.name] = np.array(value)
         return values
 
     def _attributes(self, outcome: Outcome) -> dict[str, str]:

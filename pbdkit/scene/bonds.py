@@ -72,13 +72,9 @@ def _bonds_of_plane(
 ) -> tuple[Indices, Indices, Indices, Indices, Indices]:
     m, n = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
     m, n = m + block.start[0], n + block.start[1]
-    here = _flat(raster, plane.slot.source, m, n)
-    there = _flat(raster, plane.slot.target, m + plane.slot.cell[0], n + plane.slot.cell[1])
-    a, b = raster.row_at[here], raster.row_at[there]
+    slot = plane.slot
+    a = raster.rows_at(np.full(len(m), slot.source), m, n)
+    b = raster.rows_at(np.full(len(m), slot.target), m + slot.cell[0], n + slot.cell[1])
     within = np.ravel_multi_index((m, n), raster.shape[1:])
     shell = np.full(len(a), plane.slot.shell)
     return np.minimum(a, b), np.maximum(a, b), shell, np.full(len(a), number), within
-
-
-def _flat(raster: Raster, sublattice: int, m: Indices, n: Indices) -> Indices:
-    return np.ravel_multi_index((np.full(len(m), sublattice), m, n), raster.shape)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Box, Sites
 from pbdkit.interfaces import Cell, Lattice
+from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
-from pbdkit.scene.raster import existing, positions_of_sites
-
-Mask = NDArray[np.bool_]
+from pbdkit.scene.raster import CHUNK_ROWS, cells_of_sites, positions
+from pbdkit.scene.rasterising import Mask, existing
 
 
 def window(body: Body, lattice: Lattice) -> tuple[Index, Index]:
@@ -32,20 +31,30 @@ def fill(body: Body, lattice: Lattice) -> tuple[Mask, Index]:
     The window is as small as the body allows. Raises ExperimentError where no site belongs.
     """
     low, high = window(body, lattice)
-    i, j = np.meshgrid(
-        np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1), indexing="ij"
-    )
     cell = lattice.cell()
-    x, y = positions_of_sites(lattice, i, j)
-    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(), np.abs(y).max())
-    tolerance = max(1e-9 * math.hypot(*cell.vectors[0]), rounding)
-    inside = (body.distance(Sites(i, j, x, y)) <= tolerance) & existing(cell, low, i.shape)
+    inside = existing(cell, low, (high[0] - low[0] + 1, high[1] - low[1] + 1)).copy()
+    lines = max(1, CHUNK_ROWS // inside.shape[1])
+    for begin in range(0, len(inside), lines):
+        i = np.arange(low[0] + begin, min(low[0] + begin + lines, high[0] + 1))
+        j = np.arange(low[1], high[1] + 1)
+        inside[begin : begin + lines] &= _belongs(body, lattice, *np.meshgrid(i, j, indexing="ij"))
     if not inside.any():
         raise ExperimentError("holds no site of the lattice; make it larger, or move it", ("body",))
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     first = (int(rows[0]), int(columns[0]))
     trimmed = inside[first[0] : rows[-1] + 1, first[1] : columns[-1] + 1]
     return trimmed, (low[0] + first[0], low[1] + first[1])
+
+
+def _belongs(body: Body, lattice: Lattice, i: Indices, j: Indices) -> Mask:
+    """Whether the sites (i, j) lie inside or on the outline."""
+    cell = lattice.cell()
+    x, y = positions(cell, *cells_of_sites(cell, i, j))
+    x, y = x + lattice.origin[0], y + lattice.origin[1]
+    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(), np.abs(y).max())
+    tolerance = max(1e-9 * math.hypot(*cell.vectors[0]), rounding)
+    found: Mask = body.distance(Sites(i, j, x, y)) <= tolerance
+    return found
 
 
 def has_narrow_slot(body: Mask, layers: int) -> bool:

@@ -39,12 +39,12 @@ def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
     rows = np.flatnonzero(raster.table_kind == FRAME)
     if not len(rows):
         return None
-    inside = raster.site[raster.body_rows]
+    inside = raster.site_of(raster.body_rows)
     frame = RasterFrame(
         raster,
         rows,
         raster.lattice.cell(),
-        raster.site[rows],
+        raster.site_of(rows).astype(np.int32),
         tuple(inside.min(axis=0).tolist()),
         tuple(inside.max(axis=0).tolist()),
     )
@@ -56,7 +56,7 @@ def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
             f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
             "and it would anchor the body"
         )
-    return Frame(raster.place[rows], follow, raster.place[follow.body])
+    return Frame(raster.place_of(rows), follow, raster.place_of(follow.body))
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
@@ -68,7 +68,8 @@ def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
         raise ExperimentError(f"its map names a frame point outside 0 to {points - 1}")
     if entries and (np.diff(follow.point) < 0).any():
         raise ExperimentError("its map is not sorted by frame point")
-    if not np.isin(follow.body, raster.body_rows).all():
+    known = (follow.body >= 0) & (follow.body < raster.count)
+    if not known.all() or (raster.table_kind[follow.body] != FOLLOWER).any():
         raise ExperimentError("its map follows what is no particle of the body")
     if not np.isfinite(follow.weight).all() or follow.lag not in (0, 1):
         raise ExperimentError("its map has weights that are not finite, or a lag other than 0 or 1")
@@ -87,12 +88,13 @@ class RasterFrame(FrameSites):
 
     def body_at(self, site: NDArray[np.int32]) -> Indices:
         """Looks the sites up on the raster."""
-        return self.raster.body_row_at_site(site)
+        rows = self.raster.rows_of_sites(site)
+        return np.where(self.raster.table_kind[rows] == FOLLOWER, rows, -1)
 
     def nearest(self) -> tuple[Indices, Indices]:
         """Searches outwards from every frame point, shell of sites by shell, until all have met
         the body and every tie is in."""
-        sublattice = self.raster.cells(self.frame_rows)[0]
+        sublattice = self.raster.cells_of(self.frame_rows)[0]
         pairs = [
             self._nearest_of(s, np.flatnonzero(sublattice == s)) for s in np.unique(sublattice)
         ]
@@ -116,7 +118,7 @@ class RasterFrame(FrameSites):
     def _met_at(self, offset: Offset, points: Indices, nearest: Floats) -> tuple[Indices, Indices]:
         """The points with a body particle at that offset and none nearer; notes the distance."""
         open_ = np.flatnonzero(offset.length <= _with_ties(nearest))
-        places = self.raster.place[self.frame_rows[points[open_]]]
+        places = self.raster.place_of(self.frame_rows[points[open_]])
         _, m, n = np.unravel_index(places, self.raster.shape)
         m, n = m + offset.cell[0], n + offset.cell[1]
         _, m_count, n_count = self.raster.shape
@@ -125,10 +127,7 @@ class RasterFrame(FrameSites):
         met = self.raster.kind[offset.target, m, n] == FOLLOWER
         open_, m, n = open_[met], m[met], n[met]
         nearest[open_] = np.minimum(nearest[open_], offset.length)
-        target = np.full(len(m), offset.target)
-        return points[open_], self.raster.row_at[
-            np.ravel_multi_index((target, m, n), self.raster.shape)
-        ]
+        return points[open_], self.raster.rows_at(np.full(len(m), offset.target), m, n)
 
 
 def _turned(matrices: Floats, u: Floats) -> Floats:

@@ -39,7 +39,7 @@ def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> 
     for n, group in enumerate(groups):
         rows = select(raster, group.select, ("leaders", n, "select"))
         _refuse_infinite(group, raster.reference(rows), steps, ("leaders", n, "motion"))
-        found.append(Leading(group, rows, raster.place[rows], raster.reference(rows)))
+        found.append(Leading(group, rows, raster.place_of(rows), raster.reference(rows)))
     for n, later in enumerate(found):
         for k, earlier in enumerate(found[:n]):
             _refuse_contradiction(raster, (k, earlier), (n, later), steps)
@@ -75,7 +75,8 @@ def select(raster: Raster, selection: Selection, where: tuple[str | int, ...]) -
 def _edge(raster: Raster, edge: str) -> Indices:
     """The body particle of smallest or largest i in every row j, or j in every column i."""
     body = raster.body_rows
-    along, line = raster.site[body].T if edge in ("left", "right") else raster.site[body].T[::-1]
+    i, j = raster.site_of(body).T
+    along, line = (i, j) if edge in ("left", "right") else (j, i)
     if edge in ("right", "top"):
         along = -along
     order = np.lexsort((along, line))
@@ -86,8 +87,9 @@ def _edge(raster: Raster, edge: str) -> Indices:
 def _box(raster: Raster, box: tuple[float, float, float, float]) -> Indices:
     slack = 1e-9 * math.hypot(*raster.lattice.cell().vectors[0])
     low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
-    x = raster.reference(raster.body_rows)
-    return raster.body_rows[((x >= low) & (x <= high)).all(axis=1)]
+    body = raster.body_rows
+    x = raster.reference(body)
+    return body[((x >= low) & (x <= high)).all(axis=1)]
 
 
 def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,8 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
 EMPTY, LEADER, FOLLOWER, FRAME = -1, 0, 1, 2
+CHUNK_ROWS = 65536
+"""Rows of the table that are made at a time, so that temporaries stay small."""
 
 
 @dataclass(frozen=True)
@@ -47,50 +51,100 @@ class Block:
 class Raster:
     """Every particle twice over: as a row of the table, and as a place on a raster.
 
-    `shape` is (sublattices, cells, cells), `first` the repeat cell at place (0, 0), `kind` the
-    kind at each place with EMPTY where no particle is (leaders count as followers here). Table
-    columns have a row a particle in the order of the numbers: `site` its index (i, j), `place`
-    its flat index on the raster.
+    `shape` is (sublattices, cells, cells), `first` the repeat cell at place (0, 0), `kind` the kind
+    at each place with EMPTY where no particle is (leaders count as followers here). `sites` is the
+    same by site index (i, j) from `low` on; its particles, i then j, are the rows of the table in
+    the order of their numbers.
     """
 
     lattice: Lattice
     shape: tuple[int, int, int]
     first: Index
     kind: NDArray[np.int8]
-    site: NDArray[np.int32]
-    place: Indices
+    low: Index
+    sites: NDArray[np.int8]
 
-    @property
+    @cached_property
     def count(self) -> int:
         """The number of particles, frame included."""
-        return len(self.place)
+        return int(np.count_nonzero(self.sites != EMPTY))
 
     @cached_property
+    def _full(self) -> bool:
+        """Whether every site of the window is a particle: rows then follow from indices."""
+        return self.count == self.sites.size
+
+    @cached_property
+    def _flat_sites(self) -> Indices:
+        """(particle,): the place in the window of each row, where that is not the row itself."""
+        return np.flatnonzero(self.sites != EMPTY)
+
+    @property
     def table_kind(self) -> NDArray[np.int8]:
         """(particle,): FOLLOWER or FRAME."""
-        return self.kind.ravel()[self.place]
+        flat = self.sites.ravel()
+        return flat if self._full else flat[self._flat_sites]
 
-    @cached_property
-    def row_at(self) -> Indices:
-        """(flat place,): the row of the particle there, -1 where there is none."""
-        rows = np.full(self.kind.size, -1, np.intp)
-        rows[self.place] = np.arange(self.count)
-        return rows
-
-    @cached_property
+    @property
     def body_rows(self) -> Indices:
         """The rows of leaders and followers."""
         return np.flatnonzero(self.table_kind == FOLLOWER)
 
-    def cells(self, rows: Indices | None = None) -> tuple[Indices, Indices, Indices]:
-        """(sublattice, repeat cell, repeat cell) of all particles or of some rows."""
-        place = self.place if rows is None else self.place[rows]
-        s, m, n = np.unravel_index(place, self.shape)
-        return s, m + self.first[0], n + self.first[1]
+    def chunks(self) -> Iterator[Indices]:
+        """All rows, some at a time."""
+        for begin in range(0, self.count, CHUNK_ROWS):
+            yield np.arange(begin, min(begin + CHUNK_ROWS, self.count))
+
+    def site_of(self, rows: Indices) -> NDArray[np.int64]:
+        """(row, index): the site (i, j) of some rows."""
+        i, j = np.divmod(rows if self._full else self._flat_sites[rows], self.sites.shape[1])
+        return np.stack([i + self.low[0], j + self.low[1]], axis=1)
+
+    def site_table(self) -> NDArray[np.int32]:
+        """(particle, index): the sites (i, j) of all rows."""
+        out = np.empty((self.count, 2), np.int32)
+        for rows in self.chunks():
+            out[rows[0] : rows[-1] + 1] = self.site_of(rows)
+        return out
+
+    def cells_of(self, rows: Indices) -> tuple[Indices, Indices, Indices]:
+        """(sublattice, repeat cell, repeat cell) of some rows."""
+        return cells_of_sites(self.lattice.cell(), *self.site_of(rows).T)
+
+    def place_of(self, rows: Indices) -> Indices:
+        """The flat place of some rows on the raster."""
+        s, m, n = self.cells_of(rows)
+        return np.ravel_multi_index((s, m - self.first[0], n - self.first[1]), self.shape)
+
+    def rows_at(self, s: Indices, m: Indices, n: Indices) -> Indices:
+        """The rows of the particles at (sublattice, raster cell, raster cell); -1 where none is."""
+        cell = self.lattice.cell()
+        index = np.array([site.index for site in cell.sites])
+        i = (m + self.first[0]) * cell.period[0] + index[s, 0]
+        j = (n + self.first[1]) * cell.period[1] + index[s, 1]
+        return self.rows_of_sites(np.stack([i, j], axis=-1))
+
+    def rows_of_sites(self, site: NDArray[Any]) -> Indices:
+        """The row of the particle at each site (i, j), (entry, 2); -1 where there is none."""
+        i, j = site[..., 0].astype(np.intp) - self.low[0], site[..., 1] - self.low[1]
+        inside = (i >= 0) & (i < self.sites.shape[0]) & (j >= 0) & (j < self.sites.shape[1])
+        rows = np.full(i.shape, -1, np.intp)
+        flat = i[inside] * self.sites.shape[1] + j[inside]
+        if self._full:
+            rows[inside] = flat
+        else:
+            there = self.sites.ravel()[flat] != EMPTY
+            rows[inside] = np.where(there, np.searchsorted(self._flat_sites, flat), -1)
+        return rows
 
     def reference(self, rows: Indices | None = None) -> NDArray[np.float64]:
         """X, (particle, axis), of all particles or of some rows."""
-        offsets = positions(self.lattice.cell(), *self.cells(rows))
+        if rows is None:
+            out = np.empty((self.count, 2))
+            for some in self.chunks():
+                out[some[0] : some[-1] + 1] = self.reference(some)
+            return out
+        offsets = positions(self.lattice.cell(), *self.cells_of(rows))
         return np.stack(offsets, axis=1) + self.lattice.origin
 
     def reference_planes(self, block: Block) -> Vector:
@@ -99,17 +153,20 @@ class Raster:
         n = np.arange(block.start[1], block.stop[1])[None, :] + self.first[1]
         return positions(self.lattice.cell(), block.sublattice, m, n)
 
-    def body_row_at_site(self, site: NDArray[np.int32]) -> Indices:
-        """The row of the body particle at each site (i, j), (entry, 2); -1 where there is none."""
-        cell = self.lattice.cell()
-        i, j = site[:, 0].astype(np.intp), site[:, 1].astype(np.intp)
-        s = _sublattices(cell)[i % cell.period[0], j % cell.period[1]]
-        m, n = i // cell.period[0] - self.first[0], j // cell.period[1] - self.first[1]
-        inside = (s >= 0) & (m >= 0) & (m < self.shape[1]) & (n >= 0) & (n < self.shape[2])
-        rows = np.full(len(site), -1, np.intp)
-        place = np.ravel_multi_index((s[inside], m[inside], n[inside]), self.shape)
-        rows[inside] = np.where(self.kind.ravel()[place] == FOLLOWER, self.row_at[place], -1)
-        return rows
+    def table(self, u: NDArray[Any]) -> NDArray[Any]:
+        """(particle, axis): the values of planes u, (axis, sublattice, cell, cell), by number."""
+        out = np.empty((self.count, len(u)), u.dtype)
+        if self._full:
+            window = out.reshape(*self.sites.shape, len(u))
+            for axis, plane in enumerate(u):
+                for s, here, there in self._strides():
+                    window[(*here, axis)] = plane[s][there]
+            return out
+        for rows in self.chunks():
+            place = self.place_of(rows)
+            for axis, plane in enumerate(u):
+                out[rows[0] : rows[-1] + 1, axis] = plane.ravel()[place]
+        return out
 
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
@@ -120,6 +177,20 @@ class Raster:
         start = (int(first[0]), int(second[0]))
         return Block(sublattice, start, (int(first[-1]) + 1, int(second[-1]) + 1))
 
+    def _strides(self) -> Iterator[tuple[int, tuple[slice, slice], tuple[slice, slice]]]:
+        """(sublattice, its sites in the window, its cells on the raster)."""
+        cell = self.lattice.cell()
+        for s, site in enumerate(cell.sites):
+            here, there = [], []
+            for axis in (0, 1):
+                period, low = cell.period[axis], self.low[axis]
+                skip = (site.index[axis] - low) % period
+                number = len(range(skip, self.sites.shape[axis], period))
+                begin = (low + skip) // period - self.first[axis]
+                here.append(slice(skip, None, period))
+                there.append(slice(begin, begin + number))
+            yield s, (here[0], here[1]), (there[0], there[1])
+
 
 def positions(cell: Cell, s: int | Indices, m: Indices, n: Indices) -> Vector:
     """Sublattice s in the repeat cell (m, n), from site (0, 0): at + m·a + n·b."""
@@ -128,72 +199,15 @@ def positions(cell: Cell, s: int | Indices, m: Indices, n: Indices) -> Vector:
     return Vector(at[s, 0] + (m * a.x + n * b.x), at[s, 1] + (m * a.y + n * b.y))
 
 
-def build_raster(
-    lattice: Lattice,
-    body: NDArray[np.bool_],
-    origin: Index,
-    layers: int,
-    reach_in_cells: Index,
-) -> Raster:
-    """The raster of a body and its frame.
-
-    `body` tells which sites of a window are wanted, `origin` is the site index of its first;
-    the frame takes every other site within `layers` of index distance of the body.
-    """
-    cell = lattice.cell()
-    wanted = np.pad(body, layers)
-    low = (origin[0] - layers, origin[1] - layers)
-    wanted &= existing(cell, low, wanted.shape)
-    window = _dilated(wanted, layers) & existing(cell, low, wanted.shape)
-    i, j = np.nonzero(window)
-    kinds = np.where(wanted[i, j], FOLLOWER, FRAME).astype(np.int8)
-    i, j = i + low[0], j + low[1]
-    s = _sublattices(cell)[i % cell.period[0], j % cell.period[1]]
-    m, n = i // cell.period[0], j // cell.period[1]
-    first = (int(m.min()) - reach_in_cells[0], int(n.min()) - reach_in_cells[1])
-    shape = (
-        len(cell.sites),
-        int(m.max()) + reach_in_cells[0] + 1 - first[0],
-        int(n.max()) + reach_in_cells[1] + 1 - first[1],
-    )
-    place = np.ravel_multi_index((s, m - first[0], n - first[1]), shape)
-    kind = np.full(shape, EMPTY, np.int8)
-    kind.ravel()[place] = kinds
-    site = np.stack([i, j], axis=1).astype(np.int32)
-    return Raster(lattice, shape, first, kind, site, place)
+def cells_of_sites(cell: Cell, i: Indices, j: Indices) -> tuple[Indices, Indices, Indices]:
+    """(sublattice, repeat cell, repeat cell) of the sites (i, j); sublattice -1 at a hole."""
+    p, q = cell.period
+    return sublattices(cell)[i % p, j % q], i // p, j // q
 
 
-def _sublattices(cell: Cell) -> Indices:
+def sublattices(cell: Cell) -> Indices:
     """(period, period): the sublattice of each index of the cell, -1 where it has no site."""
     found = np.full(cell.period, -1, np.intp)
     for s, site in enumerate(cell.sites):
         found[site.index] = s
     return found
-
-
-def positions_of_sites(lattice: Lattice, i: Indices, j: Indices) -> Vector:
-    """X of the sites (i, j), a component each; meaningless where the lattice has a hole."""
-    cell = lattice.cell()
-    p, q = cell.period
-    x, y = positions(cell, _sublattices(cell)[i % p, j % q], i // p, j // q)
-    return Vector(x + lattice.origin[0], y + lattice.origin[1])
-
-
-def existing(cell: Cell, low: Index, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which sites of a window of indices, from `low` on, the lattice has."""
-    i, j = np.arange(low[0], low[0] + shape[0]), np.arange(low[1], low[1] + shape[1])
-    sublattices = _sublattices(cell) >= 0
-    return sublattices[np.ix_(i % cell.period[0], j % cell.period[1])]
-
-
-def _dilated(mask: NDArray[np.bool_], layers: int) -> NDArray[np.bool_]:
-    """Every place within `layers` of a true one, along either axis or both."""
-    for axis in (0, 1):
-        grown = mask.copy()
-        for k in range(1, layers + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(k, None), slice(None, -k)
-            grown[tuple(ahead)] |= mask[tuple(behind)]
-            grown[tuple(behind)] |= mask[tuple(ahead)]
-        mask = grown
-    return mask

@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.constants import SceneConstants, ask_for_constants
-from pbdkit.scene.filling import Mask, fill, has_narrow_slot, window
+from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
-from pbdkit.scene.raster import Raster, build_raster, positions
+from pbdkit.scene.raster import FOLLOWER, Raster, positions
+from pbdkit.scene.rasterising import Mask, build_raster
 from pbdkit.scene.sizes import refuse_too_large
 
 
@@ -91,9 +94,12 @@ def _build(experiment: Experiment) -> Scene:
 
 def _setting(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     cell = raster.lattice.cell()
-    x, y = positions(cell, *raster.cells(raster.body_rows))
-    lower, upper = Vector(x.min(), y.min()), Vector(x.max(), y.max())
-    return Setting(cell, neighbourhood.slots, lower, upper)
+    lower, upper = np.full(2, np.inf), np.full(2, -np.inf)
+    for rows in raster.chunks():
+        x = np.array(positions(cell, *raster.cells_of(rows[raster.table_kind[rows] == FOLLOWER])))
+        lower = np.minimum(lower, x.min(axis=1, initial=np.inf))
+        upper = np.maximum(upper, x.max(axis=1, initial=-np.inf))
+    return Setting(cell, neighbourhood.slots, Vector(*lower.tolist()), Vector(*upper.tolist()))
 
 
 def _doubts(neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:

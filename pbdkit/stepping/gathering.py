@@ -24,8 +24,9 @@ class GatheringFollowers(Followers):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._parameters = scene.constants.rule
-        self._place, self._body = raster.place, raster.body_rows
-        self._X = np.stack(positions(raster.lattice.cell(), *raster.cells()))
+        everybody = np.arange(raster.count)
+        self._place, self._body = raster.place_of(everybody), raster.body_rows
+        self._X = np.stack(positions(raster.lattice.cell(), *raster.cells_of(everybody)))
         self._scale = np.sqrt(np.array(near.weights))
         self._radius = near.radius * (1 + 1e-9)
 

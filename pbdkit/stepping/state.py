@@ -40,10 +40,13 @@ class State:
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
     the given cracks broken at step 0. Nothing has moved before."""
-    u = np.zeros((2, *scene.raster.shape), scene.experiment.solver.precision)
-    _displace(scene, u.reshape(2, -1))
+    shape, precision = (2, *scene.raster.shape), scene.experiment.solver.precision
+    u, previous = np.zeros(shape, precision), np.zeros(shape, precision)
+    if not scene.experiment.initial.at_rest:
+        _displace(scene, u.reshape(2, -1))
+        previous[...] = u
     broken = _broken_by_cracks(scene) if scene.has_fracture else None
-    return State(0, u, u.copy(), broken, (None,) * len(scene.leading))
+    return State(0, u, previous, broken, (None,) * len(scene.leading))
 
 
 def _displace(scene: Scene, u: Floats) -> None:
@@ -52,10 +55,9 @@ def _displace(scene: Scene, u: Floats) -> None:
     leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
     generator = np.random.default_rng(scene.experiment.seed)
     initial = scene.experiment.initial.displacement(raster.reference(body), leads, generator)
-    if initial is not None:
-        u[:, raster.place[body]] = initial.T
-        if scene.frame:
-            scene.frame.follow(u, u)
+    u[:, raster.place_of(body)] = initial.T
+    if scene.frame:
+        scene.frame.follow(u, u)
 
 
 def _broken_by_cracks(scene: Scene) -> NDArray[np.int32]:

@@ -81,7 +81,7 @@ def _rests_by_construction(scene: Scene) -> bool:
     rest, no bond is broken or breaks at rest, and the rule's move from there is zero."""
     experiment, constants = scene.experiment, scene.constants
     rule, fracture = experiment.rule, experiment.fracture
-    if experiment.initial.type != "reference" or rule.uses_reference or fracture.segments():
+    if not experiment.initial.at_rest or rule.uses_reference or fracture.segments():
         return False
     home, zero = Vector(np.float64(0.0), np.float64(0.0)), np.float64(0.0)
     for s, slots in enumerate(scene.neighbourhood.slots):
