@@ -1,0 +1,129 @@
+"""Results are written beside the stepping, in order, and what goes wrong there is not lost."""
+
+import threading
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.results.overlapping import LARGE_BYTES, MOST_WAITING, OverlappingSink
+from pbdkit.results.recorder import Sink
+from pbdkit.running import run_into
+from pbdkit.scene.scene import build_scene
+
+LARGE = np.zeros(LARGE_BYTES // 8)
+
+
+class Noting(Sink):
+    """Notes what it is told, by which thread; fails at one value."""
+
+    def __init__(self, fails_at=None):
+        self.calls, self.threads, self.fails_at = [], set(), fails_at
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def begin(self, columns, sizes, planned):
+        self.calls.append("begin")
+
+    def put(self, values):
+        self.gate.wait(10)
+        self.threads.add(threading.current_thread())
+        self.calls.append(next(iter(values)))
+        if self.calls[-1] == self.fails_at:
+            raise pbdkit.StorageError("the disk is full")
+
+    def finish(self, attributes):
+        self.calls.append("finish")
+
+    def abandon(self):
+        self.calls.append("abandon")
+
+
+def test_small_values_are_written_at_once():
+    inner = Noting()
+    sink = OverlappingSink(inner)
+    sink.begin([], {}, {})
+    sink.put({"a": np.zeros(3)})
+    sink.finish({})
+    assert inner.calls == ["begin", "a", "finish"]
+    assert inner.threads == {threading.main_thread()}
+
+
+def test_large_values_are_written_in_order_by_one_other_thread():
+    inner = Noting()
+    sink = OverlappingSink(inner)
+    sink.begin([], {}, {})
+    for name in "abcdefgh":
+        sink.put({name: LARGE if name in "adf" else np.zeros(1)})
+    sink.finish({})
+    assert inner.calls == ["begin", *"abcdefgh", "finish"]
+    assert len(inner.threads) == 1
+    assert inner.threads != {threading.main_thread()}
+
+
+def test_memory_stays_bounded_when_the_disk_is_slow():
+    inner = Noting()
+    inner.gate.clear()
+    sink, done = OverlappingSink(inner), []
+
+    def produce():
+        for n in range(10):
+            sink.put({str(n): LARGE})
+            done.append(n)
+
+    producer = threading.Thread(target=produce)
+    producer.start()
+    producer.join(0.3)
+    assert len(done) <= MOST_WAITING
+    inner.gate.set()
+    producer.join(10)
+    sink.finish({})
+    assert inner.calls == [*map(str, range(10)), "finish"]
+
+
+def test_what_fails_in_the_other_thread_is_raised():
+    inner = Noting(fails_at="b")
+    sink = OverlappingSink(inner)
+
+    def produce():
+        for name in "abcdefgh":
+            sink.put({name: LARGE})
+        sink.finish({})
+
+    with pytest.raises(pbdkit.StorageError, match="the disk is full"):
+        produce()
+    sink.abandon()
+    assert inner.calls[-1] == "abandon"
+    assert "finish" not in inner.calls
+
+
+def test_a_large_run_is_the_same_written_beside_or_not(tmp_path):
+    experiment = pbdkit.load(
+        "start", settings=["body.columns=300", "body.rows=250", "steps=6", "record.every=2"]
+    )
+    scene = build_scene(experiment)
+    plain, beside = tmp_path / "plain.nc", tmp_path / "beside.nc"
+    run_into(NetcdfSink(plain), scene, progress=False)
+    run_into(OverlappingSink(NetcdfSink(beside)), scene, progress=False)
+    with pbdkit.open(plain) as one, pbdkit.open(beside) as other:
+        for name in one.variables:
+            np.testing.assert_array_equal(one[name], other[name])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["beside.nc", "plain.nc"]
+
+
+def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
+    path = tmp_path / "out.nc"
+    sink = NetcdfSink(path)
+    scene = build_scene(pbdkit.load("paper/b", settings=["steps=3"]))
+
+    def appear():
+        path.write_text("somebody else's")
+        return False
+
+    with pytest.raises(pbdkit.StorageError, match="appeared while this run was going on"):
+        run_into(sink, scene, progress=False, stopping=appear)
+    assert path.read_text() == "somebody else's"
+    (kept,) = (p for p in tmp_path.iterdir() if p != path)
+    with pbdkit.open(kept) as ds:
+        assert ds.attrs["status"] == "complete"
