@@ -37,7 +37,7 @@ class PluginError(PbdkitError):
 
 
 class DivergedError(PbdkitError):
-    """A run left the finite numbers.
+    """A run left all bounds.
 
     `dataset` holds what was recorded before, status "diverged"; it is None where the run was
     writing to a file, which then holds the same.

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pbdkit.analysis.analysis import Analysis
+from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
@@ -19,10 +21,10 @@ from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.scene.forecast import refuse_too_much_output
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import initial_state
 
 if TYPE_CHECKING:
@@ -83,6 +85,14 @@ def run(
     return dataset
 
 
+def analyse(
+    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
+) -> Analysis:
+    """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
+    and the step operator as a sparse matrix (``.operator``)."""
+    return Analysis(build_scene(_experiment(experiment, components)))
+
+
 def rerun(
     dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
 ) -> xarray.Dataset:
@@ -126,19 +136,22 @@ def _step_through(
 ) -> Outcome:
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
-    outcome = Outcome("complete", "all steps done", steps)
+    outcome, guard = Outcome("complete", "all steps done", steps), Guard(scene)
     try:
         recorder.observe(state)
         while state.step < steps and not stopping():
-            wanted = recorder.next_after(state.step) - state.step
-            state = engine.advance(state, min(wanted, patience))
+            wanted = recorder.next_after(state.step)
+            reached = min(wanted, guard.next_look, state.step + patience)
+            state = engine.advance(state, reached - state.step)
+            if reached in (wanted, guard.next_look):
+                guard.look(state)
             recorder.observe(state)
             show(state.step)
         if state.step < steps:
             recorder.observe_last(state)
             outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
     except FloatingPointError as error:
-        reason = f"{error} left the finite numbers under rule '{scene.experiment.rule.type}'"
+        reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
         outcome = Outcome("diverged", reason, state.step)
     recorder.finish(state, outcome)
     return outcome

@@ -14,6 +14,7 @@ ORDER = [
     "experiment",
     "scene",
     "stepping",
+    "analysis",
     "results",
     "running",
     "benching",

@@ -7,7 +7,7 @@ import pytest
 import pbdkit
 from pbdkit.results.netcdf import NetcdfSink
 from pbdkit.running import run_into
-from pbdkit.scene.forecast import forecast
+from pbdkit.analysis.forecast import forecast
 from pbdkit.scene.scene import build_scene
 
 MIB = 2**20

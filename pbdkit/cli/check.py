@@ -15,8 +15,8 @@ from pbdkit.cli.options import experiment_argument, json_option, set_option
 @json_option
 def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Validate an experiment and say what will happen, without running it."""
+    from pbdkit.analysis.forecast import forecast
     from pbdkit.running import load
-    from pbdkit.scene.forecast import forecast
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
@@ -31,5 +31,13 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     click.echo(f"  bonds      {found.bonds}")
     click.echo(f"  memory     about {found.memory_mib:.3g} MiB")
     click.echo(f"  output     about {found.output_mib:.3g} MiB")
+    if found.spectral_radius is not None:
+        verdict = "stable" if found.stable else "not stable"
+        click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}")
+        steps = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
+        if steps:
+            click.echo(f"  settles    to {steps} steps")
+    if found.largest_stable_relaxation is not None:
+        click.echo(f"  relaxation stable below {found.largest_stable_relaxation:.6g}")
     for warning in found.warnings:
         click.echo(f"warning: {warning}")

@@ -31,9 +31,9 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
+    from pbdkit.analysis.forecast import quick_warnings
     from pbdkit.cli.stopping import asked_to_stop
     from pbdkit.running import load, run_into
-    from pbdkit.scene.forecast import forecast
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
@@ -41,7 +41,7 @@ def run(
     _refuse_existing(path, force)
     scene = build_scene(loaded)
     if not quiet:
-        for warning in forecast(scene).warnings:
+        for warning in quick_warnings(scene):
             click.echo(f"warning: {warning}", err=True)
 
     from pbdkit.results.netcdf import NetcdfSink

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.analysis.forecast import prediction
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Diagnostic, Variable
 from pbdkit.registry.blame import blaming
@@ -186,6 +187,7 @@ class Recorder:
             "pbdkit_version": version("pbdkit"),
             "experiment": experiment.model_dump_json(by_alias=True),
             "plugins": json.dumps(experiment.distributions()),
+            "prediction": json.dumps(prediction(self._scene)),
             "status": outcome.status,
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -13,8 +13,8 @@ from pbdkit.results import layout
 from pbdkit.results.layout import Column
 
 ATTRIBUTES = (
-    "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins", "status",
-    "stop_reason", "created",
+    "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
+    "prediction", "status", "stop_reason", "created",
 )  # fmt: skip
 
 

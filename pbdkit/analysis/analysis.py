@@ -1,0 +1,150 @@
+"""What an experiment will do: stable or not, how fast it settles, what stands in its way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pbdkit.analysis.matrices import Entries, connected
+from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.analysis.spectrum import Spectrum, spectrum
+from pbdkit.scene.scene import Scene
+
+TOLERANCES = ("1e-3", "1e-6", "1e-10")
+NEUTRAL = 1e-9
+"""Eigenvalues this near to 1 in modulus count as 1."""
+MOST_FOLLOWERS = 50_000
+"""Above this the spectrum would take minutes, and is left out."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What is known before the first step, of the roles of the last step and linearised at the
+    start: exact for linear rules. Numbers are None where they do not exist or cost too much."""
+
+    scene: Scene
+
+    @cached_property
+    def operator(self) -> StepOperator:
+        """The step operator, two unknowns a follower."""
+        return step_operator(self.scene)
+
+    @cached_property
+    def spectrum(self) -> Spectrum | None:
+        """Of the step as the solver makes it, with relaxation, memory and lag."""
+        if self.scene.experiment.neighbours.nearness():
+            return None
+        if len(self.operator.followers) > MOST_FOLLOWERS:
+            return None
+        return spectrum(self.operator.augmented().matrix())
+
+    @cached_property
+    def _rule_spectrum(self) -> Spectrum | None:
+        """Of the rule's own step, with neither relaxation nor memory."""
+        solver = self.scene.experiment.solver
+        frame = self.scene.frame
+        if self.spectrum is None or (frame and frame.map.lag):
+            return None
+        if solver.relaxation == 1.0 and solver.memory == 0.0:
+            return self.spectrum
+        now = self.operator.entries_now
+        every = np.arange(now.shape[0])
+        own = 1.0 - (1.0 + solver.memory) / solver.relaxation
+        rule = Entries(
+            np.concatenate([now.rows, every]),
+            np.concatenate([now.columns, every]),
+            np.concatenate([now.values / solver.relaxation, np.full(len(every), own)]),
+            now.shape,
+        )
+        return spectrum(rule.matrix())
+
+    @property
+    def spectral_radius(self) -> float | None:
+        """max |λ|."""
+        return self.spectrum.radius if self.spectrum else None
+
+    @property
+    def smallest_eigenvalue(self) -> float | None:
+        """min Re λ of the rule's own step."""
+        return self._rule_spectrum.smallest if self._rule_spectrum else None
+
+    @property
+    def largest_stable_relaxation(self) -> float | None:
+        """With the memory as it is: 2 (1 + b) / (1 - λ_min) for real eigenvalues, and
+        min 2 Re z / |z|², z = 1 - λ, for complex ones without memory."""
+        own, memory = self._rule_spectrum, self.scene.experiment.solver.memory
+        if own is None or not len(own.eigenvalues):
+            return None
+        if np.abs(own.eigenvalues.imag).max() < NEUTRAL:
+            return 2.0 * (1.0 + memory) / (1.0 - own.smallest) if own.smallest < 1.0 else None
+        z = 1.0 - own.eigenvalues[np.abs(1.0 - own.eigenvalues) > NEUTRAL]
+        return float((2.0 * z.real / np.abs(z) ** 2).min()) if memory == 0.0 else None
+
+    @property
+    def best_memory(self) -> float | None:
+        """(1 - √(1 - ρ))², the memory that settles fastest without relaxation, for 0 ≤ ρ < 1."""
+        own = self._rule_spectrum
+        if own is None or not own.symmetric or not 0.0 <= own.largest < 1.0:
+            return None
+        return (1.0 - math.sqrt(1.0 - own.largest)) ** 2
+
+    @property
+    def stable(self) -> bool | None:
+        """Whether no mode grows."""
+        return self.spectrum.radius <= 1.0 + NEUTRAL if self.spectrum else None
+
+    @property
+    def steps_to(self) -> dict[str, int | None]:
+        """ln(tolerance) / ln ρ: the steps after which the slowest mode has shrunk to that."""
+        radius = self.spectral_radius
+        if radius is None or radius >= 1.0 - 1e-14:
+            return dict.fromkeys(TOLERANCES)
+        if radius == 0.0:
+            return dict.fromkeys(TOLERANCES, 1)
+        return {t: math.ceil(math.log(float(t)) / math.log(radius)) for t in TOLERANCES}
+
+    @cached_property
+    def parts_without_leader(self) -> list[Any]:
+        """The numbers of the particles of each part that no leader reaches."""
+        if self.scene.experiment.neighbours.nearness():
+            return []
+        operator = self.operator
+        now, before = operator.entries_now, operator.entries_before
+        graph = Entries(
+            np.concatenate([now.rows, before.rows]),
+            np.concatenate([now.columns, before.columns]),
+            np.ones(len(now.rows) + len(before.rows)),
+            now.shape,
+        )
+        count, label = connected(graph.matrix(), strongly=False)
+        led = np.zeros(count, bool)
+        led[label[np.unique(operator.entries_led.rows)]] = True
+        numbers = operator.followers[np.arange(len(label)) // 2] + 1
+        parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
+        return sorted(parts)
+
+    def warnings(self) -> list[str]:
+        """What stands in the way of settling, with the remedy."""
+        found = []
+        for part in self.parts_without_leader:
+            found.append(
+                f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
+                "nothing holds it"
+            )
+        if self.stable is False:
+            bound = self.largest_stable_relaxation
+            remedy = f"; it is stable below {bound:.4g}" if bound else ""
+            found.append(
+                f"solver.relaxation: {self.scene.experiment.solver.relaxation:g} diverges, the "
+                f"spectral radius is {self.spectral_radius:.6g}{remedy}"
+            )
+        elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
+            found.append(
+                "solver.relaxation: a mode that changes its sign in every step never decays; take "
+                "a relaxation below 1"
+            )
+        return found

@@ -1,0 +1,117 @@
+"""What `check` says of an experiment without running it, and `run` before its first step."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from pbdkit.analysis.analysis import NEUTRAL, Analysis
+from pbdkit.analysis.symbol import wave_bound
+from pbdkit.errors import ExperimentError
+from pbdkit.scene.bonds import count_bonds
+from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import Scene
+from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
+    where it cannot tell or it would take too long; warnings."""
+
+    particles: int
+    followers: int
+    bonds: int
+    memory_mib: float
+    output_mib: float
+    spectral_radius: float | None
+    smallest_eigenvalue: float | None
+    largest_stable_relaxation: float | None
+    stable: bool | None
+    steps_to: dict[str, int | None]
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        return asdict(self) | {"warnings": list(self.warnings)}
+
+
+def forecast(scene: Scene) -> Forecast:
+    """The forecast of a scene."""
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    kinds = kinds_at(scene.raster, scene.leading, 1)
+    analysis = Analysis(scene)
+    exact = analysis.warnings()
+    waves = [] if analysis.spectrum else _growing_waves(scene)
+    return Forecast(
+        particles=scene.raster.count,
+        followers=int(np.count_nonzero(kinds == FOLLOWER)),
+        bonds=count_bonds(scene.raster, scene.neighbourhood),
+        memory_mib=round(sizes.memory / MIB, 3),
+        output_mib=round(sizes.output / MIB, 3),
+        spectral_radius=analysis.spectral_radius,
+        smallest_eigenvalue=analysis.smallest_eigenvalue,
+        largest_stable_relaxation=analysis.largest_stable_relaxation,
+        stable=analysis.stable,
+        steps_to=analysis.steps_to,
+        warnings=(*_doubts(scene), *exact, *waves),
+    )
+
+
+def quick_warnings(scene: Scene) -> tuple[str, ...]:
+    """What can be said in milliseconds, before a run."""
+    return (*_doubts(scene), *_growing_waves(scene))
+
+
+def prediction(scene: Scene) -> dict[str, Any]:
+    """What the dataset keeps of the bound from plane waves; empty where there is none."""
+    bound, memory = wave_bound(scene), scene.experiment.solver.memory
+    if bound is None:
+        return {}
+    return {
+        "stable": bound.radius <= 1.0 + NEUTRAL,
+        "largest_stable_relaxation": bound.largest_stable_relaxation(memory),
+        "smallest_eigenvalue": bound.smallest,
+    }
+
+
+def _doubts(scene: Scene) -> list[str]:
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    warnings = list(scene.warnings)
+    if not (kinds_at(scene.raster, scene.leading, 1) == FOLLOWER).any():
+        warnings.append("leaders: everybody leads in step 1, nobody follows")
+    if not scene.leading:
+        warnings.append("leaders: there are none, nothing will move")
+    if sizes.output > machine_memory():
+        warnings.append(
+            f"record: the output of {sizes.output / 2**30:.3g} GiB exceeds this machine's memory: "
+            "record fewer steps to open it at once"
+        )
+    return warnings
+
+
+def _growing_waves(scene: Scene) -> list[str]:
+    bound, solver = wave_bound(scene), scene.experiment.solver
+    if bound is None or bound.radius <= 1.0 + NEUTRAL:
+        return []
+    return [
+        f"solver.relaxation: {solver.relaxation:g} can diverge, the shortest waves grow by "
+        f"{bound.radius:.4g} a step; it is stable below "
+        f"{bound.largest_stable_relaxation(solver.memory):.4g}"
+    ]
+
+
+def refuse_too_much_output(scene: Scene) -> None:
+    """Raises ExperimentError where the records of a run cannot all be in memory at once."""
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    if sizes.output > machine_memory():
+        raise scene.experiment.located(
+            ExperimentError(
+                f"the records take {sizes.output / 2**30:.3g} GiB, more than this machine's "
+                "memory: record fewer steps, or let `pbdkit run` stream them into a file",
+                ("record",),
+            )
+        )

@@ -1,0 +1,59 @@
+"""Matrices by their entries: dense where small, so that nothing is imported, else sparse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces.frame import Indices
+
+DENSE = 500
+"""Matrices of up to so many rows are made dense."""
+
+
+@dataclass(frozen=True)
+class Entries:
+    """A matrix as (row, column, value); entries of one place are added."""
+
+    rows: Indices
+    columns: Indices
+    values: NDArray[np.float64]
+    shape: tuple[int, int]
+
+    def matrix(self) -> Any:
+        """Dense up to DENSE rows, else sparse."""
+        if self.shape[0] > DENSE:
+            return self.sparse()
+        dense = np.zeros(self.shape)
+        np.add.at(dense, (self.rows, self.columns), self.values)
+        return dense
+
+    def sparse(self) -> Any:
+        """A scipy.sparse.csr_array."""
+        import scipy.sparse
+
+        return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()
+
+
+def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
+    """(count, label): the groups of unknowns that reach one another, along arrows or either way."""
+    if not isinstance(matrix, np.ndarray):
+        from scipy.sparse.csgraph import connected_components
+
+        kind = "strong" if strongly else "weak"
+        count, label = connected_components(matrix, connection=kind)
+        return count, label
+    reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
+    if not strongly:
+        reach |= reach.T
+    while True:
+        further = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
+        if (further == reach).all():
+            break
+        reach = further
+    first = np.argmax(reach & reach.T, axis=1)  # the lowest unknown of each group names it
+    names, label = np.unique(first, return_inverse=True)
+    return len(names), label

@@ -1,0 +1,92 @@
+"""The eigenvalues of a step operator that decide whether and how fast a run settles.
+
+The operator is taken apart into the strongly connected groups of its unknowns: its eigenvalues are
+those of the groups. That finds x and y uncoupled, and keeps rules that couple them one way only
+(mixed coordinates) from looking defective.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.matrices import DENSE, connected
+
+BEYOND = 1e-7
+"""How far outside the spectrum the shift of the inverse iteration lies."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """`radius` = max |λ|, `smallest` = min Re λ, `largest` = max Re λ; `symmetric` whether all
+    groups are; `eigenvalues` those that were computed: all of small groups, the extreme ones of
+    others."""
+
+    radius: float
+    smallest: float
+    largest: float
+    symmetric: bool
+    eigenvalues: NDArray[np.complex128]
+
+
+def spectrum(matrix: Any) -> Spectrum:
+    """The extreme eigenvalues of a matrix, dense or sparse; all of them of small groups."""
+    values, symmetric = [np.empty(0, complex)], True
+    for group in _groups(matrix):
+        even = abs(group - group.T).max() <= 1e-12 * max(1.0, abs(group).max())
+        symmetric &= bool(even)
+        values.append(_extremes(group, bool(even)))
+    found = np.concatenate(values)
+    if not len(found):
+        return Spectrum(0.0, 0.0, 0.0, True, found)
+    real = found.real
+    return Spectrum(float(abs(found).max()), float(real.min()), float(real.max()), symmetric, found)
+
+
+def _groups(matrix: Any) -> Iterator[Any]:
+    """The strongly connected diagonal blocks, equal ones once."""
+    count, label = connected(matrix, strongly=True)
+    order = np.argsort(label, kind="stable")
+    bounds = np.searchsorted(label[order], np.arange(count + 1))
+    alone = np.diff(bounds) == 1
+    yield from (np.array([[v]]) for v in np.unique(matrix.diagonal()[order[bounds[:-1][alone]]]))
+    seen = set()
+    for n in np.flatnonzero(~alone):
+        own = np.sort(order[bounds[n] : bounds[n + 1]])
+        block = matrix[own][:, own]
+        key = hash(_content(block))
+        if key not in seen:
+            seen.add(key)
+            yield block
+
+
+def _content(block: Any) -> tuple[Any, ...]:
+    if isinstance(block, np.ndarray):
+        return block.shape, block.tobytes()
+    block.sort_indices()
+    return block.shape, block.data.tobytes(), block.indices.tobytes()
+
+
+def _extremes(block: Any, symmetric: bool) -> NDArray[np.complex128]:
+    if block.shape[0] <= DENSE:
+        dense = block if isinstance(block, np.ndarray) else block.toarray()
+        found = np.linalg.eigvalsh(dense) if symmetric else np.linalg.eigvals(dense)
+        return found.astype(complex)
+    from scipy.sparse.linalg import eigs, eigsh
+
+    if not symmetric:
+        some = [eigs(block, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
+        return np.concatenate(some)
+    # Shifted inverses just outside the spectrum: Gershgorin's discs bound it.
+    diagonal = block.diagonal()
+    spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
+    ends = ((diagonal + spread).max() + BEYOND, (diagonal - spread).min() - BEYOND)
+    nearest = [
+        eigsh(block.tocsc(), k=2, sigma=end, which="LM", tol=1e-13, return_eigenvectors=False)
+        for end in ends
+    ]
+    return np.concatenate(nearest).astype(complex)

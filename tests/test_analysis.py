@@ -1,0 +1,228 @@
+"""What is said before a run, against closed forms and against what runs do."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from property_cases import LATTICES, RULES
+from scene_strategies import experiments
+
+import pbdkit
+from pbdkit.analysis.analysis import Analysis
+from pbdkit.analysis.operator import step_operator
+from pbdkit.analysis.symbol import wave_bound
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+HELD = [{"select": {"edge": e}, "motion": {"type": "hold"}} for e in ("left", "right")]
+
+
+def sheet(columns=12, rows=10, **parts):
+    return {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": columns, "rows": rows},
+        "rule": {"type": "barycentre"},
+        "leaders": HELD,
+        "steps": 60,
+    } | parts
+
+
+def unknowns(scene, u, rows):
+    place = scene.raster.place_of(rows)
+    return np.stack([plane.ravel()[place] for plane in u], axis=1).ravel()
+
+
+@settings(
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+@given(experiments())
+def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
+    """On random scenes, torn ones too; a nonlinear rule at the state where it is linearised."""
+    try:
+        scene = build_scene(pbdkit.Experiment(**experiment))
+    except pbdkit.ExperimentError:
+        assume(False)
+    assume(not experiment["neighbours"].get("reevaluate"))
+    stepper, state = Stepper(scene), initial_state(scene)
+    state = stepper.advance(state, 4)
+    operator = step_operator(scene, state, step=5)
+    now, before = (unknowns(scene, u, operator.followers) for u in (state.u, state.previous))
+    broken = None if state.broken_step is None else state.broken_step.copy()
+    state = stepper.advance(state)
+    assume(broken is None or np.array_equal(broken, state.broken_step))
+    led = unknowns(scene, state.u, operator.leaders)
+    old_led = unknowns(scene, state.previous, operator.leaders)
+    # Frame points that follow leaders see them where they stood before the step.
+    assume(np.array_equal(led, old_led))
+    predicted = operator.now @ now + operator.before @ before + operator.led @ led + operator.source
+    actual = unknowns(scene, state.u, operator.followers)
+    scale = max(1.0, np.abs(actual).max(initial=0.0), np.abs(before).max(initial=0.0))
+    np.testing.assert_allclose(predicted, actual, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 5), (12, 10), (40, 33)])
+def test_square_spectrum(columns, rows):
+    """½(cos a + cos b), a = pπ/N, b = qπ/rows (both end columns held, copying frame)."""
+    analysis = pbdkit.analyse(sheet(columns, rows))
+    n = columns - 1
+    largest = 0.5 * (math.cos(math.pi / n) + 1.0)
+    smallest = 0.5 * (math.cos(math.pi * (n - 1) / n) + math.cos(math.pi * (rows - 1) / rows))
+    assert analysis.spectral_radius == pytest.approx(largest, abs=1e-12)
+    assert analysis.smallest_eigenvalue == pytest.approx(smallest, abs=1e-12)
+    assert analysis.largest_stable_relaxation == pytest.approx(2 / (1 - smallest), abs=1e-11)
+
+
+def test_chebyshev_spectrum():
+    """(2cos a + 2cos b + 4 cos a cos b) / 8."""
+    analysis = pbdkit.analyse(sheet(14, 9, neighbours={"type": "chebyshev"}))
+    a = np.cos(np.pi * np.arange(1, 13) / 13)[:, None]
+    b = np.cos(np.pi * np.arange(9) / 9)[None, :]
+    exact = (2 * a + 2 * b + 4 * a * b) / 8
+    assert analysis.spectral_radius == pytest.approx(np.abs(exact).max(), abs=1e-12)
+    assert analysis.smallest_eigenvalue == pytest.approx(exact.min(), abs=1e-12)
+
+
+@pytest.mark.parametrize("columns", [12, 20])
+def test_steps_to_a_tolerance_are_those_counted(columns):
+    experiment = sheet(columns, columns, initial={"type": "noise", "amplitude": 0.1}, steps=5000)
+    scene = build_scene(pbdkit.Experiment(**experiment))
+    predicted = Analysis(scene).steps_to["1e-6"]
+    stepper, state = Stepper(scene), initial_state(scene)
+    slowest = _slowest_mode(scene)
+    state.u[...] = slowest
+    state.previous[...] = slowest
+    start, counted = np.abs(state.u).max(), 0
+    while np.abs(state.u).max() > 1e-6 * start:
+        state, counted = stepper.advance(state), counted + 1
+    assert counted == pytest.approx(predicted, rel=0.05)
+
+
+def _slowest_mode(scene):
+    u = np.zeros((2, *scene.raster.shape))
+    rows = scene.raster.body_rows
+    column = scene.raster.site_of(rows)[:, 0]
+    u[0].ravel()[scene.raster.place_of(rows)] = np.sin(np.pi * column / column.max())
+    scene.frame.follow(u.reshape(2, -1), u.reshape(2, -1))
+    return u
+
+
+BOUNDS = {
+    "square 4": ({}, 2 / 3),
+    "chebyshev 8": ({"neighbours": {"type": "chebyshev"}}, 0.774),
+    "chebyshev 24": ({"neighbours": {"type": "chebyshev", "shells": 2}}, 0.876),
+    "hexagonal 6": ({"lattice": {"type": "hexagonal", "a": 1.0}}, 0.853),
+    "rectangular 1:2": (
+        {
+            "lattice": {"type": "rectangular", "a": 1.0, "b": 2.0},
+            "neighbours": {"type": "euclidean", "radius": 1.0, "weights": [1.0, 0.25]},
+        },
+        0.6,
+    ),
+    "hexagonal 18": (
+        {
+            "lattice": {"type": "hexagonal", "a": 1.0},
+            "neighbours": {"type": "coordination", "shells": 3},
+        },
+        0.950,
+    ),
+}
+
+
+@pytest.mark.parametrize(("parts", "bound"), BOUNDS.values(), ids=BOUNDS)
+def test_the_distance_weighted_rule_is_reported_unstable_with_its_bound(parts, bound):
+    scene = build_scene(pbdkit.Experiment(**sheet(rule={"type": "distance-weighted"}, **parts)))
+    assert wave_bound(scene).largest_stable_relaxation(0.0) == pytest.approx(bound, rel=0.01)
+    assert not Analysis(scene).stable
+    assert any("is stable below" in w for w in Analysis(scene).warnings())
+
+
+@pytest.mark.parametrize("rule", [r for r in RULES if not r.startswith("mixed")])
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_one_percent_inside_the_bound_settles_and_outside_diverges(lattice, rule):
+    parts = {"lattice": LATTICES[lattice], "rule": RULES[rule]}
+    start = {"type": "noise", "amplitude": 1e-9}
+    bound = pbdkit.analyse(sheet(7, 6, **parts)).largest_stable_relaxation
+    moved = {}
+    for factor in (0.99, 1.01):
+        solver = {"type": "stepping", "relaxation": factor * bound}
+        given = sheet(7, 6, solver=solver, initial=start, steps=900, **parts)
+        assert pbdkit.analyse(given).stable == (factor < 1)
+        scene = build_scene(pbdkit.Experiment(**given))
+        state = Stepper(scene).advance(initial_state(scene), 900)
+        moved[factor] = np.abs(state.u).max()
+    assert moved[0.99] < 1e-9
+    assert not moved[1.01] < 1e-6
+
+
+def test_best_memory_settles_fastest():
+    analysis = pbdkit.analyse(sheet())
+    best = analysis.best_memory
+    radii = [
+        pbdkit.analyse(sheet(solver={"type": "stepping", "memory": b})).spectral_radius
+        for b in (best, best - 0.02, best + 0.02)
+    ]
+    assert radii[0] == pytest.approx(math.sqrt(best), abs=1e-6)
+    assert radii[0] < min(radii[1:])
+
+
+def test_parts_without_a_leader_are_named():
+    parts = {"type": "grid", "columns": 4, "rows": 4}
+    apart = {
+        "type": "union",
+        "of": [parts, {"type": "rectangle", "width": 3.0, "height": 3.0, "origin": [20.0, 0.0]}],
+    }
+    given = sheet(
+        body=apart, leaders=[{"select": {"box": [-1, -1, 0.5, 9]}, "motion": {"type": "hold"}}]
+    )
+    (part,) = pbdkit.analyse(given).parts_without_leader
+    assert len(part) == 16
+    (warning,) = pbdkit.analyse(given).warnings()
+    assert warning.startswith("leaders: none reaches a part of 16 particles (with number ")
+
+
+def test_a_mode_that_never_decays_is_found():
+    """Two particles that only see each other change places for ever (hard case 13)."""
+    given = sheet(2, 1, rule={"type": "mean-displacement"}, frame={"type": "none"}, leaders=[])
+    assert any("take a relaxation below 1" in w for w in pbdkit.analyse(given).warnings())
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_predictions_for_shipped_experiments_are_borne_out(name):
+    """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are."""
+    experiment = pbdkit.load(name)
+    analysis = pbdkit.analyse(experiment)
+    assert analysis.stable is not False
+    settings = ["steps=400", "record={every: 50}", "diagnostics=[{type: displacement}]"]
+    ds = pbdkit.run(pbdkit.load(name, settings=settings), progress=False)
+    assert ds.attrs["status"] == "complete"
+    assert abs(ds.u).max() < 100
+    predicted = json.loads(ds.attrs["prediction"])
+    assert predicted.get("stable", True)
+
+
+def test_a_run_that_can_diverge_is_warned_of_with_the_bound_and_says_so_in_the_dataset():
+    from click.testing import CliRunner
+
+    from pbdkit.cli import program
+
+    with CliRunner().isolated_filesystem():
+        arguments = [
+            "run",
+            "paper/b",
+            "--set",
+            "solver.relaxation=1.2",
+            "--set",
+            "rule={type: barycentre}",
+        ]
+        result = CliRunner().invoke(program, [*arguments, "--set", "steps=5"])
+        assert "solver.relaxation: 1.2 can diverge" in result.output
+        assert "stable below 1" in result.output
+        with pbdkit.open("paper-b.nc") as ds:
+            assert json.loads(ds.attrs["prediction"])["stable"] is False

@@ -1,0 +1,190 @@
+"""`pbdkit bench`: the table, the figures as JSON, the picture, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.benching.measuring import Bench
+from pbdkit.benching.method import REFERENCE, Measured, Method, NotMeasured, methods
+from pbdkit.benching.picture import FLOOR, work_precision
+from pbdkit.benching.report import as_dict, table
+from pbdkit.benching.resizing import resized
+from pbdkit.scene.scene import build_scene
+
+FOUR = [["numpy", "float64", 1], ["numpy", "float32", 1], ["compiled", "float64", 1]]
+HOLD = {"type": "hold"}
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Three methods, each of which takes a second or two."""
+    chosen = [m for m in methods() if [m.name, m.precision, m.threads] in FOUR]
+    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: chosen)
+
+
+def measured(method=REFERENCE, size=10, error=0.0):
+    return Measured(method, size, size**2, 5, 1.0, 0.1, 20.0, 3.0, error)
+
+
+def test_the_table_the_figures_and_the_picture(call, few):
+    result = call(
+        "bench", "e.json", "--sizes", "6", "--steps", "8", "--json", "b.json", "--plot", "b.png"
+    )
+    assert result.code == 0, result.err
+    found = json.loads(Path("b.json").read_text())
+    assert set(found) == {
+        "experiment", "settings", "steps", "machine", "measurements", "not_measured"
+    }  # fmt: skip
+    assert found["steps"] == 8
+    rows = found["measurements"]
+    assert [[r["method"], r["precision"], r["threads"]] for r in rows] == FOUR
+    for row in rows:
+        assert row["size"] == 6
+        assert row["particles"] == 8 * 6
+        assert row["setup_s"] > 0
+        assert row["setup_first_s"] > 0
+        assert row["ns_per_particle_step"] > 0
+        assert row["peak_memory_mib"] >= 0
+    exact, single, compiled = rows
+    assert exact["error"] == compiled["error"] == 0
+    assert 0 < single["error"] < 1e-5
+    assert compiled["setup_first_s"] > compiled["setup_s"]
+    assert Path("b.png").read_bytes().startswith(b"\x89PNG")
+    for row in rows:
+        assert any(row["method"] in line and row["precision"] in line
+                   for line in result.out.splitlines())  # fmt: skip
+
+
+def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
+    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: [REFERENCE])
+    result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
+    assert result.code == 0, result.err
+    assert "as it is" in result.out
+    (row,) = json.loads(Path("b").read_text())["measurements"]
+    assert row["size"] is None
+    assert row["particles"] == 6 * 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--sizes", "6,x"], 2, "'x' is no number of sites"),
+        (["--sizes", "1"], 2, "'1' is no number of sites"),
+        (["--steps", "0"], 2, "--steps"),
+        (["--plot", "b.txt"], 2, "a picture ends in .png, .svg, .pdf"),
+        (["--plot", "nowhere/b.png"], 6, "there is no folder nowhere"),
+        (["--json", "."], 2, "is a folder"),
+        (["--set", "rule.K=1"], 2, "rule"),
+        (["--set", "body={type: grid, columns: 1000000, rows: 1000000}"], 2, "make it smaller"),
+        (
+            ["--sizes", "6", "--set", "leaders.0.select={numbers: [7]}"],
+            2,
+            "leaders chosen by number cannot be resized",
+        ),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_is_refused_is_refused_in_one_line(call, arguments, code, words):
+    result = call("bench", "e.json", *arguments)
+    assert result.code == code
+    assert words in result.err
+    assert len(result.err.strip().splitlines()) == 1
+    assert "Traceback" not in result.err
+
+
+def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile):
+    file = tmp_path / "e.json"
+    file.write_text(json.dumps(tensile))
+    swarm = "neighbours={type: euclidean, radius: 1.1, reevaluate: true}"
+    never = Method("never", "float64", 1, ("solver.engine=compiled", swarm))
+    exact, other = Bench(str(file), (), 3).measure([never], None, lambda _: None)
+    assert isinstance(exact, Measured)
+    assert isinstance(other, NotMeasured)
+    assert "neighbours are found anew" in other.reason
+    assert as_dict(Bench("e", (), 3), [exact, other])["not_measured"][0]["reason"] == other.reason
+
+
+def sheet(**parts):
+    base = {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0, "origin": [1.0, 2.0]},
+        "body": {"type": "grid", "columns": 5, "rows": 3},
+        "rule": {"type": "barycentre"},
+        "leaders": [{"select": {"edge": "left"}, "motion": HOLD}],
+        "steps": 3,
+    }
+    return pbdkit.Experiment(**(base | parts))
+
+
+def at_size(tmp_path, experiment, size):
+    file = tmp_path / "e.json"
+    file.write_text(experiment.model_dump_json())
+    return build_scene(pbdkit.load(file, settings=resized(experiment, size)))
+
+
+def test_a_grid_grows_and_what_has_coordinates_keeps_its_place(tmp_path):
+    groups = [
+        {"select": {"box": [4.5, 0.0, 5.5, 9.0]}, "motion": HOLD},
+        {
+            "select": {"nearest": [[1.0, 4.0]]},
+            "motion": {"type": "rotation", "centre": [3.0, 3.0], "angle": 1.0, "steps": 2},
+        },
+    ]
+    cracks = [[[2.5, 0.0], [2.5, 3.0]]]
+    fracture = {"type": "threshold", "thresholds": [3.0], "cracks": cracks}
+    scene = at_size(tmp_path, sheet(leaders=groups, fracture=fracture), 9)
+    body = scene.experiment.body
+    assert (body.columns, body.rows) == (9, 5)
+    right, corner = (group.rows for group in scene.leading)
+    x = scene.raster.reference(right)
+    assert set(x[:, 0]) == {8.0, 9.0}
+    np.testing.assert_array_equal(scene.raster.reference(corner), [[1.0, 6.0]])
+    assert scene.experiment.leaders[1].motion.centre == (5.0, 4.0)
+    assert scene.experiment.fracture.cracks == (((4.0, -2.0), (4.0, 4.0)),)
+
+
+@pytest.mark.parametrize(
+    ("lattice", "body"),
+    [
+        ({"type": "square", "a": 1.0}, {"type": "disc", "radius": 5.0, "centre": [0.0, 0.0]}),
+        ({"type": "hexagonal", "a": 0.7}, {"type": "rectangle", "width": 10.0, "height": 4.0}),
+        (
+            {"type": "rectangular", "a": 1.0, "b": 0.5},
+            {"type": "rectangle", "width": 4.0, "height": 10.0},
+        ),
+    ],
+    ids=lambda part: part["type"],
+)
+def test_other_bodies_get_a_finer_lattice(tmp_path, lattice, body):
+    parts = {"lattice": lattice, "body": body, "frame": {"type": "none"}}
+    fracture = {"type": "threshold", "thresholds": [2.0]}
+    before = sheet(**parts, fracture=fracture)
+    scene = at_size(tmp_path, before, 41)
+    after = scene.experiment
+    factor = after.lattice.a / before.lattice.a
+    assert after.fracture.thresholds[0] == pytest.approx(2.0 * factor)
+    assert after.body == before.body
+    x = scene.raster.reference()
+    longer = np.argmax(np.ptp(x, axis=0))
+    spacing = {0: after.lattice.a, 1: getattr(after.lattice, "b", after.lattice.a)}[int(longer)]
+    assert np.ptp(x, axis=0).max() / spacing + 1 == pytest.approx(41, abs=1.01)
+
+
+def test_a_grid_within_another_body_cannot_be_resized():
+    grid = {"type": "grid", "columns": 5, "rows": 3}
+    with pytest.raises(pbdkit.ExperimentError, match="a grid within another body"):
+        resized(sheet(body={"type": "union", "of": [grid]}), 10)
+
+
+def test_every_method_is_a_row_and_a_marker():
+    rows = [measured(m, s, e) for m, e in zip(methods(), (0.0, 1e-7) * 3, strict=False)
+            for s in (10, 20)]  # fmt: skip
+    assert table(rows).row_count == len(rows)
+    (ax,) = work_precision([*rows, measured(error=None)], "a title").axes
+    drawn = np.concatenate([points.get_offsets() for points in ax.collections])
+    assert len(drawn) == len(rows)
+    assert drawn[:, 1].min() == FLOOR
+    assert "0" in [label.get_text() for label in ax.get_yticklabels()]
