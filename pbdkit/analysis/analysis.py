@@ -17,8 +17,8 @@ from pbdkit.scene.scene import Scene
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 NEUTRAL = 1e-9
 """Eigenvalues this near to 1 in modulus count as 1."""
-MOST_FOLLOWERS = 50_000
-"""Above this the spectrum would take minutes, and is left out."""
+MOST_FOLLOWERS = 250_000
+"""Above this the spectrum would take many seconds, and is left out."""
 
 
 @dataclass(frozen=True)
