@@ -96,6 +96,10 @@ COMPONENTS = {
     "fracture, reference": {"fracture": TORN | {"fictitious": "reference"}},
     "fracture, no frame": {"fracture": TORN, "frame": {"type": "none"}},
     "relaxed, with memory": {"solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.2}},
+    "released where it would not rest": {
+        "frame": {"type": "none"},
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}, "until": 2}],
+    },
     "noise": {"initial": {"type": "noise", "amplitude": 0.1}},
     "disc": {"body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]}, "leaders": []},
 }

@@ -35,6 +35,7 @@ class Reach:
                 self.blocks[s] = i0, i1, j0, j1
         self._everything = np.array([0, raster.shape[1], 0, raster.shape[2]], np.int64)
         self._bond = _growth(scene)
+        self._leaders = [np.unravel_index(led.place, raster.shape) for led in scene.leading]
         self._rests = _rests_by_construction(scene)
         self._known = self._empty = False
         self.box, self.growth = self._everything.copy(), np.zeros(4, np.int64)
@@ -64,6 +65,8 @@ class Reach:
             return
         self._known = True
         moved = (now != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
+        for _, m, n in self._leaders:  # who is held where it would not rest moves once released
+            moved[m, n] = True
         i, j = np.nonzero(moved)
         self.box = _around(i, j) if len(i) else np.array([0, 0, 0, 0], np.int64)
         self._empty = not len(i)
