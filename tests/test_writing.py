@@ -127,3 +127,29 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
     (kept,) = (p for p in tmp_path.iterdir() if p != path)
     with pbdkit.open(kept) as ds:
         assert ds.attrs["status"] == "complete"
+
+
+def test_compression_changes_the_file_and_not_the_values(tmp_path):
+    sizes = {}
+    for compression in ("none", "zlib"):
+        settings = ["body.columns=100", "steps=20", f"record.compression={compression}"]
+        experiment = pbdkit.load("start", settings=settings)
+        path = tmp_path / f"{compression}.nc"
+        sink = NetcdfSink(path, compression=experiment.record.compression)
+        run_into(sink, build_scene(experiment), progress=False)
+        sizes[compression] = path.stat().st_size
+    assert sizes["zlib"] < 0.3 * sizes["none"]
+    with pbdkit.open(tmp_path / "none.nc") as one, pbdkit.open(tmp_path / "zlib.nc") as other:
+        np.testing.assert_array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize(("columns", "along_time"), [(10, True), (400, False)])
+def test_chunks_serve_a_history_and_a_snapshot(tmp_path, columns, along_time):
+    settings = [f"body.columns={columns}", f"body.rows={columns}", "steps=30"]
+    path = tmp_path / "out.nc"
+    run_into(NetcdfSink(path), build_scene(pbdkit.load("start", settings=settings)), progress=False)
+    with pbdkit.open(path) as ds:
+        chunks = ds.position.encoding["chunksizes"]
+        assert np.prod(chunks) * 8 <= 1.01 * 2**20
+        assert (chunks[0] > 1) == along_time
+        assert (chunks[1] == ds.sizes["particle"]) == along_time

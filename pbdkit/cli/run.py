@@ -48,7 +48,7 @@ def run(
     from pbdkit.results.overlapping import OverlappingSink
 
     silent = quiet or as_json or not sys.stderr.isatty()
-    sink = OverlappingSink(NetcdfSink(path, replace=force))
+    sink = OverlappingSink(NetcdfSink(path, replace=force, compression=loaded.record.compression))
     with asked_to_stop() as stopping:
         report = run_into(sink, scene, progress=not silent, stopping=stopping)
     if as_json:

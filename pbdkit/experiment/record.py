@@ -16,11 +16,13 @@ class Record(Strict):
     """Every so many steps, or at chosen ones; time 0 and the last step always.
 
     `dtype` is that of recorded positions and diagnostics; the run itself is not affected.
+    `compression` is that of the file: zlib makes it smaller, and writing it slower.
     """
 
     every: Annotated[int, Field(ge=1)] = 1
     at: Steps | None = None
     dtype: Literal["float64", "float32"] = "float64"
+    compression: Literal["none", "zlib"] = "none"
 
     @model_validator(mode="after")
     def _one_way(self) -> Record:
@@ -34,7 +36,7 @@ class Record(Strict):
     @model_serializer
     def _serialize(self) -> dict[str, Any]:
         which = {"every": self.every} if self.at is None else {"at": list(self.at)}
-        return which | {"dtype": self.dtype}
+        return which | {"dtype": self.dtype, "compression": self.compression}
 
     def keeps(self, step: int, steps: int) -> bool:
         """Whether that step of a run of `steps` is recorded."""

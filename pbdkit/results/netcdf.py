@@ -16,18 +16,18 @@ from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column
 from pbdkit.results.recorder import Sink, Values
 
-BATCH_BYTES = 2**20
-"""Entries are written, and chunked, in batches of about so much: one particle's history and one
-snapshot both stay cheap to read."""
-
+CHUNK_BYTES = 2**20
+"""About a chunk: several entries where they are small, a part of one where they are large. Reading
+the history of a particle touches one chunk a batch, reading a snapshot little more than itself."""
 FULL_BYTES = 2**20
 
 
 class NetcdfSink(Sink):
     """Writes beside `path` under a temporary name; `finish` syncs it and renames it to `path`."""
 
-    def __init__(self, path: Path, *, replace: bool = False) -> None:
+    def __init__(self, path: Path, *, replace: bool = False, compression: str = "none") -> None:
         self._path = path
+        self._compression = {"zlib": {"compression": "zlib", "complevel": 1}}.get(compression, {})
         self._replace = replace
         self._temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{id(self):x}.partial")
         self._file: Any = None
@@ -108,10 +108,13 @@ class NetcdfSink(Sink):
         if column.grows:
             inner = [max(1, sizes[d]) for d in column.dims[1:]]
             entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
-            self._batch[column.name] = max(1, min(BATCH_BYTES // entry, planned[column.dims[0]]))
+            self._batch[column.name] = max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]]))
+            if inner:  # parts of equal size, so that the last one wastes nothing
+                inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
             chunks = (self._batch[column.name], *inner)
+        packed = self._compression if column.dtype != "str" else {}
         variable = self._file.createVariable(
-            column.name, dtype, column.dims, chunksizes=chunks, fill_value=False
+            column.name, dtype, column.dims, chunksizes=chunks, fill_value=False, **packed
         )
         variable.setncatts(column.attributes)
         if "particle" in column.dims and not column.coordinate:
