@@ -121,6 +121,9 @@ def run_into(
         recorder.begin()
         with progress_bar(scene.experiment.steps, progress) as show:
             outcome = _step_through(scene, engine, recorder, show, stopping)
+    except ExperimentError as error:
+        sink.abandon()
+        raise scene.experiment.located(error) from None
     except BaseException:
         sink.abandon()
         raise
@@ -136,14 +139,14 @@ def _step_through(
 ) -> Outcome:
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
-    outcome, guard = Outcome("complete", "all steps done", steps), Guard(scene)
+    outcome, guard = Outcome("complete", "all steps done", steps), Guard(scene, state)
     try:
         recorder.observe(state)
         while state.step < steps and not stopping():
             wanted = recorder.next_after(state.step)
             reached = min(wanted, guard.next_look, state.step + patience)
             state = engine.advance(state, reached - state.step)
-            if reached in (wanted, guard.next_look):
+            if reached == guard.next_look or recorder.records(reached):
                 guard.look(state)
             recorder.observe(state)
             show(state.step)

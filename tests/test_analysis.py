@@ -46,16 +46,17 @@ def unknowns(scene, u, rows):
 def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
     """On random scenes, torn ones too; a nonlinear rule at the state where it is linearised."""
     try:
-        scene = build_scene(pbdkit.Experiment(**experiment))
+        scene = build_scene(pbdkit.Experiment(**experiment | {"steps": 10}))
+        assume(not experiment["neighbours"].get("reevaluate"))
+        stepper, state = Stepper(scene), initial_state(scene)
+        state = stepper.advance(state, 4)
+        operator = step_operator(scene, state, step=5)
+        before_step = [u.copy() for u in (state.u, state.previous)]
+        broken = None if state.broken_step is None else state.broken_step.copy()
+        state = stepper.advance(state)
     except pbdkit.ExperimentError:
         assume(False)
-    assume(not experiment["neighbours"].get("reevaluate"))
-    stepper, state = Stepper(scene), initial_state(scene)
-    state = stepper.advance(state, 4)
-    operator = step_operator(scene, state, step=5)
-    now, before = (unknowns(scene, u, operator.followers) for u in (state.u, state.previous))
-    broken = None if state.broken_step is None else state.broken_step.copy()
-    state = stepper.advance(state)
+    now, before = (unknowns(scene, u, operator.followers) for u in before_step)
     assume(broken is None or np.array_equal(broken, state.broken_step))
     led = unknowns(scene, state.u, operator.leaders)
     old_led = unknowns(scene, state.previous, operator.leaders)
@@ -226,3 +227,65 @@ def test_a_run_that_can_diverge_is_warned_of_with_the_bound_and_says_so_in_the_d
         assert "stable below 1" in result.output
         with pbdkit.open("paper-b.nc") as ds:
             assert json.loads(ds.attrs["prediction"])["stable"] is False
+
+
+class Hypotenuse(pbdkit.FollowerRule):
+    """The distance-weighted rule by a function that takes no complex numbers."""
+
+    type: str = "hypotenuse"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        x, y = r.x + d.x, r.y + d.y
+        distance = np.hypot(x, y)
+        return distance * x, distance * y, distance
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[2], total[1] / total[2]
+
+
+class Absolute(Hypotenuse):
+    """The same by one that drops the imaginary part without a word."""
+
+    type: str = "absolute"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        x, y = r.x + d.x, r.y + d.y
+        distance = np.sqrt(np.abs(x) ** 2 + np.abs(y) ** 2)
+        return distance * x, distance * y, distance
+
+
+@pytest.mark.parametrize("rule", [Hypotenuse(type="hypotenuse"), Absolute(type="absolute")])
+def test_functions_that_take_no_complex_step_are_found_out(rule):
+    given = sheet(rule=rule)
+    assert wave_bound(build_scene(pbdkit.Experiment(**given))).smallest == pytest.approx(
+        -2, abs=1e-6
+    )
+    exact = pbdkit.analyse(sheet(rule={"type": "distance-weighted"}))
+    assert pbdkit.analyse(given).spectral_radius == pytest.approx(exact.spectral_radius, abs=1e-6)
+    assert pbdkit.run(given | {"steps": 3}, progress=False).attrs["status"] == "complete"
+
+
+@pytest.mark.parametrize("memory", [1.5, -1.5])
+def test_no_bound_is_promised_where_there_is_none(memory):
+    given = sheet(solver={"type": "stepping", "memory": memory})
+    analysis = pbdkit.analyse(given)
+    assert analysis.stable is False
+    assert analysis.largest_stable_relaxation is None
+    assert any("no relaxation helps" in w for w in analysis.warnings())
+
+
+def test_frames_with_lag_are_left_to_the_spectrum():
+    scene = build_scene(pbdkit.Experiment(**sheet(frame={"type": "mean", "lag": 1})))
+    assert wave_bound(scene) is None
+    assert Analysis(scene).stable
+
+
+def test_where_everybody_leads_there_is_nothing_to_analyse():
+    leaders = [{"select": {"box": [-1, -1, 99, 99]}, "motion": {"type": "hold"}}]
+    analysis = pbdkit.analyse(sheet(leaders=leaders))
+    assert analysis.stable
+    assert len(analysis.operator.followers) == 0
+    assert analysis.warnings() == []

@@ -63,3 +63,24 @@ def test_not_a_number_is_found(every):
     with pytest.raises(pbdkit.DivergedError, match="under rule 'poisoned'") as caught:
         pbdkit.run(given, progress=False)
     assert np.isfinite(caught.value.dataset.position).all()
+
+
+def test_a_far_start_and_a_released_leader_are_no_divergence():
+    start = {"type": "affine", "gradient": [[0.0, 0.0], [0.0, 0.0]], "shift": [1e9, 0.0]}
+    far = {"type": "displace", "displacement": [1e9, 0.0]}
+    released = [{"select": {"edge": "right"}, "motion": far, "until": 4}]
+    for parts in ({"initial": start, "leaders": []}, {"leaders": released}):
+        ds = pbdkit.run(BLOWN | parts | {"steps": 250}, progress=False)
+        assert ds.attrs["status"] == "complete"
+
+
+def test_groups_that_contradict_each_other_from_where_they_stand_are_refused():
+    start = {"type": "affine", "gradient": [[0.0, 0.0], [0.0, 0.0]], "shift": [1.0, 0.0]}
+    turn = {"type": "rotation", "centre": [0.0, 0.0], "angle": 5.0, "steps": 3}
+    one = {"numbers": [12]}
+    leaders = [{"select": one, "motion": turn}, {"select": one, "motion": {"type": "hold"}}]
+    with pytest.raises(pbdkit.ExperimentError, match="move particle 12 differently in step 1"):
+        pbdkit.run(BLOWN | {"initial": start, "leaders": leaders}, progress=False)
+    leaders[0]["motion"] = turn | {"centre": [1.0, 0.0]}  # where number 12 stands: it does not move
+    ds = pbdkit.run(BLOWN | {"initial": start, "leaders": leaders, "steps": 5}, progress=False)
+    assert ds.attrs["status"] == "complete"

@@ -5,9 +5,9 @@ import tracemalloc
 import pytest
 
 import pbdkit
+from pbdkit.analysis.forecast import forecast
 from pbdkit.results.netcdf import NetcdfSink
 from pbdkit.running import run_into
-from pbdkit.analysis.forecast import forecast
 from pbdkit.scene.scene import build_scene
 
 MIB = 2**20

@@ -17,7 +17,8 @@ from pbdkit.scene.scene import Scene
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 NEUTRAL = 1e-9
 """Eigenvalues this near to 1 in modulus count as 1."""
-MOST_FOLLOWERS = 250_000
+NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
+MOST_FOLLOWERS = 50_000
 """Above this the spectrum would take many seconds, and is left out."""
 
 
@@ -36,11 +37,13 @@ class Analysis:
     @cached_property
     def spectrum(self) -> Spectrum | None:
         """Of the step as the solver makes it, with relaxation, memory and lag."""
-        if self.scene.experiment.neighbours.nearness():
-            return None
-        if len(self.operator.followers) > MOST_FOLLOWERS:
-            return None
-        return spectrum(self.operator.augmented().matrix())
+        return spectrum(self.operator.augmented().matrix()) if self._within_reach else None
+
+    @property
+    def _within_reach(self) -> bool:
+        """Whether there is an operator, and it is small enough to be looked at."""
+        fixed = self.scene.experiment.neighbours.nearness() is None
+        return fixed and self.scene.raster.count <= MOST_FOLLOWERS
 
     @cached_property
     def _rule_spectrum(self) -> Spectrum | None:
@@ -77,10 +80,12 @@ class Analysis:
         """With the memory as it is: 2 (1 + b) / (1 - λ_min) for real eigenvalues, and
         min 2 Re z / |z|², z = 1 - λ, for complex ones without memory."""
         own, memory = self._rule_spectrum, self.scene.experiment.solver.memory
-        if own is None or not len(own.eigenvalues):
+        if own is None or not len(own.eigenvalues) or abs(memory) >= 1.0:
+            return None
+        if own.largest > 1.0 + NEUTRAL or own.smallest > 1.0 - NEUTRAL:
             return None
         if np.abs(own.eigenvalues.imag).max() < NEUTRAL:
-            return 2.0 * (1.0 + memory) / (1.0 - own.smallest) if own.smallest < 1.0 else None
+            return 2.0 * (1.0 + memory) / (1.0 - own.smallest)
         z = 1.0 - own.eigenvalues[np.abs(1.0 - own.eigenvalues) > NEUTRAL]
         return float((2.0 * z.real / np.abs(z) ** 2).min()) if memory == 0.0 else None
 
@@ -110,7 +115,7 @@ class Analysis:
     @cached_property
     def parts_without_leader(self) -> list[Any]:
         """The numbers of the particles of each part that no leader reaches."""
-        if self.scene.experiment.neighbours.nearness():
+        if not self._within_reach:
             return []
         operator = self.operator
         now, before = operator.entries_now, operator.entries_before
@@ -130,14 +135,20 @@ class Analysis:
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         found = []
-        for part in self.parts_without_leader:
+        parts = self.parts_without_leader
+        if len(parts) > 3:
+            found.append(
+                f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"
+            )
+            parts = []
+        for part in parts:
             found.append(
                 f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
                 "nothing holds it"
             )
         if self.stable is False:
             bound = self.largest_stable_relaxation
-            remedy = f"; it is stable below {bound:.4g}" if bound else ""
+            remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
             found.append(
                 f"solver.relaxation: {self.scene.experiment.solver.relaxation:g} diverges, the "
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.analysis import NEUTRAL, Analysis
+from pbdkit.analysis.analysis import NEUTRAL, NO_REMEDY, Analysis
 from pbdkit.analysis.symbol import wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
@@ -83,6 +83,9 @@ def _doubts(scene: Scene) -> list[str]:
     warnings = list(scene.warnings)
     if not (kinds_at(scene.raster, scene.leading, 1) == FOLLOWER).any():
         warnings.append("leaders: everybody leads in step 1, nobody follows")
+    for n, leading in enumerate(scene.leading):
+        if leading.group.from_ > scene.experiment.steps:
+            warnings.append(f"leaders.{n}: begins to lead after the run's last step")
     if not scene.leading:
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():
@@ -97,10 +100,11 @@ def _growing_waves(scene: Scene) -> list[str]:
     bound, solver = wave_bound(scene), scene.experiment.solver
     if bound is None or bound.radius <= 1.0 + NEUTRAL:
         return []
+    stable = bound.largest_stable_relaxation(solver.memory)
+    remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
     return [
-        f"solver.relaxation: {solver.relaxation:g} can diverge, the shortest waves grow by "
-        f"{bound.radius:.4g} a step; it is stable below "
-        f"{bound.largest_stable_relaxation(solver.memory):.4g}"
+        f"solver.relaxation: {solver.relaxation:g} can diverge, some waves grow by "
+        f"{bound.radius:.4g} a step{remedy}"
     ]
 
 

@@ -1,8 +1,6 @@
 """A rule's answer to small displacements, from the rule's own functions and nothing else.
 
-The functions are analytic where they keep to arithmetic and roots, so that a complex step gives
-their derivatives to the last digits: ∂f = Im f(x + ih) / h with h far below rounding. Linear rules
-come out exactly, whatever the configuration.
+Linear rules come out exactly, whatever the configuration; others linearised at a state.
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.raster import Block
 from pbdkit.scene.scene import Scene
@@ -20,7 +19,6 @@ from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.state import State
 from pbdkit.stepping.sums import difference, planes, presence, sum_over_slots
 
-H = 1e-100
 Floats = NDArray[np.float64]
 
 
@@ -64,15 +62,16 @@ class _Linearisation:
     def derivative(self, of: Slot | None) -> Floats:
         """∂move/∂u_k through a slot, or ∂move/∂u_j with all neighbours where they are."""
         columns = []
-        for axis in (0, 1):
-            nudge = Vector(*(1j * H if axis == n else 0.0 for n in (0, 1)))
-            if of is None:
+        for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+
+            def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
+                nudge = Vector(step * along.x, step * along.y)
+                if of is not None:
+                    return self._moved(self._u, {of: nudge})
                 here = Vector(self._u.x + nudge.x, self._u.y + nudge.y)
-                back = Vector(-nudge.x, -nudge.y)
-                moved = self._moved(here, dict.fromkeys(self._slots, back))
-            else:
-                moved = self._moved(self._u, {of: nudge})
-            columns.append([np.broadcast_to(np.imag(m) / H, self._u.x.shape) for m in moved])
+                return self._moved(here, dict.fromkeys(self._slots, Vector(-nudge.x, -nudge.y)))
+
+            columns.append(derivative(moved, self._u.x.shape))
         return np.moveaxis(np.array(columns), (0, 1), (3, 2))
 
     def _moved(self, here: Vector, nudges: dict[Slot, Vector]) -> tuple[Any, Any]:

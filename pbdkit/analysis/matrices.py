@@ -40,6 +40,8 @@ class Entries:
 
 def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
     """(count, label): the groups of unknowns that reach one another, along arrows or either way."""
+    if not matrix.shape[0]:
+        return 0, np.empty(0, np.intp)
     if not isinstance(matrix, np.ndarray):
         from scipy.sparse.csgraph import connected_components
 

@@ -107,6 +107,7 @@ class _Assembly:
         self._before: Parts = []
         self._led: Parts = []
         self._source = np.zeros(2 * len(self._followers))
+        self._accompanied = np.zeros(len(self._followers), bool)
 
     def operator(self) -> StepOperator:
         raster, memory = self._scene.raster, self._scene.experiment.solver.memory
@@ -114,10 +115,12 @@ class _Assembly:
             if block := raster.body_block(s):
                 self._add(respond(self._scene, self._state, block))
         size, led = 2 * len(self._followers), 2 * len(self._leaders)
-        diagonal = np.arange(size)
-        self._now.append((diagonal, diagonal, np.full(size, 1.0 + memory)))
+        every = np.arange(size)
+        self._now.append((every, every, np.ones(size)))
         if memory:
-            self._before.append((diagonal, diagonal, np.full(size, -memory)))
+            moving = every[np.repeat(self._accompanied, 2)]
+            self._now.append((moving, moving, np.full(len(moving), memory)))
+            self._before.append((moving, moving, np.full(len(moving), -memory)))
         return StepOperator(
             self._followers,
             self._leaders,
@@ -142,6 +145,7 @@ class _Assembly:
         accompanied = np.any([there >= 0 for there in others.values()], axis=0)
         kept = (self._kinds[rows] == FOLLOWER) & accompanied
         m, n, rows = m[kept], n[kept], rows[kept]
+        self._accompanied[self._unknown[rows]] = True
         own = relaxation * response.own[m, n]
         self._put(self._now, rows, rows, own)
         constant = relaxation * response.move[m, n] - _times(own, self._u(rows))

@@ -86,7 +86,7 @@ def _extremes(block: Any, symmetric: bool) -> NDArray[np.complex128]:
     spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
     ends = ((diagonal + spread).max() + BEYOND, (diagonal - spread).min() - BEYOND)
     nearest = [
-        eigsh(block.tocsc(), k=2, sigma=end, which="LM", tol=1e-13, return_eigenvectors=False)
+        eigsh(block.tocsc(), k=2, sigma=end, which="LM", tol=1e-10, return_eigenvectors=False)
         for end in ends
     ]
     return np.concatenate(nearest).astype(complex)

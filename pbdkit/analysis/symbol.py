@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.linearising import H
+from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.scene import Scene
 
@@ -24,29 +24,43 @@ WAVES = 48
 
 @dataclass(frozen=True)
 class Bound:
-    """Over all waves: the smallest and largest real part of the eigenvalues of the rule's step
-    without relaxation and memory, and the largest modulus of the solver's step with them."""
+    """Over all waves: the smallest and largest real part and the largest imaginary part of the
+    eigenvalues of the rule's step without relaxation and memory, and the largest modulus of the
+    solver's step with them."""
 
     smallest: float
     largest: float
+    imaginary: float
     radius: float
 
-    def largest_stable_relaxation(self, memory: float) -> float:
-        """2 (1 + memory) / (1 - λ_min), for real spectra."""
-        return 2.0 * (1.0 + memory) / (1.0 - self.smallest)
+    def largest_stable_relaxation(self, memory: float) -> float | None:
+        """2 (1 + memory) / (1 - λ_min); None where eigenvalues are complex or above 1, or the
+        memory grows by itself: no such bound exists there."""
+        if self.imaginary > 1e-9 or self.largest > 1.0 + 1e-9 or abs(memory) >= 1.0:
+            return None
+        return 2.0 * (1.0 + memory) / (1.0 - self.smallest) if self.smallest < 1.0 - 1e-9 else None
 
 
 def wave_bound(scene: Scene) -> Bound | None:
-    """The bound for the scene's rule at rest; None for rules that depend on the place, and where
-    neighbours are found anew."""
-    if scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
+    """The bound for the scene's rule at rest.
+
+    None for rules that depend on the place or take no single numbers, where neighbours are found
+    anew, and where the frame lags: its delay can make modes grow that no plane wave knows.
+    """
+    solver, lags = scene.experiment.solver, scene.frame is not None and scene.frame.map.lag
+    if lags or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
-    solver = scene.experiment.solver
-    eigenvalues = _eigenvalues(_symbols(scene)).ravel()
+    try:
+        eigenvalues = _eigenvalues(_symbols(scene)).ravel()
+    except Exception:  # a prediction never stops a run; the run itself names the rule at fault
+        return None
+    if not np.isfinite(eigenvalues).all():
+        return None
     relaxed = 1.0 + solver.relaxation * (eigenvalues - 1.0)
     return Bound(
         float(eigenvalues.real.min()),
         float(eigenvalues.real.max()),
+        float(np.abs(eigenvalues.imag).max()),
         float(np.abs(with_memory(relaxed, solver.memory)).max()),
     )
 
@@ -90,22 +104,25 @@ def _symbols(scene: Scene) -> Complex:
 def _derivative(scene: Scene, slots: tuple[Slot, ...], of: Slot | None) -> NDArray[np.float64]:
     """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are: (2, 2)."""
     rule, constants = scene.experiment.rule, scene.constants
+    still = Vector(np.float64(0.0), np.float64(0.0))
     columns = []
-    for axis in (0, 1):
-        nudge = Vector(*(np.complex128(1j * H if axis == n else 0.0) for n in (0, 1)))
-        still = Vector(np.complex128(0.0), np.complex128(0.0))
-        back = Vector(-nudge.x, -nudge.y)
-        parts = [
-            rule.gather(
-                nudge if slot is of else back if of is None else still,
-                slot.rest,
-                constants.weights[slot],
-                constants.rule,
-            )
-            for slot in slots
-        ]
-        total = tuple(sum(part[1:], part[0]) for part in zip(*parts, strict=True))
-        here = Here(nudge if of is None else still, Vector(None, None))
-        with np.errstate(all="ignore"):
-            columns.append([np.imag(m) / H for m in rule.apply(total, here, constants.rule)])
+    for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+
+        def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
+            nudge = Vector(np.multiply(step, along.x), np.multiply(step, along.y))
+            back = Vector(-nudge.x, -nudge.y)
+            parts = [
+                rule.gather(
+                    back if of is None else nudge if slot is of else still,
+                    slot.rest,
+                    constants.weights[slot],
+                    constants.rule,
+                )
+                for slot in slots
+            ]
+            total = tuple(sum(part[1:], part[0]) for part in zip(*parts, strict=True))
+            here = Here(nudge if of is None else still, Vector(None, None))
+            return rule.apply(total, here, constants.rule)
+
+        columns.append(derivative(moved))
     return np.array(columns).T

@@ -35,8 +35,15 @@ class Intersection(Body):
     of: Bodies
 
     def boxes(self) -> list[Box]:
-        """Those of the first part."""
-        return self.of[0].boxes()
+        """A grid's own where a part is one; else what the boxes of all parts share."""
+        every = [part.boxes() for part in self.of]
+        grids = [boxes for boxes in every if len(boxes) == 1 and boxes[0].in_sites]
+        outlines = [_hull(boxes) for boxes in every if not any(box.in_sites for box in boxes)]
+        if grids or not outlines:
+            return (grids or every)[0]
+        low = max(box.low[0] for box in outlines), max(box.low[1] for box in outlines)
+        high = min(box.high[0] for box in outlines), min(box.high[1] for box in outlines)
+        return [Box(low, (max(low[0], high[0]), max(low[1], high[1])))]
 
     def distance(self, at: Sites) -> Floats:
         """The largest."""
@@ -57,6 +64,13 @@ class Difference(Body):
         """The largest of the first distance and the others' negatives."""
         first, *others = (part.distance(at) for part in self.of)
         return reduce(np.maximum, (-other for other in others), first)
+
+
+def _hull(boxes: list[Box]) -> Box:
+    """The box around some boxes."""
+    low = min(b.low[0] for b in boxes), min(b.low[1] for b in boxes)
+    high = max(b.high[0] for b in boxes), max(b.high[1] for b in boxes)
+    return Box(low, high)
 
 
 AnyBody = Annotated[

@@ -14,7 +14,7 @@ from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component, Pair
 
 Floats = NDArray[np.floating[Any]]
-Steps = Annotated[int, Field(ge=1)]
+Steps = Annotated[int, Field(ge=1, le=2**62)]
 
 
 class Motion(Component):
@@ -133,7 +133,7 @@ class Rotation(Motion):
 
     type: Literal["rotation"] = "rotation"
     centre: Pair
-    angle: float
+    angle: Annotated[float, Field(ge=-1e6, le=1e6)]
     steps: Steps
 
     def offset(self, n: int, start: Floats) -> Floats:
@@ -158,7 +158,7 @@ class Oscillation(Motion):
 
     type: Literal["oscillation"] = "oscillation"
     amplitude: Pair
-    period: Annotated[float, Field(gt=0.0)]
+    period: Annotated[float, Field(ge=1e-6, le=1e12)]
 
     def offset(self, n: int, start: Floats) -> Floats:
         """amplitude · sin(2πn / period)."""

@@ -84,6 +84,8 @@ class Polygon(Body):
     def _simple(self) -> Polygon:
         from shapely.validation import explain_validity
 
+        if max(abs(c) for vertex in self.vertices for c in vertex) > 1e100:
+            raise ValueError("a vertex lies beyond 1e100")
         outline = self._outline()
         if not outline.is_valid or outline.area == 0.0:
             reason = explain_validity(outline) if outline.area else "no area"

@@ -105,9 +105,13 @@ class Recorder:
     def observe(self, state: State) -> None:
         """Takes what is wanted of this step. Raises FloatingPointError where a recorded value has
         left the finite numbers; nothing of that step is kept."""
-        steps, record = self._scene.experiment.steps, self._scene.experiment.record
         with np.errstate(all="ignore"):
-            self._observe(state, record.keeps(state.step, steps), bool(self._stepped))
+            self._observe(state, self.records(state.step), bool(self._stepped))
+
+    def records(self, step: int) -> bool:
+        """Whether positions are recorded at that step."""
+        experiment = self._scene.experiment
+        return experiment.record.keeps(step, experiment.steps)
 
     def next_after(self, step: int) -> int:
         """The next step after `step` at which something is taken."""
@@ -139,7 +143,10 @@ class Recorder:
     def finish(self, state: State, outcome: Outcome) -> None:
         """Hands over what is known at the end, and the attributes."""
         if self._scene.has_fracture:
-            self._sink.put({"broken_step": StateMoment(state, self._tables).broken_step()})
+            broken = StateMoment(state, self._tables).broken_step()
+            if outcome.status == "diverged":  # what broke since the last record is no result
+                broken = np.where(broken > self._last_recorded, -1, broken)
+            self._sink.put({"broken_step": broken})
         self._sink.finish(self._attributes(outcome))
 
     def _columns(self) -> list[Column]:

@@ -32,6 +32,11 @@ def fill(body: Body, lattice: Lattice) -> tuple[Mask, Index]:
     """
     low, high = window(body, lattice)
     cell = lattice.cell()
+    if max(map(abs, (*low, *high))) > 2**31 - 100:
+        raise ExperimentError(
+            "lies beyond the site indices of 32 bits; move it, or the lattice's origin, nearer",
+            ("body",),
+        )
     inside = existing(cell, low, (high[0] - low[0] + 1, high[1] - low[1] + 1)).copy()
     lines = max(1, CHUNK_ROWS // inside.shape[1])
     for begin in range(0, len(inside), lines):

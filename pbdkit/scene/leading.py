@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.leaders import LeaderGroup, Selection
+from pbdkit.experiment.motions import Rotation
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
@@ -29,7 +30,9 @@ class Leading:
     reference: Floats
 
 
-def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> tuple[Leading, ...]:
+def build_leading(
+    raster: Raster, groups: Iterable[LeaderGroup], steps: int, *, at_rest: bool = True
+) -> tuple[Leading, ...]:
     """Every group with its particles.
 
     Raises ExperimentError for a group that selects nobody or a frame point, and for groups that
@@ -42,7 +45,8 @@ def build_leading(raster: Raster, groups: Iterable[LeaderGroup], steps: int) -> 
         found.append(Leading(group, rows, raster.place_of(rows), raster.reference(rows)))
     for n, later in enumerate(found):
         for k, earlier in enumerate(found[:n]):
-            _refuse_contradiction(raster, (k, earlier), (n, later), steps)
+            if _known_beforehand(earlier.group, later.group, at_rest):
+                _refuse_contradiction(raster, (k, earlier), (n, later), steps)
     return tuple(found)
 
 
@@ -151,6 +155,12 @@ def _refuse_infinite(
     for n in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
         if n >= 1 and not np.isfinite(at + group.motion.offset(n, at)).all():
             raise ExperimentError(f"leaves the finite numbers at its step {n}", where)
+
+
+def _known_beforehand(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
+    """Whether it is known where both motions start, or does not matter: it does to rotations."""
+    turns = any(isinstance(group.motion, Rotation) for group in (a, b))
+    return not turns or (at_rest and min(a.from_, b.from_) == 1)
 
 
 def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:

@@ -49,6 +49,12 @@ class Scene:
         return self.experiment.shows_bonds
 
     @cached_property
+    def leaders_overlap(self) -> bool:
+        """Whether any particle belongs to two leader groups."""
+        rows = [leading.rows for leading in self.leading]
+        return len(np.unique(np.concatenate([*rows, []]))) < sum(map(len, rows))
+
+    @cached_property
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
@@ -86,7 +92,8 @@ def _build(experiment: Experiment) -> Scene:
             "neighbours do not have; set neighbours.reevaluate: false",
             ("neighbours",),
         )
-    leading = build_leading(raster, experiment.leaders, experiment.steps)
+    at_rest = experiment.initial.at_rest
+    leading = build_leading(raster, experiment.leaders, experiment.steps, at_rest=at_rest)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame)
     return Scene(experiment, neighbourhood, raster, constants, following, leading, tuple(warnings))

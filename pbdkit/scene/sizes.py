@@ -55,10 +55,16 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     )
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
     records = experiment.record.count(experiment.steps)
-    per_record = particles * (2 * 8 + 1) + sum(
-        _bytes_a_record(d, particles) for d in experiment.diagnostics if not d.every_step
-    )
-    every_step = sum(_bytes_a_record(d, particles) for d in experiment.diagnostics if d.every_step)
+    recorded = np.dtype(experiment.record.dtype).itemsize
+    entries = {
+        stepped: sum(
+            _bytes_an_entry(d, particles, recorded)
+            for d in experiment.diagnostics
+            if d.every_step == stepped
+        )
+        for stepped in (False, True)
+    }
+    per_record, every_step = particles * (2 * recorded + 1) + entries[False], entries[True]
     once = particles * (2 * 8 + 2 * 4 + 2 * 8)
     if experiment.shows_bonds:
         once += math.ceil(particles * planes * (2 * 8 + 1 + 4 * experiment.fracture.can_break))
@@ -88,10 +94,11 @@ def machine_memory() -> int:
         return 16 * 2**30
 
 
-def _bytes_a_record(diagnostic: Diagnostic, particles: int) -> int:
+def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int) -> int:
     sizes = {"particle": particles, "axis": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     return sum(
-        math.prod(sizes.get(dim, 1) for dim in v.dims) * np.dtype(v.dtype).itemsize
+        math.prod(sizes.get(dim, 1) for dim in v.dims)
+        * (recorded if v.dtype == "f8" else np.dtype(v.dtype).itemsize)
         for v in diagnostic.variables()
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
@@ -26,7 +27,30 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
         n_th = step - leading.group.from_ + 1
         offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
         led.append((leading.place, begun + np.atleast_2d(offset).T))
+    if scene.leaders_overlap:
+        _refuse_contradiction(scene, led, step)
     return led, tuple(starts)
+
+
+def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
+    """What could not be known before: groups that move one particle differently from where it
+    stands."""
+    if len(led) < 2:
+        return
+    places = np.concatenate([p for p, _ in led])
+    u = np.concatenate([v for _, v in led], axis=1)
+    order = np.argsort(places, kind="stable")
+    same = np.diff(places[order]) == 0
+    apart = np.abs(np.diff(u[:, order], axis=1)).max(axis=0) > 1e-9 * max(1.0, np.abs(u).max())
+    if (same & apart).any():
+        place = places[order][:-1][same & apart][:1]
+        s, m, n = np.unravel_index(place, scene.raster.shape)
+        number = int(scene.raster.rows_at(s, m, n)[0]) + 1
+        raise ExperimentError(
+            f"two groups move particle {number} differently in step {step}; select it in one of "
+            "them only, or let one end before the other begins",
+            ("leaders",),
+        )
 
 
 def steady_steps(scene: Scene, step: int, most: int) -> int:

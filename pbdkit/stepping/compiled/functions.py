@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import inspect
 import types
+import uuid
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
+import numpy as np
 from numba.extending import overload, register_jitable
 
 from pbdkit.interfaces import where
@@ -40,15 +42,31 @@ def compiled(function: Function) -> Any:
 
 
 def source_key(*functions: Function) -> str:
-    """A digest of the source of these functions and of all that they reach, constants included."""
+    """A digest of the source of these functions and of all that they reach, constants included.
+
+    What a function reads and cannot be told apart by its value gets a key of its own every time,
+    so that a kernel is rather made anew than out of date.
+    """
     digest = hashlib.sha256()
     for function in functions:
         for reached in _reached(function):
             digest.update(_source(reached).encode())
+            digest.update(repr((reached.__defaults__, reached.__kwdefaults__)).encode())
             for name, value in sorted(_names(reached).items()):
-                if isinstance(value, (bool, int, float, complex, str, tuple)):
-                    digest.update(f"{name}={value!r}".encode())
+                digest.update(f"{name}={_content(value)}".encode())
     return digest.hexdigest()
+
+
+def _content(value: Any) -> str:
+    if isinstance(value, (bool, int, float, complex, str, tuple, type(None))):
+        return repr(value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+    if isinstance(value, (types.FunctionType, types.BuiltinFunctionType, type, np.ufunc)):
+        return getattr(value, "__qualname__", repr(value))
+    if isinstance(value, types.ModuleType) or hasattr(value, "py_func"):
+        return type(value).__name__
+    return uuid.uuid4().hex
 
 
 def _source(function: Function) -> str:
@@ -67,16 +85,27 @@ def _reached(function: Function) -> Iterator[Function]:
         here = waiting.pop()
         if here not in seen:
             seen.append(here)
-            waiting += [v for v in _names(here).values() if isinstance(v, types.FunctionType)]
+            found = [getattr(v, "py_func", v) for v in _names(here).values()]
+            waiting += [v for v in found if isinstance(v, types.FunctionType)]
     yield from seen
 
 
 def _names(function: Function) -> dict[str, Any]:
-    """What the names in a function stand for: globals, closures, and members of modules."""
-    known = inspect.getclosurevars(function)
-    found = {**known.globals, **known.nonlocals}
-    for module in [v for v in found.values() if isinstance(v, types.ModuleType)]:
-        if module.__name__.split(".")[0] not in ("numpy", "math"):
-            for name in known.unbound & set(vars(module)):
-                found[f"{module.__name__}.{name}"] = getattr(module, name)
+    """What the names in a function, and in functions inside it, stand for: globals, closures, and
+    members of modules."""
+    names, waiting = set(), [function.__code__]
+    while waiting:
+        code = waiting.pop()
+        names |= set(code.co_names)
+        waiting += [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    found = {n: function.__globals__[n] for n in names if n in function.__globals__}
+    found |= inspect.getclosurevars(function).nonlocals
+    modules = [v for v in found.values() if isinstance(v, types.ModuleType)]
+    while modules:
+        module = modules.pop()
+        if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
+            for name in names & set(vars(module)):
+                member = getattr(module, name)
+                found[f"{module.__name__}.{name}"] = member
+                modules += [member] if isinstance(member, types.ModuleType) else []
     return found

@@ -63,7 +63,7 @@ def write_kernel(cell: Cell, neighbourhood: Neighbourhood, wanted: Wanted) -> st
 
 
 def _number(value: float, wanted: Wanted) -> str:
-    return f"float32({value!r})" if wanted.single else repr(float(value))
+    return f"float32({float(value)!r})" if wanted.single else repr(float(value))
 
 
 def _parameters(name: str, names: tuple[str, ...], source: str) -> str:
@@ -134,7 +134,8 @@ def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -
     zero = _number(0.0, wanted)
     if wanted.reference:
         a, b = cell.vectors
-        for c, at, along, across in zip("XY", cell.sites[s].at, a, b, strict=False):
+        for c, *numbers in zip("XY", cell.sites[s].at, a, b, strict=False):
+            at, along, across = map(float, numbers)
             out.add(
                 3, f"{c} = {at!r} + ((i + first[0]) * {along!r} + (j + j0 + first[1]) * {across!r})"
             )

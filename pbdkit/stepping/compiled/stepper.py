@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numba
@@ -31,7 +30,7 @@ class CompiledStepper(Engine):
     name = "compiled"
 
     def __init__(self, scene: Scene, threads: int = 1) -> None:
-        self.threads = min(threads, os.cpu_count() or 1)
+        self.threads = min(threads, int(vars(numba.config)["NUMBA_NUM_THREADS"]))
         self._scene = scene
         self._bits = bits_for(scene)
         self._masks = presence_bits(scene, self._bits)
