@@ -1,0 +1,1 @@
+"""Speed against error: methods measured at sizes, each in a process of its own."""

@@ -1,0 +1,92 @@
+"""All measurements of docs/performance.md: `python tests/benchmarks`, from the repository's root.
+
+Writes docs/performance.json and the tables of docs/performance.md. `--only goals threads` measures
+parts again and keeps the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import document
+import numba
+import numpy as np
+from cost import cost
+from engines import engines, limit, threads
+from goals import all_goals
+from peers import peers
+
+from pbdkit.benching.method import processors
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def goals() -> list[dict[str, Any]]:
+    found = []
+    for goal in all_goals():
+        sign = "<=" if goal.at_most else ">="
+        verdict = "met" if goal.met else "NOT MET"
+        print(f"{goal.name}: {goal.measured:.3g}, goal {sign} {goal.goal:g}: {verdict}", flush=True)
+        found.append(asdict(goal) | {"met": goal.met})
+    return found
+
+
+PARTS = {
+    "goals": goals,
+    "limit": limit,
+    "threads": threads,
+    "cost": cost,
+    "engines": engines,
+    "peers": peers,
+}
+
+
+def machine() -> dict[str, Any]:
+    names = (
+        [
+            line.partition(":")[2].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
+        ]
+        if Path("/proc/cpuinfo").exists()
+        else [platform.processor()]
+    )
+    return {
+        "date": datetime.date.today().isoformat(),
+        "processor": names[0],
+        "processors": processors(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "load": os.getloadavg()[0],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    chosen = parser.parse_args().only
+    file, page = DOCS / "performance.json", DOCS / "performance.md"
+    data = json.loads(file.read_text()) if file.exists() else {}
+    data["machine"] = machine()
+    for name in chosen:
+        begun = time.perf_counter()
+        data[name] = PARTS[name]()
+        print(f"-- {name}: {time.perf_counter() - begun:.0f} s", flush=True)
+        if name != "goals":
+            print(document.TABLES[name](data[name]), flush=True)
+        data["machine"]["load_after"] = os.getloadavg()[0]
+        file.write_text(json.dumps(data, indent=1) + "\n")
+    if page.exists():
+        document.refresh(page, data)
+
+
+main()

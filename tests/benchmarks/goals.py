@@ -1,0 +1,134 @@
+"""The rows of the goal table: each measures one ratio, in one run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from bare import sweeping
+from fresh import bytes_a_particle
+from pairing import Ratio, ratio, wait_for_quiet
+from recording import recording
+from sheets import (
+    DISTANCE,
+    ELASTIC,
+    FRACTURE,
+    OWN,
+    Afresh,
+    Everywhere,
+    Running,
+    Sharing,
+    moving,
+    pulled,
+)
+
+BUSY = "measured while other programs computed: the second processor was not free"
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A goal with what was measured. `at_most` tells on which side of `goal` it is met."""
+
+    name: str
+    goal: float
+    at_most: bool
+    measured: float
+    low: float
+    high: float
+    unit: str
+    note: str
+
+    @property
+    def met(self) -> bool:
+        return self.measured <= self.goal if self.at_most else self.measured >= self.goal
+
+
+def at_most(name: str, goal: float, found: Ratio, note: str = "", unit: str = "×") -> Goal:
+    return Goal(name, goal, True, found.value, found.low, found.high, unit, note)
+
+
+def at_least(name: str, goal: float, found: Ratio, note: str = "") -> Goal:
+    return Goal(name, goal, False, found.value, found.low, found.high, "×", note)
+
+
+def all_goals() -> Iterator[Goal]:
+    for rows in (against_bare, threads, reach, third_party, record, memory, start_up):
+        yield from rows()
+
+
+def against_bare() -> Iterator[Goal]:
+    steps, size = 20, 1000
+    bare = sweeping(size, steps)
+    for name, goal, parts in (
+        ("barycentre, 1000², 4 neighbours, all in motion, against the bare sweep", 1.2, {}),
+        ("distance-weighted against the bare barycentre sweep", 1.6, DISTANCE),
+        ("irreversible fracture against the bare barycentre sweep", 1.4, FRACTURE),
+        ("elastic 2×2 weights, 8 neighbours, against the bare barycentre sweep", 1.5, ELASTIC),
+    ):
+        found = ratio(Running(moving(size, **parts), steps), bare, 11)
+        note = f"{found.first_s / steps / size**2 * 1e9:.2f} ns a particle and step against "
+        yield at_most(name, goal, found, note + f"{found.second_s / steps / size**2 * 1e9:.2f}")
+
+
+def threads() -> Iterator[Goal]:
+    one, two = (Running(moving(3000, **DISTANCE), 4, threads=n) for n in (1, 2))
+    quiet = wait_for_quiet()
+    # Many turns: in some of them, hopefully, nobody else wants the second processor.
+    found = ratio(one, two, 41)
+    yield at_least(
+        "two threads against one, 3000², distance-weighted", 1.7, found, "" if quiet else BUSY
+    )
+
+
+def reach() -> Iterator[Goal]:
+    reached, everything = Afresh(pulled(1000), 200), Afresh(pulled(1000), 200)
+    everything.engine._reach = Everywhere(everything.engine._reach)
+    found = ratio(everything, reached, 7)
+    assert (reached.state.u == everything.state.u).all()
+    name = "leaders at one edge, 1000², first 200 steps: the sweep of everything against pbdkit"
+    yield at_least(name, 12, found, "the same numbers to the last bit")
+
+
+def third_party() -> Iterator[Goal]:
+    # On one and the same arrays: where arrays happen to lie in memory makes several per cent.
+    own, built_in = Running(moving(1000, **OWN), 40), Running(moving(1000), 40)
+    found = ratio(Sharing(own, own), Sharing(own, built_in), 15)
+    yield at_most("a third-party rule against the built-in of the same arithmetic", 1.05, found)
+
+
+def record() -> Iterator[Goal]:
+    found, note = recording(1000, 200, 10)
+    name = "recording every 10th step of 1000² against raw writing and the stepping"
+    yield at_most(name, 1.3, found, note)
+
+
+def memory() -> Iterator[Goal]:
+    found, note = bytes_a_particle(3000)
+    name = "memory a particle, 3000², only the end recorded, output included"
+    yield Goal(name, 120, True, found, found, found, "B", note)
+
+
+def start_up() -> Iterator[Goal]:
+    program = str(Path(sys.executable).with_name("pbdkit"))
+    with tempfile.TemporaryDirectory() as folder:
+        out = str(Path(folder) / "a.nc")
+        for name, goal, call in (
+            ("pbdkit --help", 2, [program, "--help"]),
+            ("pbdkit check paper/a", 5, [program, "check", "paper/a"]),
+            ("pbdkit run paper/a", 10, [program, "run", "paper/a", "-o", out, "--force"]),
+        ):
+            found = _processes(call, [sys.executable, "-c", "import numpy"], 20)
+            note = f"{found.first_s * 1e3:.0f} ms against {found.second_s * 1e3:.0f} ms"
+            yield at_most(f'`{name}` against `python -c "import numpy"`', goal, found, note)
+
+
+def _processes(first: list[str], second: list[str], turns: int) -> Ratio:
+    return ratio(_process(first), _process(second), turns)
+
+
+def _process(call: list[str]) -> Callable[[], object]:
+    return lambda: subprocess.run(call, check=True, capture_output=True)

@@ -1,0 +1,143 @@
+"""The sheets that are stepped, and rules as a third party writes them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+import pbdkit
+from pbdkit.experiment.source import Source
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.state import initial_state
+
+
+class OwnBarycentre(pbdkit.FollowerRule):
+    """The barycentre, from outside."""
+
+    type: Literal["own-barycentre"] = "own-barycentre"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y, r.x, r.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        dx, dy, rx, ry, n = total
+        return (dx + rx) / n, (dy + ry) / n
+
+
+class OwnElastic(pbdkit.FollowerRule):
+    """Plane-stress elasticity on the square lattice with eight neighbours: 2×2 weights a slot.
+
+    The weights' sum is the identity and rest offsets cancel, so the move is Σ W d.
+    """
+
+    type: Literal["own-elastic"] = "own-elastic"
+    poisson_ratio: float = 0.3
+
+    def weights(self, slot: pbdkit.Slot) -> tuple[float, ...]:
+        nu = self.poisson_ratio
+        x, y = np.sign(slot.rest.x), np.sign(slot.rest.y)
+        if x and y:
+            w = (1 + nu) / (4 * (5 - 3 * nu))
+            return (w, w * x * y, w * x * y, w)
+        along, across = ((3 - nu) / (2 * (5 - 3 * nu)), (1 - 3 * nu) / (2 * (5 - 3 * nu)))
+        return (along, 0.0, 0.0, across) if x else (across, 0.0, 0.0, along)
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return w[0] * d.x + w[1] * d.y, w[2] * d.x + w[3] * d.y
+
+    @staticmethod
+    def apply(total, here, p):
+        return total
+
+
+HOLD = {"type": "hold"}
+DISTANCE = {
+    "rule": {"type": "distance-weighted"},
+    "solver": {"type": "stepping", "relaxation": 0.6},
+}
+ELASTIC = {"rule": {"type": "own-elastic"}, "neighbours": {"type": "chebyshev", "shells": 1}}
+FRACTURE = {"fracture": {"type": "threshold", "thresholds": [3.0]}}
+OWN = {"rule": {"type": "own-barycentre"}}
+
+
+def moving(size: int, **parts: Any) -> dict[str, Any]:
+    """A square sheet in which everything moves, both ends held."""
+    sheet = {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": size, "rows": size},
+        "rule": {"type": "barycentre"},
+        "initial": {"type": "noise", "amplitude": 0.01},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": HOLD},
+            {"select": {"edge": "right"}, "motion": HOLD},
+        ],
+        "steps": 10**6,
+        "record": {"every": 10**6},
+    }
+    return sheet | parts
+
+
+def pulled(size: int) -> dict[str, Any]:
+    """The same at rest, pulled at its right edge for ten steps."""
+    pull = {"type": "velocity", "velocity": [0.35, 0.0], "steps": 10}
+    leaders = [{"select": {"edge": "right"}, "motion": pull, "until": 10}]
+    return moving(size, leaders=leaders, initial={"type": "reference"})
+
+
+def scene_of(parts: dict[str, Any]):
+    source = Source(data=parts)
+    own = [OwnBarycentre, OwnElastic]
+    return build_scene(pbdkit.Experiment.build(source, own))
+
+
+class Running:
+    """A sheet under way; a call makes so many steps more."""
+
+    def __init__(self, parts: dict[str, Any], steps: int, threads: int = 1, engine: Any = None):
+        self.scene = scene_of(parts)
+        self.engine = engine(self.scene) if engine else CompiledStepper(self.scene, threads)
+        self.state = initial_state(self.scene)
+        self.steps = steps
+
+    def __call__(self) -> None:
+        self.state = self.engine.advance(self.state, self.steps)
+
+
+class Afresh(Running):
+    """A call runs the sheet from its beginning."""
+
+    def __call__(self) -> None:
+        self.state = initial_state(self.scene)
+        super().__call__()
+
+
+class Sharing:
+    """A call steps the state of one sheet with the engine of another."""
+
+    def __init__(self, whose: Running, by: Running):
+        self.whose, self.by = whose, by
+
+    def __call__(self) -> None:
+        self.whose.state = self.by.engine.advance(self.whose.state, self.by.steps)
+
+
+class Everywhere:
+    """Stands in for the compiled engine's reach: everything counts as reached from the start."""
+
+    def __init__(self, reach: Any):
+        self.blocks, self._everything = reach.blocks, reach._everything
+        self.begin()
+
+    def begin(self, *state: Any) -> None:
+        self.box, self.growth = self._everything.copy(), np.zeros(4, np.int64)
+
+    def before(self, led: Any, count: int) -> int:
+        return count
+
+    forget = after = begin
