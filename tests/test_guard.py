@@ -77,10 +77,10 @@ def test_a_far_start_and_a_released_leader_are_no_divergence():
 def test_groups_that_contradict_each_other_from_where_they_stand_are_refused():
     start = {"type": "affine", "gradient": [[0.0, 0.0], [0.0, 0.0]], "shift": [1.0, 0.0]}
     turn = {"type": "rotation", "centre": [0.0, 0.0], "angle": 5.0, "steps": 3}
-    one = {"numbers": [12]}
+    one = {"numbers": [10]}
     leaders = [{"select": one, "motion": turn}, {"select": one, "motion": {"type": "hold"}}]
-    with pytest.raises(pbdkit.ExperimentError, match="move particle 12 differently in step 1"):
+    with pytest.raises(pbdkit.ExperimentError, match="move particle 10 differently in step 1"):
         pbdkit.run(BLOWN | {"initial": start, "leaders": leaders}, progress=False)
-    leaders[0]["motion"] = turn | {"centre": [1.0, 0.0]}  # where number 12 stands: it does not move
+    leaders[0]["motion"] = turn | {"centre": [1.0, 0.0]}  # where number 10 stands: it does not move
     ds = pbdkit.run(BLOWN | {"initial": start, "leaders": leaders, "steps": 5}, progress=False)
     assert ds.attrs["status"] == "complete"
