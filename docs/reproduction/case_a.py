@@ -3,18 +3,12 @@
 import numpy as np
 from claims import Claim, Section
 from drawing import configurations, histories, numbered
-from runs import Floats, run
+from fits import both, both_text, fit_quality, parabolic
+from runs import run
 
 LEFT_OF_MIDDLE, ABOVE = 4, 5
 """Particle 67: column 5 and row 6 of the body, counted from 0 here."""
 MIRROR = "frame={type: mirror}"
-
-
-def fit_quality(y: Floats, degree: int) -> float:
-    """R² of a polynomial fitted to a series."""
-    x = np.arange(len(y))
-    rest = y - np.polyval(np.polyfit(x, y, degree), x)
-    return float(1 - rest.var() / y.var())
 
 
 def section() -> Section:
@@ -118,9 +112,8 @@ def _energy() -> list[Claim]:
     at_9 = pe1[9].mean(axis=1)
     peak = int(pe1[:, LEFT_OF_MIDDLE, ABOVE].argmax())
     fall = pe1[peak:, LEFT_OF_MIDDLE, ABOVE]
-    parabola = fit_quality(fall, 2)
-    tail = pe1[150:, LEFT_OF_MIDDLE, ABOVE]
-    decay = fit_quality(np.log(tail), 1)
+    of_67 = pe1[:, LEFT_OF_MIDDLE, ABOVE]
+    tail = of_67[150:]
     ratio = text.of("pe1")[9, 8, 5] / pe1[9, 8, 5]
     peaks = {c + 1: int(pe1[:, c, ABOVE].argmax()) for c in (2, 4, 6, 8)}
     widths = {c: int((pe1[:, c - 1, ABOVE] > pe1[:, c - 1, ABOVE].max() / 2).sum()) for c in peaks}
@@ -151,10 +144,11 @@ def _energy() -> list[Claim]:
         ),
         Claim(
             "decrease in quite a parabolic-like way",
-            f"a parabola fits the fall after step {peak} with R² = {parabola:.3f}; from step 150 "
-            f"on an exponential fits with R² = {decay:.5f}: PE1 falls by a constant share a step, "
-            f"{1 - tail[1] / tail[0]:.1%} at step 150, {1 - tail[-1] / tail[-2]:.1%} at the end",
-            parabola > 0.99,
+            f"{both_text(of_67, peak)}. In the end PE1 falls by a constant share a step, "
+            f"{1 - tail[1] / tail[0]:.1%} at step 150, {1 - tail[-1] / tail[-2]:.1%} at the last",
+            parabolic(both(of_67, peak, 400)),
+            f"steps {peak} to 150 of the fall",
+            parabolic(both(of_67, peak, 150)),
         ),
         Claim(
             "similarity with Hooke's law where the energy is proportional to the square",
@@ -177,11 +171,10 @@ def _history() -> list[Claim]:
     start, top = int(np.flatnonzero(x)[0]), int(x.argmax())
     speed = np.diff(x)[start - 1 : top]
     rise = fit_quality(x[start : top + 1], 1)
-    fall = x[top:]
     turns = int((np.diff(np.sign(np.diff(x[start:]))) != 0).sum())
     swing = run("paper/a-memory").u[:, LEFT_OF_MIDDLE, ABOVE, 0]
     crossings = int((np.diff(np.sign(swing[20:200])) != 0).sum())
-    tail = x[150:]
+    whole = both(x, top, 400)
     return [
         Claim(
             "x increases linearly (velocity is constant), after a delay",
@@ -192,10 +185,11 @@ def _history() -> list[Claim]:
         ),
         Claim(
             "later decrease with parabolic like behaviour to the original position",
-            f"a parabola fits the fall after step {top} with R² = {fit_quality(fall, 2):.3f}, an "
-            f"exponential from step 150 on with R² = {fit_quality(np.log(tail), 1):.5f}; "
-            f"{x[400]:.3f} is left of {x[top]:.3f} at step 400",
-            fit_quality(fall, 2) > 0.99,
+            f"{both_text(x, top)}. Over the whole fall they differ by "
+            f"{abs(whole[1] - whole[0]):.0e}; {x[400]:.3f} is left of {x[top]:.3f} at step 400",
+            parabolic(whole),
+            f"steps {top} to 150 of the fall",
+            parabolic(both(x, top, 150)),
         ),
         Claim(
             "no oscillation can be observed with this kind of rule",

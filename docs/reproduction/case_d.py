@@ -63,6 +63,7 @@ def _line() -> list[Claim]:
         label: [t for t, sheet in sheets.items() if edges_first(parted(sheet))]
         for label, sheets in swept.items()
     }
+    share = {n: f"{len(first[n])} of {len(swept[n])} thresholds" for n in swept}
     found = "; ".join(
         f"{label}: {len(first[label])} of {len(swept[label])}"
         + (f" ({', '.join(f'{t:g}' for t in first[label])})" if first[label] else "")
@@ -90,20 +91,22 @@ def _line() -> list[Claim]:
             f"`paper/d1`: {rows['1']}, all at once; `paper/d1-lag`: {rows['lag']}. Thresholds "
             f"from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} at which all rows part, and among them "
             f"those at which the edges do first: {found}",
-            edges_first(parted(one)),
-            "`paper/d1-lag`, in windows of the threshold",
+            len(first["one shell"]) == len(swept["one shell"]),
+            f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),
         ),
         Claim(
             "points close to the frame are detached before the others [second gradient]",
-            f"`paper/d2`: {rows['2']}, at this threshold",
+            f"`paper/d2`: {rows['2']}; at {share['two shells']} that were tried in all, and with "
+            f"24 neighbours at {share['24 neighbours']}",
+            len(first["two shells"]) == len(swept["two shells"]),
+            f"`paper/d2`, at {share['two shells']}",
             edges_first(parted(two)),
         ),
         Claim(
             "this effect is more marked in second gradient case",
             f"edge before the middle by {_lead(one)} steps with one shell, {_lead(two)} with two; "
-            f"at {len(first['one shell'])} of {len(swept['one shell'])} and "
-            f"{len(first['two shells'])} of {len(swept['two shells'])} thresholds",
+            f"at {share['one shell']} and {share['two shells']}",
             _lead(two) > _lead(one),
         ),
         Claim(

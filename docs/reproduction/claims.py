@@ -54,6 +54,6 @@ def counted(sections: list[Section]) -> str:
     only = sum(claim.verdict.startswith(ONLY) for claim in claims)
     out = sum(claim.verdict == OUT for claim in claims)
     return (
-        f"Of {len(claims)} claims {out} come out, {only} come out only with a named variant, "
+        f"Of {len(claims)} claims {out} come out, {only} come out only with what is named there, "
         f"and {len(claims) - out - only} do not come out."
     )

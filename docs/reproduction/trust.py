@@ -65,12 +65,13 @@ def _meaning() -> list[str]:
     return [
         "**A second shell is not a second gradient.** Along x eight neighbours act as four that "
         f"are 1.5 times as fast (relative stiffness of the wave k = 1: {eight:.4f} and "
-        f"{four:.4f}); 24 soften short waves ({soft:.3f}); gradient elasticity stiffens them.",
+        f"{four:.4f}); 24 soften short waves more ({soft:.3f}). Gradient elasticity with a "
+        "positive l² in its energy stiffens them; an expansion of a lattice may have l² < 0.",
         "**It is diffusion.** Each coordinate diffuses for itself; nothing happens k layers away "
         "before step k, and an equilibrium takes a number of steps that grows with the square of "
         "the size. PE1 of 67 peaks at step "
         f"{int(run('paper/a').of('pe1')[:, 4, 5].argmax())}, long after the release at step 10, "
-        "and the fall is exponential, not parabolic.",
+        "and its fall is exponential rather than parabolic.",
         "**Saint-Venant's principle is not verified by case e.** At its time 9 the rim has "
         f"{rim_share(e, 8):.1%} of the leaders' motion because the disturbance has hardly arrived; "
         f"at step 400 it has {rim_share(e, 400):.1%}.",

@@ -32,7 +32,7 @@ Parts = list[tuple[Indices, Indices, Floats]]
 
 @dataclass(frozen=True)
 class StepOperator:
-    """One step, linearised at a state, for fixed roles.
+    """One step, linearised at a state, for fixed roles and leaders that stand still.
 
     `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
     2n + 1 its y, and the same for leaders.
