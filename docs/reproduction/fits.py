@@ -1,0 +1,50 @@
+"""A parabola against an exponential, over the same steps and with as many free parameters."""
+
+import numpy as np
+from runs import Floats
+from scipy.optimize import minimize_scalar
+
+
+def fit_quality(y: Floats, degree: int) -> float:
+    """R² of a polynomial fitted to a series."""
+    x = np.arange(len(y))
+    return _r_squared(y, np.polyval(np.polyfit(x, y, degree), x))
+
+
+def exponential_quality(y: Floats) -> float:
+    """R² of c + A exp(-r t) fitted to a series: three free parameters, as a parabola has."""
+    t = np.arange(len(y))
+
+    def fitted(log_rate: float) -> Floats:
+        basis = np.stack([np.exp(-np.exp(log_rate) * t), np.ones(len(t))], axis=1)
+        return np.asarray(basis @ np.linalg.lstsq(basis, y)[0])
+
+    def loss(log_rate: float) -> float:
+        return -_r_squared(y, fitted(log_rate))
+
+    return -float(minimize_scalar(loss, bounds=(np.log(1e-5), np.log(0.5)), method="bounded").fun)
+
+
+def both(y: Floats, first: int, last: int) -> tuple[float, float]:
+    """R² of a parabola and of an exponential over the steps first to last."""
+    part = y[first : last + 1]
+    return fit_quality(part, 2), exponential_quality(part)
+
+
+def parabolic(pair: tuple[float, float]) -> bool:
+    """Whether the parabola fits well, and no worse than the exponential."""
+    return pair[0] > 0.99 and pair[0] >= pair[1]
+
+
+def both_text(y: Floats, top: int, middle: int = 150, last: int = 400) -> str:
+    """Both R² over the whole fall and its two parts, in words."""
+    parts = ((top, last), (top, middle), (middle, last))
+    return "R² of a parabola and of an exponential of as many free parameters: " + "; ".join(
+        f"{p:.5f} and {e:.5f} over steps {low} to {high}"
+        for low, high in parts
+        for p, e in [both(y, low, high)]
+    )
+
+
+def _r_squared(y: Floats, fitted: Floats) -> float:
+    return float(1 - ((y - fitted) ** 2).sum() / ((y - y.mean()) ** 2).sum())
