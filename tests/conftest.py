@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from hypothesis import settings
 
 import pbdkit
 from pbdkit.cli import main
 from pbdkit.scene.scene import Scene, build_scene
+
+# The same random scenes in every run that decides about landing; elsewhere new ones each time.
+settings.register_profile("landing", derandomize=True)
+if os.environ.get("CI"):
+    settings.load_profile("landing")
 
 Build = Callable[..., Scene]
 Refused = Callable[..., str]
