@@ -1,7 +1,8 @@
 """Writes the source of a scene's kernel: one sweep a sublattice, and the loop over steps.
 
 Rest offsets and steps to neighbours are literals, so that what cancels at rest folds away; what
-varies from run to run (parameters, thresholds, places) are arguments.
+varies from run to run (the rule's parameters, thresholds, places) are arguments. Those of fracture
+are literals too: they decide what is to be computed at all.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Wanted:
     parallel: bool
     single: bool
     rule_parameters: tuple[str, ...]
-    fracture_parameters: tuple[str, ...]
+    fracture_parameters: dict[str, float]
     weights: dict[Slot, tuple[float, ...]]
 
 
@@ -76,9 +77,10 @@ def _write_sweep(
 ) -> None:
     out.add(0, "", "", '@njit(error_model="numpy")')
     out.add(0, f"def sweep_{s}(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(2, "step, i0, i1, j0, j1, rule, fracture, solver, first):")
+    out.add(2, "step, i0, i1, j0, j1, rule, solver, first):")
     out.add(1, f"p = {_parameters('Rule', wanted.rule_parameters, 'rule')}")
-    out.add(1, f"q = {_parameters('Fracture', wanted.fracture_parameters, 'fracture')}")
+    values = "".join(f"{_number(v, wanted)}, " for v in wanted.fracture_parameters.values())
+    out.add(1, f"q = Fracture({values})")
     out.add(1, "for i in range(i0, i1):")
     for c in "xy":
         out.add(2, f"h{c} = u{c}[{s}, i, j0:j1]", f"o{c} = v{c}[{s}, i, j0:j1]")
@@ -176,7 +178,7 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
     out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
     out.add(2, "step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,")
-    out.add(2, "points, entries, bodies, weights, rule, fracture, solver, first):")
+    out.add(2, "points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
     body = Writer()
     body.add(
@@ -197,7 +199,7 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
             f"j0, j1 = max(blocks[{s}, 2], box[2]), min(blocks[{s}, 3], box[3])",
             "if i0 < i1 and j0 < j1:",
         )
-        tail = "j0, j1, rule, fracture, solver, first)"
+        tail = "j0, j1, rule, solver, first)"
         if wanted.parallel:
             body.add(1, "for c in prange(chunks):")
             body.add(2, "a, b = i0 + (i1 - i0) * c // chunks, i0 + (i1 - i0) * (c + 1) // chunks")

@@ -82,7 +82,7 @@ class CompiledStepper(Engine):
             self._scene.raster.kind, broken, c["limits"], state.step, count, self._reach.blocks,
             self._reach.box, self._reach.growth, 4 * self.threads, places, values[0], values[1],
             kept[0], kept[1], c["points"], c["entries"], c["bodies"], c["weights"], c["rule"],
-            c["fracture"], c["solver"], c["first"],
+            c["solver"], c["first"],
         )  # fmt: skip
 
     def _compile(self) -> None:
@@ -116,7 +116,7 @@ class CompiledStepper(Engine):
             parallel=self.threads > 1,
             single=solver.precision == "float32",
             rule_parameters=constants.rule._fields,
-            fracture_parameters=constants.fracture._fields,
+            fracture_parameters=constants.fracture._asdict(),
             weights=constants.weights,
         )
 
@@ -144,7 +144,6 @@ class CompiledStepper(Engine):
             "bodies": frame.body_place if frame else none,
             "weights": (frame.map.weight if frame else np.empty(0)).astype(number),
             "rule": np.array([*constants.rule, 0.0], number),
-            "fracture": np.array([*constants.fracture, 0.0], number),
             "solver": np.array([solver.relaxation, solver.memory], number),
             "first": np.array(scene.raster.first, np.int64),
         }
