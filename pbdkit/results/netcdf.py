@@ -116,6 +116,8 @@ class NetcdfSink(Sink):
         variable = self._file.createVariable(
             column.name, dtype, column.dims, chunksizes=chunks, fill_value=False, **packed
         )
+        if column.grows:  # whole chunks go to the file as they are: a cache would only copy them
+            variable.set_var_chunk_cache(size=1024, nelems=1, preemption=0.0)
         variable.setncatts(column.attributes)
         if "particle" in column.dims and not column.coordinate:
             variable.coordinates = "number"
