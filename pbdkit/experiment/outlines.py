@@ -88,7 +88,7 @@ class Polygon(Body):
             raise ValueError("a vertex lies beyond 1e100")
         outline = self._outline()
         if not outline.is_valid or outline.area == 0.0:
-            reason = explain_validity(outline) if outline.area else "no area"
+            reason = "no area" if outline.is_valid else explain_validity(outline)
             raise ValueError(f"the polygon is not simple: {reason}")
         return self
 
