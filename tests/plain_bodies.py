@@ -1,4 +1,4 @@
-"""The bodies of model.md section 3 and contract.md in plain loops (see plain_loops.py).
+"""The bodies of docs/model.md, section 3, in plain loops (see plain_loops.py).
 
 Every outline is told by its depth at a point: positive inside, negative outside, 0 on it, and near
 it the distance to it (at a corner no more than a factor short of it). A grid has no outline: its

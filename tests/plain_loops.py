@@ -1,10 +1,10 @@
-"""The lattice model of model.md in plain loops: slow, independent, a test oracle.
+"""The lattice model of docs/model.md in plain loops: slow, independent, a test oracle.
 
-Written from model.md alone, in positions x (not displacements), sharing no code with the package.
+Written from docs/model.md alone, in positions x (not displacements), sharing no code with the package.
 Sections of model.md: 1 numbering and kinds, `build_body`, `leads`; 2 lattices and 4 neighbours,
 plain_lattice.py, and `neighbours_now` where they are re-evaluated; 3 bodies, plain_bodies.py;
 5 the step and the rules, `simulate`, plain_motions.py, `move_follower`, `rule_target`; 6 fracture,
-`too_long`, `seen_place`, and the cracks of contract.md, `crosses`; 7 the frame, `framed`,
+`too_long`, `seen_place`, and its cracks, `crosses`; 7 the frame, `framed`,
 `mirrored`, `frame_position`; 8 diagnostics, `pe1`, `simulate`.
 """
 
@@ -365,7 +365,7 @@ def pe1(body: Body, j: int, x: list[Point], left_out: set[Bond]) -> float:
 
 
 def simulate(experiment: Part) -> Part:
-    """Runs an experiment (contract.md, as a dict) and returns every step of it in plain lists."""
+    """Runs an experiment (as in a file, a dict) and returns every step of it in plain lists."""
     experiment = completed(experiment)
     fracture, lag, steps = experiment["fracture"], experiment["frame"]["lag"], experiment["steps"]
     body = build_body(experiment)

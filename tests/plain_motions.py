@@ -1,4 +1,4 @@
-"""The motions of contract.md in plain loops (see plain_loops.py); model.md section 5.1."""
+"""The motions in plain loops (see plain_loops.py); model.md section 5.1."""
 
 import math
 from itertools import pairwise
