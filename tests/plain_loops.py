@@ -1,6 +1,6 @@
 """The lattice model of docs/model.md in plain loops: slow, independent, a test oracle.
 
-Written from docs/model.md alone, in positions x (not displacements), sharing no code with the package.
+Written from docs/model.md alone, in positions x (not displacements), sharing no code with pbdkit.
 Sections of model.md: 1 numbering and kinds, `build_body`, `leads`; 2 lattices and 4 neighbours,
 plain_lattice.py, and `neighbours_now` where they are re-evaluated; 3 bodies, plain_bodies.py;
 5 the step and the rules, `simulate`, plain_motions.py, `move_follower`, `rule_target`; 6 fracture,
