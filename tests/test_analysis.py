@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import HealthCheck, assume, given, settings
 from property_cases import LATTICES, RULES
 from scene_strategies import experiments
@@ -13,6 +14,7 @@ import pbdkit
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.symbol import wave_bound
+from pbdkit.cli import program
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
@@ -209,25 +211,15 @@ def test_predictions_for_shipped_experiments_are_borne_out(name):
     assert predicted.get("stable", True)
 
 
-def test_a_run_that_can_diverge_is_warned_of_with_the_bound_and_says_so_in_the_dataset():
-    from click.testing import CliRunner
-
-    from pbdkit.cli import program
-
-    with CliRunner().isolated_filesystem():
-        arguments = [
-            "run",
-            "paper/b",
-            "--set",
-            "solver.relaxation=1.2",
-            "--set",
-            "rule={type: barycentre}",
-        ]
-        result = CliRunner().invoke(program, [*arguments, "--set", "steps=5"])
-        assert "solver.relaxation: 1.2 can diverge" in result.output
-        assert "stable below 1" in result.output
-        with pbdkit.open("paper-b.nc") as ds:
-            assert json.loads(ds.attrs["prediction"])["stable"] is False
+def test_a_run_that_can_diverge_is_warned_of_and_says_so_in_the_dataset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    changes = ["solver.relaxation=1.2", "rule={type: barycentre}", "steps=5"]
+    arguments = [word for change in changes for word in ("--set", change)]
+    result = CliRunner().invoke(program, ["run", "paper/b", *arguments])
+    assert "solver.relaxation: 1.2 can diverge" in result.output
+    assert "stable below 1" in result.output
+    with pbdkit.open("paper-b.nc") as ds:
+        assert json.loads(ds.attrs["prediction"])["stable"] is False
 
 
 class Hypotenuse(pbdkit.FollowerRule):

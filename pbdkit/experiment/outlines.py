@@ -110,7 +110,8 @@ class Polygon(Body):
         shapely.prepare(outline)
         inside = shapely.contains_xy(outline, at.x, at.y)
         to_boundary = shapely.distance(outline.boundary, shapely.points(at.x, at.y))
-        return np.where(inside, -to_boundary, to_boundary)
+        signed: Floats = np.where(inside, -to_boundary, to_boundary)
+        return signed
 
 
 class Dogbone(Body):
