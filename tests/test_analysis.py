@@ -282,3 +282,22 @@ def test_where_everybody_leads_there_is_nothing_to_analyse():
     assert analysis.stable
     assert len(analysis.operator.followers) == 0
     assert analysis.warnings() == []
+
+
+def test_a_particle_without_neighbours_stays_whatever_the_memory():
+    """It has the eigenvalue 1 of the rule's own step, and no other."""
+    body = {
+        "type": "union",
+        "of": [
+            {"type": "grid", "columns": 6, "rows": 5},
+            {"type": "rectangle", "width": 0.5, "height": 0.5, "origin": [19.8, 1.8]},
+        ],
+    }
+    parts = {"rule": {"type": "mean-displacement"}, "frame": {"type": "none"}, "body": body}
+    solver = {"type": "stepping", "relaxation": 0.4, "memory": 0.5}
+    leaders = [{"select": {"box": [-1, -1, 0.5, 9]}, "motion": {"type": "hold"}}]
+    plain = pbdkit.analyse(sheet(leaders=leaders, **parts))
+    remembering = pbdkit.analyse(sheet(leaders=leaders, solver=solver, **parts))
+    assert remembering.smallest_eigenvalue == pytest.approx(plain.smallest_eigenvalue, abs=1e-12)
+    assert remembering.spectral_radius == pytest.approx(1.0, abs=1e-12)
+    assert remembering.parts_without_leader == plain.parts_without_leader

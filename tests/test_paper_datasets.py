@@ -3,39 +3,16 @@
 import json
 import subprocess
 import sys
-from functools import cache
 
 import numpy as np
 import pytest
 import xarray
+from paper_cases import FOLLOWER, FRAME, LEADER, TORN, every_case, moved, run
 
 import pbdkit
 from pbdkit.results.netcdf import NetcdfSink
 from pbdkit.running import run_into
 from pbdkit.scene.scene import build_scene
-
-CASES = ["a", "a-text", "b", "c", "d1", "d2", "e", "f1", "f2", "g"]
-TORN = ["d1", "d2", "f1", "f2", "g"]
-every_case = pytest.mark.parametrize("case", CASES)
-LEADER, FOLLOWER, FRAME = 0, 1, 2
-
-
-@cache
-def run(case):
-    """The dataset of a shipped experiment; one run serves all tests, none changes it."""
-    return pbdkit.run(f"paper/{case}", progress=False)
-
-
-def moved(case):
-    """u, (time, particle, axis)."""
-    ds = run(case)
-    return (ds.position - ds.reference).transpose("time", "particle", "axis")
-
-
-def track_x(case, number):
-    """The x displacement of one particle at every step."""
-    return moved(case).sel(particle=number, axis="x").values
-
 
 BASE = {
     "time": (("time",), "int64"),

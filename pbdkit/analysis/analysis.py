@@ -54,13 +54,15 @@ class Analysis:
             return None
         if solver.relaxation == 1.0 and solver.memory == 0.0:
             return self.spectrum
-        now = self.operator.entries_now
-        every = np.arange(now.shape[0])
-        own = 1.0 - (1.0 + solver.memory) / solver.relaxation
+        # With no lag `before` is -b where particles move, so that the sum has no memory left.
+        now, before = self.operator.entries_now, self.operator.entries_before
+        every, share = np.arange(now.shape[0]), 1.0 / solver.relaxation
         rule = Entries(
-            np.concatenate([now.rows, every]),
-            np.concatenate([now.columns, every]),
-            np.concatenate([now.values / solver.relaxation, np.full(len(every), own)]),
+            np.concatenate([now.rows, before.rows, every]),
+            np.concatenate([now.columns, before.columns, every]),
+            np.concatenate(
+                [share * now.values, share * before.values, np.full(len(every), 1.0 - share)]
+            ),
             now.shape,
         )
         return spectrum(rule.matrix())

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ def _do(job: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def _import_engine(experiment: Experiment) -> None:
     if experiment.solver.engine == "compiled":
-        import pbdkit.stepping.compiled.stepper  # noqa: F401
+        import_module("pbdkit.stepping.compiled.stepper")
 
 
 def _first_run(scene: Scene, engine: Engine, folder: Path) -> float:

@@ -41,7 +41,7 @@ def closed_part(base: type[Component], *members: type[Component]) -> BeforeValid
 
     return BeforeValidator(
         lambda value, info: _build(value, base, find, info),
-        json_schema_input_type=Union[members],  # noqa: UP007
+        json_schema_input_type=Union[members],  # noqa: UP007 (there is no `|` of a tuple)
     )
 
 

@@ -20,5 +20,5 @@ class Hooks:
     """What a plugin may implement, as functions of the module that its entry point names."""
 
     @hookspec
-    def pbdkit_components(self) -> list[type[Component]]:  # type: ignore[empty-body]
+    def pbdkit_components(self) -> list[type[Component]]:  # type: ignore[empty-body]  # a specification only
         """The component classes that the distribution offers."""

@@ -58,7 +58,7 @@ def _parts(version: Any) -> tuple[int, ...]:
     return tuple(int(part) for part in str(version).split("."))
 
 
-@xarray.register_dataset_accessor("pbd")  # type: ignore[no-untyped-call]
+@xarray.register_dataset_accessor("pbd")  # type: ignore[no-untyped-call]  # xarray's is untyped
 class PbdAccessor:
     """What pbdkit adds to a dataset: ``dataset.pbd.plot(...)``."""
 

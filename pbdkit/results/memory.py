@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,8 +40,7 @@ class MemorySink(Sink):
         """The dataset as in the file."""
         import xarray
 
-        import pbdkit.results.accessor  # noqa: F401, so that the dataset has `pbd`
-
+        import_module("pbdkit.results.accessor")  # gives every dataset its `pbd`
         variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
         coordinates = [c.name for c in self._columns if c.coordinate]
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -103,10 +104,8 @@ def figure(
 
 
 def _require_matplotlib() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise ExperimentError("pictures need matplotlib: pip install 'pbdkit[plot]'") from None
+    if find_spec("matplotlib") is None:
+        raise ExperimentError("pictures need matplotlib: pip install 'pbdkit[plot]'")
 
 
 def _look(dataset: xarray.Dataset, snapshots: list[Snapshot], numbers: bool) -> Look:
