@@ -1,6 +1,7 @@
 """A rule's answer to small displacements, from the rule's own functions and nothing else.
 
-Linear rules come out exactly, whatever the configuration; others linearised at a state.
+Linear rules come out exactly, whatever the configuration; others linearised at a state. At rest,
+particles with the same neighbours present answer alike, and one of each kind is asked.
 """
 
 from __future__ import annotations
@@ -12,51 +13,134 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
-from pbdkit.interfaces import Here, Slot, Vector
-from pbdkit.scene.raster import Block
+from pbdkit.interfaces import Here, Slot, Vector, where
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.raster import EMPTY, positions
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.state import State
-from pbdkit.stepping.sums import difference, planes, presence, sum_over_slots
+from pbdkit.stepping.sums import sum_over_slots
 
 Floats = NDArray[np.float64]
+Present = NDArray[np.bool_]
+Contributions = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class Response:
-    """The move of the followers of a block, linearised: ∂move/∂u_k for each slot and ∂move/∂u_j,
-    (row, column, axis of the move, axis of u), and the move itself, (row, column, axis)."""
+    """The move of some followers, linearised.
 
-    block: Block
+    ∂move/∂u_k for each slot and ∂move/∂u_j, (kind, axis of the move, axis of u), and the move
+    itself, (kind, axis); `kind` says for each follower which of the kinds it is, and `steps` how far
+    along the flat raster a slot reaches.
+    """
+
     neighbours: dict[Slot, Floats]
     own: Floats
     move: Floats
+    kind: Indices
+    steps: dict[Slot, int]
+
+    def of_each(self, values: Floats) -> Floats:
+        """The values of the kinds, for each follower; a view where there is one kind only."""
+        if len(values) == 1:
+            return np.broadcast_to(values[0], (len(self.kind), *values.shape[1:]))
+        return values[self.kind]
 
 
-def respond(scene: Scene, state: State, block: Block) -> Response:
-    """The response of a block's followers at a state."""
-    linearisation = _Linearisation(scene, state, block)
-    slots = scene.neighbourhood.slots[block.sublattice]
-    neighbours = {slot: linearisation.derivative(slot) for slot in slots}
-    return Response(block, neighbours, linearisation.derivative(None), linearisation.move())
+def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
+    """The response at a state of the followers at some flat places, all of one sublattice."""
+    slots = scene.neighbourhood.slots[sublattice]
+    steps = {slot: slot_step(scene, slot) for slot in slots}
+    kinds = np.arange(len(place))
+    if not scene.experiment.rule.uses_reference and not state.u.any():
+        kinds, place = _alike(scene, state, steps, place)
+    some = _Followers(scene, state, steps, place)
+    neighbours = {slot: some.derivative(slot) for slot in slots}
+    return Response(neighbours, some.derivative(None), some.move(), kinds, steps)
 
 
-class _Linearisation:
-    """The rule's chain of functions on a block, with differences that can be nudged."""
+def slot_step(scene: Scene, slot: Slot) -> int:
+    """From a flat place of the raster to that of the neighbour at a slot."""
+    _, m, n = scene.raster.shape
+    return ((slot.target - slot.source) * m + slot.cell[0]) * n + slot.cell[1]
 
-    def __init__(self, scene: Scene, state: State, block: Block) -> None:
+
+def _alike(
+    scene: Scene, state: State, steps: dict[Slot, int], place: Indices
+) -> tuple[Indices, Indices]:
+    """(kind, place): which kind each place is of, and one place of each; those of a kind have the
+    same neighbours and the same broken bonds."""
+    code = np.zeros(len(place), np.int64)
+    bonds = _Bonds(scene, state)
+    for slot, step in steps.items():
+        code = 2 * code + (scene.raster.kind.ravel()[place + step] == EMPTY)
+        if bonds.any_broken:
+            code = 2 * code + bonds.broken(slot, step, place)
+    if len(code) and (code == code[0]).all():
+        return np.zeros(len(place), np.intp), place[:1]
+    if len(steps) * (1 + bonds.any_broken) > 62:  # more than fits a number
+        return np.arange(len(place)), place
+    _, first, kind = np.unique(code, return_index=True, return_inverse=True)
+    return kind, place[first]
+
+
+class _Bonds:
+    """Which bonds are broken, by the place of one end."""
+
+    def __init__(self, scene: Scene, state: State) -> None:
+        self._steps = state.broken_step
+        self.any_broken = self._steps is not None and bool((self._steps >= 0).any())
+        self._fracturing = Fracturing(scene) if self.any_broken else None
+        self._model, self._parameters = scene.experiment.fracture, scene.constants.fracture
+        self._cells = scene.raster.shape[1] * scene.raster.shape[2]
+
+    def broken(self, slot: Slot, step: int, place: Indices) -> Present:
+        """Whether the bond along a slot is broken, for each place."""
+        assert self._fracturing is not None and self._steps is not None
+        plane, positive = self._fracturing.plane_of(slot)
+        start = place if positive else place + step
+        return self._steps[plane].ravel()[start % self._cells] >= 0
+
+    def seen(self, d: Vector, u: Vector, slot: Slot, broken: Present) -> Vector:
+        """The difference that the rule sees."""
+        if not broken.any():
+            return d
+        lost = self._model.fictitious(u, slot.rest, self._parameters)
+        return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
+
+
+class _Followers:
+    """The rule's chain of functions on some places, with differences that can be nudged."""
+
+    def __init__(
+        self, scene: Scene, state: State, steps: dict[Slot, int], place: Indices
+    ) -> None:
         self._rule, self._constants = scene.experiment.rule, scene.constants
-        self._slots = scene.neighbourhood.slots[block.sublattice]
-        self._present = presence(scene.raster, block, self._slots)
-        self._block, self._state = block, state
-        self._fracturing = Fracturing(scene) if scene.has_fracture else None
-        self._u = planes(state.u, block)
-        X = scene.raster.reference_planes(block) if self._rule.uses_reference else None
-        self._X = X or Vector(None, None)
+        self._bonds = _Bonds(scene, state)
+        self._slots = tuple(steps)
+        kind, u = scene.raster.kind.ravel(), state.u.reshape(2, -1)
+        there = [kind[place + step] != EMPTY for step in steps.values()]
+        self._present = [None if some.all() else some for some in there]
+        self._u = Vector(*u[:, place].astype(float))
+        self._d = {slot: Vector(*(u[:, place + n] - u[:, place])) for slot, n in steps.items()}
+        self._broken = {
+            slot: self._bonds.broken(slot, step, place)
+            for slot, step in steps.items()
+            if self._bonds.any_broken
+        }
+        self._X = Vector(None, None)
+        if self._rule.uses_reference:
+            s, m, n = np.unravel_index(place, scene.raster.shape)
+            first = scene.raster.first
+            self._X = positions(scene.experiment.lattice.cell(), s, m + first[0], n + first[1])
+        with np.errstate(all="ignore"):
+            self._still = {slot: self._contribution(slot, self._u, None) for slot in self._slots}
+            self._total = self._sum(self._still)
 
     def move(self) -> Floats:
-        """(row, column, axis)."""
-        moved = self._moved(self._u, {})
+        """(place, axis)."""
+        moved = self._applied(self._total, self._u)
         return np.stack([np.broadcast_to(m, self._u.x.shape) for m in moved], axis=-1)
 
     def derivative(self, of: Slot | None) -> Floats:
@@ -66,24 +150,31 @@ class _Linearisation:
 
             def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
                 nudge = Vector(step * along.x, step * along.y)
-                if of is not None:
-                    return self._moved(self._u, {of: nudge})
-                here = Vector(self._u.x + nudge.x, self._u.y + nudge.y)
-                return self._moved(here, dict.fromkeys(self._slots, Vector(-nudge.x, -nudge.y)))
+                return self._moved_with_neighbour(of, nudge) if of else self._moved_by(nudge)
 
             columns.append(derivative(moved, self._u.x.shape))
-        return np.moveaxis(np.array(columns), (0, 1), (3, 2))
+        return np.moveaxis(np.array(columns), (0, 1), (2, 1))
 
-    def _moved(self, here: Vector, nudges: dict[Slot, Vector]) -> tuple[Any, Any]:
-        def contribution(slot: Slot) -> tuple[Any, ...]:
-            d, nudge = difference(self._state.u, self._block, slot), nudges.get(slot)
-            if nudge:
-                d = Vector(d.x + nudge.x, d.y + nudge.y)
-            if self._fracturing and self._state.broken_step is not None:
-                d = self._fracturing.seen(d, here, self._block, slot, self._state.broken_step)
-            weights = self._constants.weights[slot]
-            return self._rule.gather(d, slot.rest, weights, self._constants.rule)
+    def _moved_with_neighbour(self, slot: Slot, nudge: Vector) -> tuple[Any, Any]:
+        contributions = self._still | {slot: self._contribution(slot, self._u, nudge)}
+        return self._applied(self._sum(contributions), self._u)
 
+    def _moved_by(self, nudge: Vector) -> tuple[Any, Any]:
+        here, back = Vector(self._u.x + nudge.x, self._u.y + nudge.y), Vector(-nudge.x, -nudge.y)
+        contributions = {slot: self._contribution(slot, here, back) for slot in self._slots}
+        return self._applied(self._sum(contributions), here)
+
+    def _contribution(self, slot: Slot, here: Vector, nudge: Vector | None) -> Contributions:
+        d = self._d[slot]
+        if nudge:
+            d = Vector(d.x + nudge.x, d.y + nudge.y)
+        if slot in self._broken:
+            d = self._bonds.seen(d, here, slot, self._broken[slot])
+        return self._rule.gather(d, slot.rest, self._constants.weights[slot], self._constants.rule)
+
+    def _sum(self, contributions: dict[Slot, Contributions]) -> Contributions:
+        return sum_over_slots(self._slots, self._present, contributions.__getitem__)
+
+    def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
         with np.errstate(all="ignore"):
-            total = sum_over_slots(self._slots, self._present, contribution)
             return self._rule.apply(total, Here(here, self._X), self._constants.rule)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.linearising import Response, respond
+from pbdkit.analysis.couplings import Couplings
+from pbdkit.analysis.linearising import Response, respond, slot_step
 from pbdkit.analysis.matrices import Entries
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
-from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
+from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 Floats = NDArray[np.float64]
-Parts = list[tuple[Indices, Indices, Floats]]
-"""(row, column, value) of the entries of a matrix, in parts."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +34,30 @@ class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
     `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
-    2n + 1 its y, and the same for leaders.
+    2n + 1 its y, and the same for leaders. The couplings hold the same by particle.
     """
 
     followers: Indices
     leaders: Indices
-    entries_now: Entries
-    entries_before: Entries
-    entries_led: Entries
+    couplings_now: Couplings
+    couplings_before: Couplings
+    couplings_led: Couplings
     source: Floats
+
+    @cached_property
+    def entries_now(self) -> Entries:
+        """The entries of `now`."""
+        return self.couplings_now.entries()
+
+    @cached_property
+    def entries_before(self) -> Entries:
+        """The entries of `before`."""
+        return self.couplings_before.entries()
+
+    @cached_property
+    def entries_led(self) -> Entries:
+        """The entries of `led`."""
+        return self.couplings_led.entries()
 
     @cached_property
     def now(self) -> scipy.sparse.csr_array:
@@ -93,105 +107,97 @@ def step_operator(
 
 
 class _Assembly:
-    """Collects the entries of the operator. Unknowns are looked up by row of the particle table."""
+    """Collects the couplings, looking particles up by their flat place on the raster: the
+    neighbour at a slot is a constant step away."""
 
     def __init__(self, scene: Scene, state: State, step: int) -> None:
         self._scene, self._state = scene, state
-        self._kinds = kinds_at(scene.raster, scene.leading, step)
-        self._followers = np.flatnonzero(self._kinds == FOLLOWER)
-        self._leaders = np.flatnonzero(self._kinds == LEADER)
-        self._unknown = np.full(len(self._kinds), -1, np.intp)
-        self._unknown[self._followers] = np.arange(len(self._followers))
-        self._unknown[self._leaders] = np.arange(len(self._leaders))
-        self._now: Parts = []
-        self._before: Parts = []
-        self._led: Parts = []
-        self._source = np.zeros(2 * len(self._followers))
-        self._accompanied = np.zeros(len(self._followers), bool)
+        raster, kinds = scene.raster, kinds_at(scene.raster, scene.leading, step)
+        self._kind = np.full(raster.kind.size, EMPTY, np.int8)
+        self._unknown = np.full(raster.kind.size, -1, np.int32)
+        rows = {kind: np.flatnonzero(kinds == kind) for kind in (FOLLOWER, LEADER, FRAME)}
+        for kind, some in rows.items():
+            place = raster.place_of(some)
+            self._kind[place] = kind
+            self._unknown[place] = np.arange(len(some))
+        self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
+        free, led = len(self._followers), len(self._leaders)
+        self._now, self._before = Couplings((free, free)), Couplings((free, free))
+        self._led = Couplings((free, led))
+        self._source = np.zeros((free, 2))
 
     def operator(self) -> StepOperator:
-        raster, memory = self._scene.raster, self._scene.experiment.solver.memory
-        for s in range(raster.shape[0]):
-            if block := raster.body_block(s):
-                self._add(respond(self._scene, self._state, block))
-        size, led = 2 * len(self._followers), 2 * len(self._leaders)
-        every = np.arange(size)
-        self._now.append((every, every, np.ones(size)))
-        if memory:
-            moving = every[np.repeat(self._accompanied, 2)]
-            self._now.append((moving, moving, np.full(len(moving), memory)))
-            self._before.append((moving, moving, np.full(len(moving), -memory)))
+        memory = self._scene.experiment.solver.memory
+        self._now.add_scaled_identity(np.arange(len(self._followers)), 1.0)
+        place = self._scene.raster.place_of(self._followers)
+        cells = self._kind.size // self._scene.raster.shape[0]
+        for s in range(self._scene.raster.shape[0]):
+            own = place if self._scene.raster.shape[0] == 1 else place[place // cells == s]
+            own = own[self._has_neighbours(s, own)]
+            if len(own):
+                self._add(own, respond(self._scene, self._state, s, own))
+                if memory:
+                    self._now.add_scaled_identity(self._unknown[own], memory)
+                    self._before.add_scaled_identity(self._unknown[own], -memory)
         return StepOperator(
             self._followers,
             self._leaders,
-            _joined(self._now, (size, size)),
-            _joined(self._before, (size, size)),
-            _joined(self._led, (size, led)),
-            self._source,
+            self._now,
+            self._before,
+            self._led,
+            self._source.ravel(),
         )
 
-    def _add(self, response: Response) -> None:
-        """The rows of a block's followers. Particles with no neighbour stay, whatever the rule
-        makes of nothing."""
-        raster, relaxation = self._scene.raster, self._scene.experiment.solver.relaxation
-        block = response.block
-        m, n = np.nonzero(raster.kind[block.slices()] == FOLLOWER)
-        i, j = m + block.start[0], n + block.start[1]
-        rows = raster.rows_at(np.full(len(m), block.sublattice), i, j)
-        others = {
-            slot: raster.rows_at(np.full(len(m), slot.target), i + slot.cell[0], j + slot.cell[1])
-            for slot in response.neighbours
-        }
-        accompanied = np.any([there >= 0 for there in others.values()], axis=0)
-        kept = (self._kinds[rows] == FOLLOWER) & accompanied
-        m, n, rows = m[kept], n[kept], rows[kept]
-        self._accompanied[self._unknown[rows]] = True
-        own = relaxation * response.own[m, n]
-        self._put(self._now, rows, rows, own)
-        constant = relaxation * response.move[m, n] - _times(own, self._u(rows))
+    def _has_neighbours(self, sublattice: int, place: Indices) -> NDArray[np.bool_]:
+        """Particles with no neighbour stay, whatever the rule makes of nothing."""
+        found = np.zeros(len(place), bool)
+        for slot in self._scene.neighbourhood.slots[sublattice]:
+            found |= self._kind[place + slot_step(self._scene, slot)] != EMPTY
+        return found
+
+    def _add(self, place: Indices, response: Response) -> None:
+        """The rows of the followers at some places of one sublattice."""
+        relaxation, u = self._scene.experiment.solver.relaxation, self._state.u.reshape(2, -1)
+        rows = self._unknown[place]
+        own = response.of_each(relaxation * response.own)
+        self._now.add(rows, rows, own)
+        at_rest = not u.any()
+        constant = relaxation * response.of_each(response.move)
+        if not at_rest:
+            constant = constant - _times(own, u[:, place].T)
         for slot, derivative in response.neighbours.items():
-            weight, there = relaxation * derivative[m, n], others[slot][kept]
-            felt = (there >= 0) & (weight != 0.0).any(axis=(1, 2))
-            constant[felt] -= _times(weight[felt], self._u(there[felt]))
-            self._see(rows[felt], there[felt], weight[felt])
-        unknown = self._unknown[rows]
-        self._source.reshape(-1, 2)[unknown] += constant
+            there = place + response.steps[slot]
+            weight = response.of_each(relaxation * derivative)
+            if not at_rest:
+                present = (self._kind[there] != EMPTY)[:, None]
+                constant = constant - np.where(present, _times(weight, u[:, there].T), 0.0)
+            self._see(rows, there, weight)
+        self._source[rows] = constant
 
-    def _u(self, rows: Indices) -> Floats:
-        place = self._scene.raster.place_of(rows)
-        return np.stack([plane.ravel()[place] for plane in self._state.u], axis=1)
-
-    def _see(self, rows: Indices, others: Indices, weight: Floats) -> None:
+    def _see(self, rows: Indices, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
-        kinds = self._kinds[others]
-        for kind, entries in ((FOLLOWER, self._now), (LEADER, self._led)):
+        kinds = self._kind[there]
+        for kind, couplings in ((FOLLOWER, self._now), (LEADER, self._led)):
             some = kinds == kind
-            self._put(entries, rows[some], others[some], weight[some])
+            if some.all():
+                couplings.add(rows, self._unknown[there], weight)
+            elif some.any():
+                couplings.add(rows[some], self._unknown[there[some]], weight[some])
         frame, some = self._scene.frame, kinds == FRAME
         if frame is None or not some.any():
             return
-        point = np.searchsorted(np.flatnonzero(self._kinds == FRAME), others[some])
+        point, rows, weight = self._unknown[there[some]], rows[some], weight[some]
         first = np.searchsorted(frame.map.point, point)
         last = np.searchsorted(frame.map.point, point + 1)
         for e in range(int((last - first).max(initial=0))):
-            there = first + e < last
-            entry = (first + e)[there]
-            product = np.einsum(
-                "eab,ebc->eac", weight[some][there], _matrices(frame.map.weight[entry])
-            )
-            follower, body = rows[some][there], frame.map.body[entry]
-            of_leader = self._kinds[body] == LEADER
+            has = first + e < last
+            entry = (first + e)[has]
+            product = np.einsum("eab,ebc->eac", weight[has], _matrices(frame.map.weight[entry]))
+            body = frame.body_place[entry]
+            of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
-            self._put(self._led, follower[of_leader], body[of_leader], product[of_leader])
-            self._put(free, follower[~of_leader], body[~of_leader], product[~of_leader])
-
-    def _put(self, entries: Parts, rows: Indices, columns: Indices, blocks: Floats) -> None:
-        for a in (0, 1):
-            for b in (0, 1):
-                value = blocks[:, a, b]
-                kept = value != 0.0
-                row, column = self._unknown[rows[kept]], self._unknown[columns[kept]]
-                entries.append((2 * row + a, 2 * column + b, value[kept]))
+            for couplings, those in ((self._led, of_leader), (free, ~of_leader)):
+                couplings.add(rows[has][those], self._unknown[body[those]], product[those])
 
 
 def _matrices(weights: Floats) -> Floats:
@@ -201,11 +207,3 @@ def _matrices(weights: Floats) -> Floats:
 def _times(matrices: Floats, vectors: Floats) -> Floats:
     product: Floats = np.einsum("eab,eb->ea", matrices, vectors)
     return product
-
-
-def _joined(parts: Parts, shape: tuple[int, int]) -> Entries:
-    if not parts:
-        nothing = np.empty(0, np.intp)
-        return Entries(nothing, nothing, np.empty(0), shape)
-    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Entries(rows, columns, values, shape)

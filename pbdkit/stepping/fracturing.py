@@ -52,12 +52,16 @@ class Fracturing:
             lost = self._model.fictitious(u, slot.rest, self._parameters)
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
 
+    def plane_of(self, slot: Slot) -> tuple[int, bool]:
+        """The plane of the bonds along a slot, and whether they live at this end."""
+        return self._plane_of[slot]
+
     def broken(self, block: Block, slot: Slot, broken_step: Steps) -> NDArray[np.bool_]:
         """Where on the block the bond along a slot is broken.
 
         A bond lives on the plane of its positive slot: at this end or at the other.
         """
-        n, positive = self._plane_of[slot]
+        n, positive = self.plane_of(slot)
         _, rows, columns = (block if positive else block.seen_through(slot)).slices()
         broken: NDArray[np.bool_] = broken_step[n, rows, columns] >= 0
         return broken

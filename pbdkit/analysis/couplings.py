@@ -1,0 +1,72 @@
+"""Who moves with whom: the blocks of 2 × 2 between particles that a step operator is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.matrices import Entries
+from pbdkit.interfaces.frame import Indices
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class Couplings:
+    """Blocks of 2 × 2 at (row, column), in parts, counted in particles; those of one place add.
+
+    `shape` is in particles. Blocks that are the same everywhere may be views of one.
+    """
+
+    shape: tuple[int, int]
+    parts: list[tuple[Indices, Indices, Floats]] = field(default_factory=list)
+
+    def add(self, rows: Indices, columns: Indices, blocks: Floats) -> None:
+        """Adds blocks, (entry, 2, 2)."""
+        if len(rows):
+            self.parts.append((rows, columns, blocks))
+
+    def add_scaled_identity(self, rows: Indices, factor: float) -> None:
+        """Adds factor · 1 on the diagonal of some rows."""
+        block = factor * np.eye(2)
+        self.add(rows, rows, np.broadcast_to(block, (len(rows), 2, 2)))
+
+    def entries(self) -> Entries:
+        """Of the matrix with the unknowns 2n (x) and 2n + 1 (y) of particle n."""
+        found: list[tuple[Indices, Indices, Floats]] = []
+        for rows, columns, blocks in self.parts:
+            for a in (0, 1):
+                for b in (0, 1):
+                    value = blocks[:, a, b]
+                    kept = value != 0.0
+                    found.append((2 * rows[kept] + a, 2 * columns[kept] + b, value[kept]))
+        return _joined(found, (2 * self.shape[0], 2 * self.shape[1]))
+
+    def between(self, a: int, b: int) -> Entries:
+        """Of the matrix from axis b to axis a alone, an unknown a particle."""
+        parts = [(r, c, blocks[:, a, b]) for r, c, blocks in self.parts if blocks[:, a, b].any()]
+        return _joined(parts, self.shape)
+
+    def couples(self, a: int, b: int) -> bool:
+        """Whether anything leads from axis b to axis a."""
+        return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
+
+    def times(self, vectors: Floats) -> Floats:
+        """The product with vectors, (particle, 2)."""
+        product = np.zeros((self.shape[0], 2))
+        for rows, columns, blocks in self.parts:
+            terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
+            for axis in (0, 1):
+                product[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
+        return product
+
+
+def _joined(parts: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> Entries:
+    if not parts:
+        nothing = np.empty(0, np.intp)
+        return Entries(nothing, nothing, np.empty(0), shape)
+    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Entries(rows, columns, values, shape)
