@@ -54,6 +54,10 @@ class Couplings:
         """Whether anything leads from axis b to axis a."""
         return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
 
+    def is_isotropic(self) -> bool:
+        """Whether both axes move alike."""
+        return all(np.array_equal(b[:, 0, 0], b[:, 1, 1]) for _, _, b in self.parts)
+
     def times(self, vectors: Floats) -> Floats:
         """The product with vectors, (particle, 2)."""
         product = np.zeros((self.shape[0], 2))

@@ -25,7 +25,7 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
         click.echo(json.dumps(found.as_dict()))
         return
     click.echo(f"{loaded.name}: valid")
-    records = loaded.record.count(loaded.steps)
+    records = loaded.recording.count(loaded.steps)
     click.echo(f"  steps      {loaded.steps}, of which {records} are recorded (time 0 included)")
     click.echo(f"  particles  {found.particles}, of which {found.followers} follow in step 1")
     click.echo(f"  bonds      {found.bonds}")

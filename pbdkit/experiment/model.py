@@ -22,8 +22,9 @@ from pbdkit.experiment.bodies import AnyBody
 from pbdkit.experiment.faults import located, report
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
-from pbdkit.experiment.parts import brief, closed_part, fault, open_part
+from pbdkit.experiment.parts import brief, fault, open_part
 from pbdkit.experiment.record import Record
+from pbdkit.experiment.solvers import AnySolver, Equilibrium
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
     INTERFACES,
@@ -62,29 +63,12 @@ Name = Annotated[
 Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
 
 
-class Stepping(Component):
-    """One step after the other.
-
-    `relaxation` w and `memory` b apply to any rule's move, for followers only:
-    x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
-    best; `precision` is that of the run's own numbers; `threads` for the compiled engine.
-    """
-
-    type: Literal["stepping"] = "stepping"
-    engine: Literal["auto", "numpy", "compiled"] = "auto"
-    precision: Literal["float64", "float32"] = "float64"
-    threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
-    relaxation: Annotated[float, Field(gt=0.0)] = 1.0
-    memory: float = 0.0
-
-
 AnyLattice = Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
 AnyNeighbours = Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)]
 AnyRule = Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
 AnyFrame = Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)]
 AnyFracture = Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)]
 AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
-AnySolver = Annotated[SerializeAsAny[Stepping], closed_part(Stepping, Stepping)]
 
 
 def _default(part: str) -> Any:
@@ -125,7 +109,20 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false or fracture: {type: none}",
                 key="fracture",
             )
+        if self.neighbours.nearness() and isinstance(self.solver, Equilibrium):
+            raise fault(
+                "where neighbours are re-evaluated nothing tells where the steps lead; "
+                "set neighbours.reevaluate: false or solver: {type: stepping}",
+                key="solver",
+            )
         return self
+
+    @property
+    def recording(self) -> Record:
+        """What is recorded: of an equilibrium, the start and the end."""
+        if isinstance(self.solver, Equilibrium):
+            return self.record.model_copy(update={"at": (0, self.steps)})
+        return self.record
 
     _source: Source = PrivateAttr(default_factory=Source)
     _registry: Registry = PrivateAttr()

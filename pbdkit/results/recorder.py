@@ -79,7 +79,7 @@ class Recorder:
         for diagnostic in experiment.diagnostics:
             sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
-        records = experiment.record.count(experiment.steps)
+        records = experiment.recording.count(experiment.steps)
         self._sink.begin(columns, sizes, {"time": records, "step": experiment.steps + 1})
         for name, values in known.items():
             self._sink.put({name: values()})
@@ -111,12 +111,12 @@ class Recorder:
     def records(self, step: int) -> bool:
         """Whether positions are recorded at that step."""
         experiment = self._scene.experiment
-        return experiment.record.keeps(step, experiment.steps)
+        return experiment.recording.keeps(step, experiment.steps)
 
     def next_after(self, step: int) -> int:
         """The next step after `step` at which something is taken."""
         experiment = self._scene.experiment
-        return step + 1 if self._stepped else experiment.record.next_after(step, experiment.steps)
+        return step + 1 if self._stepped else experiment.recording.next_after(step, experiment.steps)
 
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""

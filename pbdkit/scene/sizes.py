@@ -54,7 +54,7 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
         + experiment.shows_bonds * planes * BOND_BYTES
     )
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
-    records = experiment.record.count(experiment.steps)
+    records = experiment.recording.count(experiment.steps)
     recorded = np.dtype(experiment.record.dtype).itemsize
     entries = {
         stepped: sum(

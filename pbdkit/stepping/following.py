@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.experiment.model import Stepping
+from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.stepping.state import Floats
 
 
@@ -22,7 +22,7 @@ class Followers(ABC):
         neighbour stay. What it writes for leaders is overwritten."""
 
 
-def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
+def target(here: Any, move: Any, before: Any, solver: Stepping | Equilibrium) -> Any:
     """u + relaxation · move + memory · (u - before), elementwise for one component.
 
     Raises ValueError where the move is not one value a particle.

@@ -23,7 +23,7 @@ class Guard:
         ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
         spacing = max(abs(s.rest.x) + abs(s.rest.y) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
-        ways = [_way(leading, scene.experiment.steps) for leading in scene.leading]
+        ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
         self._limit = BEYOND * (size + sum(ways))
         self.next_look = EVERY
         """The step at which to look at the latest."""
@@ -43,7 +43,7 @@ def _most(state: State) -> float:
     return max(float(state.u.max()), -float(state.u.min()))
 
 
-def _way(leading: Leading, steps: int) -> float:
+def way_of(leading: Leading, steps: int) -> float:
     """How far a group gets from where it starts, looked at here and there."""
     group = leading.group
     last = group.last(steps) - group.from_ + 1

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
@@ -35,8 +36,14 @@ class _Part:
 class SlotFollowers(Followers):
     """Moves the followers of a scene whose neighbours stay as they are."""
 
-    def __init__(self, scene: Scene, fracturing: Fracturing | None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        fracturing: Fracturing | None,
+        solver: Stepping | Equilibrium | None = None,
+    ) -> None:
         self._scene = scene
+        self._solver = solver or scene.experiment.solver
         self._rule = scene.experiment.rule
         self._parameters = scene.constants.rule
         self._fracturing = fracturing
@@ -79,5 +86,5 @@ class SlotFollowers(Followers):
         move = self._rule.apply(total, Here(u, part.X), self._parameters)
         out = planes(new, part.block)
         for here, step, plane in zip(u, move, out, strict=True):
-            moved = target(here, step, plane, self._scene.experiment.solver)
+            moved = target(here, step, plane, self._solver)
             plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)

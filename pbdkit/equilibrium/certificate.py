@@ -1,0 +1,65 @@
+"""What is known of the distance between a state and its equilibrium."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pbdkit.scene.leading import Leading
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.guard import way_of
+from pbdkit.stepping.state import State
+
+WAYS = {
+    "inverse": "the inverse of the step operator's system, entry by entry",
+    "barrier": "a barrier: v > 0 with A v > 0 bounds the inverse of a matrix A that has no positive "
+    "entry off its diagonal",
+    "estimated norm of the inverse": "three times an estimate of the norm of the inverse",
+    "nothing to solve": "nobody follows",
+}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """`residual` is the largest move of the rule at the state; `distance` bounds how far any
+    follower is from equilibrium, both lengths; `share` is the distance as a share of the largest
+    prescribed displacement; `iterations` counts linearisations and `inner_iterations` those of the
+    linear solvers; `bound` says how the distance was obtained; `linearised` whether the rule is not
+    linear, so that it holds to first order, with a factor of 2."""
+
+    method: str
+    iterations: int
+    inner_iterations: int
+    residual: float
+    distance: float
+    share: float
+    bound: str
+    linearised: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain values, for JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return (
+            f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest prescribed "
+            f"displacement), by {WAYS[self.bound]}"
+        )
+
+
+def scale_of(scene: Scene, start: State) -> float:
+    """The largest prescribed displacement: of the leaders, or of the start; the lattice's spacing
+    where nothing is prescribed but rest."""
+    ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
+    prescribed = max([float(abs(start.u).max()), *ways])
+    return prescribed or spacing_of(scene)
+
+
+def spacing_of(scene: Scene) -> float:
+    """The length of the shortest bond."""
+    return min(min(lengths) for lengths in scene.neighbourhood.shells())
+
+
+def never_rests(leading: Leading, steps: int) -> bool:
+    """Whether a group still leads in the last step, in a motion that has no end."""
+    return leading.group.leads(steps) and leading.group.motion.rests_after() is None

@@ -1,0 +1,70 @@
+"""How an experiment is carried out: step by step, or straight to where the steps lead. A closed
+family."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, SerializeAsAny
+
+from pbdkit.experiment.parts import closed_part
+from pbdkit.interfaces import Component
+from pbdkit.interfaces.component import Strict
+
+Tolerance = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Settle(Strict):
+    """When a run may stop before its last step: once every particle is certified to be nearer to
+    its equilibrium than `tolerance`, as a share of the largest prescribed displacement."""
+
+    tolerance: Tolerance
+
+
+class Solver(Component):
+    """What takes a scene from its start to its end."""
+
+
+class Stepping(Solver):
+    """One step after the other.
+
+    `relaxation` w and `memory` b apply to any rule's move, for followers only:
+    x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
+    best; `precision` is that of the run's own numbers; `threads` for the compiled engine.
+    """
+
+    type: Literal["stepping"] = "stepping"
+    engine: Literal["auto", "numpy", "compiled"] = "auto"
+    precision: Literal["float64", "float32"] = "float64"
+    threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
+    relaxation: Annotated[float, Field(gt=0.0)] = 1.0
+    memory: float = 0.0
+    settle: Settle | None = None
+
+
+class Equilibrium(Solver):
+    """Straight to where the steps converge to, leaders at their last prescribed position with the
+    roles of the last step.
+
+    `tolerance` is the largest distance from equilibrium, as a share of the largest prescribed
+    displacement. Where bonds can break, the leaders' way is made in so many `increments`, each
+    settled before the next. `method` solves the linear systems: lu, multigrid (algebraic, with
+    Krylov's iteration around it), conjugate-gradients alone, or what serves their size.
+    """
+
+    type: Literal["equilibrium"] = "equilibrium"
+    method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
+    tolerance: Tolerance = 1e-8
+    increments: Annotated[int, Field(ge=1, le=100_000)] = 100
+
+    # The rule's own step; until roles change for the last time it is made as stepping would.
+    engine: ClassVar[Literal["auto", "numpy", "compiled"]] = "auto"
+    precision: ClassVar[Literal["float64", "float32"]] = "float64"
+    threads: ClassVar[Literal["auto"] | int] = "auto"
+    relaxation: ClassVar[float] = 1.0
+    memory: ClassVar[float] = 0.0
+
+
+AnySolver = Annotated[
+    SerializeAsAny[Stepping | Equilibrium], closed_part(Solver, Stepping, Equilibrium)
+]
