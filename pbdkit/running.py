@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
+from pbdkit.equilibrium.finding import UnconvergedError
+from pbdkit.equilibrium.loading import settle
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
+from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
 Components = Iterable[type[Component]]
+_STRAIGHT = Choice("equilibrium", 1, "asked for")
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ def run(
     refuse_too_much_output(scene)
     report = run_into(sink, scene, progress=progress)
     dataset = sink.dataset()
-    if report.outcome.status == "diverged":
+    if report.outcome.status in ("diverged", "unconverged"):
         raise DivergedError(report.outcome.stop_reason, dataset)
     return dataset
 
@@ -114,13 +118,17 @@ def run_into(
     sink: Sink, scene: Scene, *, progress: bool, stopping: Callable[[], bool] = lambda: False
 ) -> Report:
     """Steps the scene to its end, or until `stopping` says so, and records it into the sink."""
-    engine, choice = make_engine(scene, choose(scene))
     recorder = Recorder(scene, sink)
+    straight = isinstance(scene.experiment.solver, Equilibrium)
+    engine, choice = (None, _STRAIGHT) if straight else make_engine(scene, choose(scene))
     begun = time.perf_counter()
     try:
         recorder.begin()
-        with progress_bar(scene.experiment.steps, progress) as show:
-            outcome = _step_through(scene, engine, recorder, show, stopping)
+        with progress_bar(scene.experiment.steps, progress and not straight) as show:
+            if engine is None:
+                outcome = _go_straight(scene, recorder)
+            else:
+                outcome = _step_through(scene, engine, recorder, show, stopping)
     except ExperimentError as error:
         sink.abandon()
         raise scene.experiment.located(error) from None
@@ -128,6 +136,24 @@ def run_into(
         sink.abandon()
         raise
     return Report(outcome, scene.raster.count, time.perf_counter() - begun, choice)
+
+
+def _go_straight(scene: Scene, recorder: Recorder) -> Outcome:
+    state, steps = initial_state(scene), scene.experiment.steps
+    recorder.observe(state)
+    try:
+        certificate = settle(scene, state)
+        outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
+    except UnconvergedError as error:
+        found = error.certificate
+        outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+    state.step = steps
+    try:
+        recorder.observe(state)
+    except FloatingPointError as error:
+        outcome = Outcome("unconverged", f"{error} left all bounds", steps)
+    recorder.finish(state, outcome)
+    return outcome
 
 
 def _step_through(

@@ -15,6 +15,7 @@ ORDER = [
     "scene",
     "stepping",
     "analysis",
+    "equilibrium",
     "results",
     "running",
     "benching",

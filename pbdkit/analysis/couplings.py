@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.matrices import Entries
-from pbdkit.interfaces.frame import Indices
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.signedinteger[Any]]
 
 
 @dataclass

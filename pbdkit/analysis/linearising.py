@@ -31,8 +31,8 @@ class Response:
     """The move of some followers, linearised.
 
     ∂move/∂u_k for each slot and ∂move/∂u_j, (kind, axis of the move, axis of u), and the move
-    itself, (kind, axis); `kind` says for each follower which of the kinds it is, and `steps` how far
-    along the flat raster a slot reaches.
+    itself, (kind, axis); `kind` says for each follower which of the kinds it is, and `steps` how
+    far along the flat raster a slot reaches.
     """
 
     neighbours: dict[Slot, Floats]
@@ -97,10 +97,12 @@ class _Bonds:
 
     def broken(self, slot: Slot, step: int, place: Indices) -> Present:
         """Whether the bond along a slot is broken, for each place."""
-        assert self._fracturing is not None and self._steps is not None
+        assert self._fracturing is not None
+        assert self._steps is not None
         plane, positive = self._fracturing.plane_of(slot)
         start = place if positive else place + step
-        return self._steps[plane].ravel()[start % self._cells] >= 0
+        broken: Present = self._steps[plane].ravel()[start % self._cells] >= 0
+        return broken
 
     def seen(self, d: Vector, u: Vector, slot: Slot, broken: Present) -> Vector:
         """The difference that the rule sees."""
@@ -113,9 +115,7 @@ class _Bonds:
 class _Followers:
     """The rule's chain of functions on some places, with differences that can be nudged."""
 
-    def __init__(
-        self, scene: Scene, state: State, steps: dict[Slot, int], place: Indices
-    ) -> None:
+    def __init__(self, scene: Scene, state: State, steps: dict[Slot, int], place: Indices) -> None:
         self._rule, self._constants = scene.experiment.rule, scene.constants
         self._bonds = _Bonds(scene, state)
         self._slots = tuple(steps)

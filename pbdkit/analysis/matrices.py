@@ -18,8 +18,8 @@ DENSE = 500
 class Entries:
     """A matrix as (row, column, value); entries of one place are added."""
 
-    rows: Indices
-    columns: Indices
+    rows: NDArray[np.signedinteger[Any]]
+    columns: NDArray[np.signedinteger[Any]]
     values: NDArray[np.float64]
     shape: tuple[int, int]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.signedinteger[Any]]
 
 
 @dataclass(frozen=True)
@@ -157,12 +158,13 @@ class _Assembly:
 
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
-        relaxation, u = self._scene.experiment.solver.relaxation, self._state.u.reshape(2, -1)
+        relaxation = self._scene.experiment.solver.relaxation
+        u = self._state.u.reshape(2, -1).astype(float, copy=False)
         rows = self._unknown[place]
         own = response.of_each(relaxation * response.own)
         self._now.add(rows, rows, own)
         at_rest = not u.any()
-        constant = relaxation * response.of_each(response.move)
+        constant: Floats = relaxation * response.of_each(response.move)
         if not at_rest:
             constant = constant - _times(own, u[:, place].T)
         for slot, derivative in response.neighbours.items():
@@ -174,7 +176,7 @@ class _Assembly:
             self._see(rows, there, weight)
         self._source[rows] = constant
 
-    def _see(self, rows: Indices, there: Indices, weight: Floats) -> None:
+    def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
         kinds = self._kind[there]
         for kind, couplings in ((FOLLOWER, self._now), (LEADER, self._led)):

@@ -57,6 +57,9 @@ def run(
         outcome = report.outcome
         size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
         click.echo(f"{outcome.status}: {size}, written to {path}")
+        if outcome.certificate:
+            click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
+            return 0
         threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""
         click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
     return _exit_code(report, path)
@@ -100,7 +103,7 @@ def _peak_memory_mib() -> float | None:
 
 
 def _exit_code(report: Report, path: Path) -> int:
-    codes = {"diverged": 4, "interrupted": 130}
+    codes = {"diverged": 4, "unconverged": 4, "interrupted": 130}
     code = codes.get(report.outcome.status, 0)
     if code:
         click.echo(

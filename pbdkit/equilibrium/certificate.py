@@ -12,8 +12,8 @@ from pbdkit.stepping.state import State
 
 WAYS = {
     "inverse": "the inverse of the step operator's system, entry by entry",
-    "barrier": "a barrier: v > 0 with A v > 0 bounds the inverse of a matrix A that has no positive "
-    "entry off its diagonal",
+    "barrier": "a barrier: v > 0 with A v > 0 bounds the inverse of a matrix A without positive "
+    "entries off its diagonal",
     "estimated norm of the inverse": "three times an estimate of the norm of the inverse",
     "nothing to solve": "nobody follows",
 }
@@ -42,8 +42,8 @@ class Certificate:
 
     def __str__(self) -> str:
         return (
-            f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest prescribed "
-            f"displacement), by {WAYS[self.bound]}"
+            f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
+            f"prescribed displacement), by {WAYS[self.bound]}"
         )
 
 

@@ -25,7 +25,7 @@ FIRST_ORDER = 2.0
 """What a bound is multiplied with that holds to first order only."""
 
 
-class Unconverged(Exception):
+class UnconvergedError(Exception):
     """The best state found is no equilibrium; its certificate comes along."""
 
     def __init__(self, reason: str, certificate: Certificate) -> None:
@@ -38,9 +38,9 @@ class Finder:
     methods. `scale` is the length that shares are of."""
 
     def __init__(self, scene: Scene, tolerance: float, scale: float, method: str) -> None:
-        self._scene, self._method = scene, method
-        self._tolerance, self._scale = tolerance, scale
-        self._moves = Moves(scene)
+        self.scene, self.method = scene, method
+        self.tolerance, self.scale = tolerance, scale
+        self.moves = Moves(scene)
 
     def find(self, state: State, step: int) -> Certificate:
         """Moves the followers of `state`, in place, to where they rest, with the roles of `step`.
@@ -48,7 +48,7 @@ class Finder:
         The first linearisation is that of the scene at rest, exact for linear rules. Others are
         linearised anew where they have come to (Newton's iteration, with shorter corrections where
         the moves would grow). Raises ExperimentError where a part of the body has no equilibrium,
-        and Unconverged.
+        and UnconvergedError.
         """
         return _Search(self, state, step).run()
 
@@ -59,9 +59,9 @@ class _Search:
         self._linearisations = self._inner = 0
         self._linear = False
         at_rest = replace(state, u=np.zeros_like(state.u))
-        operator = step_operator(finder._scene, at_rest, step)
-        self._place = finder._scene.raster.place_of(operator.followers)
-        self._X = finder._scene.raster.reference(operator.followers)
+        operator = step_operator(finder.scene, at_rest, step)
+        self._place = finder.scene.raster.place_of(operator.followers)
+        self._X = finder.scene.raster.reference(operator.followers)
         self._system = self._systematised(operator)
         self._owed = self._owed_by(operator)
         self._left = self._moves()
@@ -91,7 +91,7 @@ class _Search:
                 self._linear = before > 1e3 * floor and after <= self._expected(before, accuracy)
             if not self._linear or not math.isfinite(after):
                 return False
-            if self._distance() <= self._finder._tolerance:
+            if self._distance() <= self._finder.tolerance:
                 return True
             if after > 0.5 * before:
                 return False
@@ -100,10 +100,10 @@ class _Search:
     def _correct_anew(self) -> None:
         """Newton's iteration."""
         while self._linearisations < MOST_LINEARISATIONS:
-            operator = step_operator(self._finder._scene, self._state, self._step)
+            operator = step_operator(self._finder.scene, self._state, self._step)
             self._system = self._systematised(operator)
             self._system.refuse_moving_floats(self._left, self._rounding())
-            if self._distance() <= self._finder._tolerance or not self._search_along(
+            if self._distance() <= self._finder.tolerance or not self._search_along(
                 self._system.solve(self._left, self._accuracy())
             ):
                 return
@@ -127,12 +127,12 @@ class _Search:
             inner_iterations=self._inner + self._system.iterations,
             residual=float(np.abs(self._left).max(initial=0.0)),
             distance=distance,
-            share=distance / self._finder._scale,
+            share=distance / self._finder.scale,
             bound=self._system.how,
             linearised=not self._linear,
         )
-        if not distance <= self._finder._tolerance:
-            raise Unconverged(self._why(), certificate)
+        if not distance <= self._finder.tolerance:
+            raise UnconvergedError(self._why(), certificate)
         return certificate
 
     def _why(self) -> str:
@@ -148,7 +148,7 @@ class _Search:
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return System(operator, self._finder._method, self._X)
+        return System(operator, self._finder.method, self._X)
 
     def _owed_by(self, operator: StepOperator) -> Vectors | None:
         """What frames that lag have yet to hand back, (follower, axis)."""
@@ -166,7 +166,7 @@ class _Search:
         self._left = self._moves()
 
     def _moves(self) -> Vectors:
-        return self._finder._moves.at(self._state.u, self._state.broken_step, self._place)
+        return self._finder.moves.at(self._state.u, self._state.broken_step, self._place)
 
     def _is_better_than(self, moves: Vectors) -> bool:
         return _size(self._left) < _size(moves)
@@ -179,7 +179,7 @@ class _Search:
     def _accuracy(self) -> float:
         """How well a linear system must be solved for the tolerance."""
         distance = self._distance()
-        wanted = 0.2 * self._finder._tolerance / distance if distance > 0.0 else 1.0
+        wanted = self._finder.tolerance / distance if distance > 0.0 else 1.0
         return min(1e-6, max(1e-13, wanted))
 
     def _expected(self, before: float, accuracy: float) -> float:

@@ -47,9 +47,11 @@ class Dense(LinearSolver):
         self.inverse = np.linalg.inv(matrix)
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         return self.inverse @ b
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         return self.inverse.T @ b
 
 
@@ -74,9 +76,11 @@ class SparseLU(LinearSolver):
             raise np.linalg.LinAlgError(str(error)) from None
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         return np.asarray(self._factors.solve(b))
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         return np.asarray(self._factors.solve(b, trans="T"))
 
 
@@ -94,9 +98,11 @@ class Krylov(LinearSolver):
         self._transposed: tuple[Any, Any] | None = self._upright if symmetric else None
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         return self._iterated(*self._upright, b, accuracy)
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By this method."""
         if self._transposed is None:
             self._transposed = self._prepared(self._upright[0].T.tocsr())
         return self._iterated(*self._transposed, b, accuracy)

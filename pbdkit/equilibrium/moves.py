@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.scene import Scene
-
-from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.fracturing import Fracturing, Steps
+from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats
 
 ROUNDING = 4 * float(np.finfo(float).eps)

@@ -24,7 +24,7 @@ LARGEST_FALLBACK = 400_000
 """Unknowns up to which an LU factorisation takes over where an iteration gets stuck."""
 
 
-class Drifting(Exception):
+class DriftingError(Exception):
     """A part that nothing holds is pushed on for ever."""
 
 
@@ -38,7 +38,7 @@ class Part(ABC):
 
     @abstractmethod
     def solve(self, r: Floats, accuracy: float) -> Floats:
-        """The x to which steps from x = 0 converge. Raises Drifting where there is none."""
+        """The x to which steps from x = 0 converge. Raises DriftingError where there is none."""
 
     @abstractmethod
     def farthest(self, r: Floats) -> float:
@@ -59,6 +59,10 @@ class Held(Part):
     """A part whose matrix has an inverse."""
 
     def __init__(self, matrix: Any, method: str, near_kernel: Floats | None = None) -> None:
+        if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
+            from scipy.sparse import csr_array
+
+            matrix = csr_array(matrix)
         self._matrix, self._symmetric = matrix, is_symmetric(matrix)
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
         self._solver: LinearSolver = linear_solver(
@@ -67,13 +71,16 @@ class Held(Part):
 
     @property
     def name(self) -> str:
+        """That of the linear solver."""
         return self._solver.name
 
     @property
     def iterations(self) -> int:
+        """Those of the linear solver."""
         return self._solver.iterations
 
     def solve(self, r: Floats, accuracy: float) -> Floats:
+        """By this method."""
         x = self._solver.solve(r, accuracy)
         if isinstance(self._solver, Krylov) and self._has_choice:
             left = float(np.linalg.norm(r - self._matrix @ x))
@@ -83,6 +90,7 @@ class Held(Part):
         return x
 
     def farthest(self, r: Floats) -> float:
+        """From the inverse where it is at hand, else from a bound on it."""
         if isinstance(self._solver, Dense):
             return float((np.abs(self._solver.inverse) @ r).max(initial=0.0))
         if self._barrier:
@@ -92,6 +100,7 @@ class Held(Part):
 
     @property
     def how(self) -> str:
+        """By the inverse where it is at hand, else by what the matrix allows."""
         if isinstance(self._solver, Dense):
             return "inverse"
         return "barrier" if self._barrier else "estimated norm of the inverse"
@@ -134,17 +143,20 @@ class Floating(Part):
 
     @property
     def name(self) -> str:
+        """That of the linear solver."""
         return self._solver.name
 
     def solve(self, r: Floats, accuracy: float, owed: Floats | None = None) -> Floats:
+        """By this method."""
         push = self._left.T @ r
         if np.abs(push).max(initial=0.0) > SINGULAR * max(1.0, float(np.linalg.norm(r))):
-            raise Drifting
+            raise DriftingError
         kept = np.zeros(len(push)) if owed is None else self._left.T @ owed
         x = self._solver.solve(np.concatenate([r - self._left @ push, kept]), accuracy)
         return x[: self._size]
 
     def farthest(self, r: Floats) -> float:
+        """From the inverse where it is at hand, else from a bound on it."""
         if isinstance(self._solver, Dense):
             own = np.abs(self._solver.inverse[: self._size, : self._size])
             return float((own @ r).max(initial=0.0))
@@ -152,6 +164,7 @@ class Floating(Part):
 
     @property
     def how(self) -> str:
+        """By the inverse where it is at hand, else by what the matrix allows."""
         return "inverse" if isinstance(self._solver, Dense) else "estimated norm of the inverse"
 
     @cached_property
@@ -173,7 +186,7 @@ def estimated_norm(solver: LinearSolver, size: int) -> float:
 
 
 def _left_kernel(matrix: Any) -> Floats:
-    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0; few, since parts are connected."""
+    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0; few, for connected parts."""
     size = matrix.shape[0]
     if size <= DENSE:
         dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import Couplings
 from pbdkit.analysis.matrices import DENSE, connected
 from pbdkit.analysis.operator import StepOperator
-from pbdkit.equilibrium.parts import Drifting, Floating, Held, Part
+from pbdkit.equilibrium.parts import DriftingError, Floating, Held, Part
 from pbdkit.errors import ExperimentError
 
 Floats = NDArray[np.float64]
@@ -133,7 +133,7 @@ class System:
     ) -> Floats:
         try:
             return part.solve(r, 0.0, owed)
-        except Drifting:
+        except DriftingError:
             numbers = self._numbers(stage, unknowns)
             raise ExperimentError(
                 f"there is no equilibrium: nothing holds a part of {len(numbers)} particles (with "

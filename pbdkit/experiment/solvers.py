@@ -9,16 +9,6 @@ from pydantic import Field, SerializeAsAny
 
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
-from pbdkit.interfaces.component import Strict
-
-Tolerance = Annotated[float, Field(gt=0.0, lt=1.0)]
-
-
-class Settle(Strict):
-    """When a run may stop before its last step: once every particle is certified to be nearer to
-    its equilibrium than `tolerance`, as a share of the largest prescribed displacement."""
-
-    tolerance: Tolerance
 
 
 class Solver(Component):
@@ -39,7 +29,6 @@ class Stepping(Solver):
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
     relaxation: Annotated[float, Field(gt=0.0)] = 1.0
     memory: float = 0.0
-    settle: Settle | None = None
 
 
 class Equilibrium(Solver):
@@ -54,7 +43,7 @@ class Equilibrium(Solver):
 
     type: Literal["equilibrium"] = "equilibrium"
     method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
-    tolerance: Tolerance = 1e-8
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-8
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
 
     # The rule's own step; until roles change for the last time it is made as stepping would.

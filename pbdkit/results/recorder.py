@@ -50,11 +50,12 @@ class Sink(ABC):
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """How a run ended; `certificate` says of an equilibrium how far it can be off."""
 
     status: str
     stop_reason: str
     steps: int
+    certificate: dict[str, Any] | None = None
 
 
 class Recorder:
@@ -116,7 +117,9 @@ class Recorder:
     def next_after(self, step: int) -> int:
         """The next step after `step` at which something is taken."""
         experiment = self._scene.experiment
-        return step + 1 if self._stepped else experiment.recording.next_after(step, experiment.steps)
+        if self._stepped:
+            return step + 1
+        return experiment.recording.next_after(step, experiment.steps)
 
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""
@@ -198,7 +201,7 @@ class Recorder:
             "status": outcome.status,
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
+        } | ({"certificate": json.dumps(outcome.certificate)} if outcome.certificate else {})
 
 
 def _refuse_unknown(

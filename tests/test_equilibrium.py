@@ -1,0 +1,179 @@
+"""solver: equilibrium goes where the steps go, and its certificate is never below the error."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, assume, given, settings
+from scene_strategies import experiments
+
+import pbdkit
+from pbdkit.cli import program
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+STRAIGHT = {"type": "equilibrium"}
+LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+
+
+def pulled(dx, dy=0.0, **more):
+    motion = {"type": "displace", "displacement": [dx, dy]}
+    return {"select": {"edge": "right"}, "motion": motion, **more}
+
+
+def sheet(columns=12, rows=10, **parts):
+    return {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": columns, "rows": rows},
+        "rule": {"type": "barycentre"},
+        "leaders": [LEFT, pulled(1.0)],
+        "diagnostics": [{"type": "displacement"}],
+        "steps": 60,
+        "solver": STRAIGHT,
+    } | parts
+
+
+def run(given):
+    return pbdkit.run(given, progress=False)
+
+
+def certificate(ds):
+    return json.loads(ds.attrs["certificate"])
+
+
+@pytest.mark.parametrize("method", ["lu", "multigrid", "conjugate-gradients"])
+@pytest.mark.parametrize("size", [10, 60])
+def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size):
+    if method == "multigrid":
+        pytest.importorskip("pyamg")
+    ds = run(sheet(size, size, solver=STRAIGHT | {"method": method, "tolerance": 1e-10}))
+    exact = ds.reference.isel(axis=0) / (size - 1)
+    body = ds.kind.isel(time=-1) < 2
+    error = abs(ds.u.isel(time=-1, axis=0) - exact).where(body).max()
+    known = certificate(ds)
+    assert error <= known["distance"] <= 1e-10
+    assert ds.attrs["status"] == "complete"
+    assert ds.time.values.tolist() == [0, 60]
+    assert abs(ds.u.isel(time=-1, axis=1)).max() <= known["distance"]
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+@given(experiments())
+def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
+    """Where 4000 further steps from there move nobody out of the certificate, and where steps from
+    the start settle, they do so at the same place."""
+    assume(experiment["fracture"]["type"] == "none")
+    assume(experiment["rule"]["type"] != "distance-weighted")
+    assume(not experiment["neighbours"].get("reevaluate"))
+    steps = 4000
+    try:
+        straight = run(experiment | {"solver": STRAIGHT, "steps": steps, "diagnostics": []})
+        relaxed = {"type": "stepping", "relaxation": 1.0}
+        scene = build_scene(pbdkit.Experiment(**experiment | {"solver": relaxed, "steps": steps}))
+        state = Stepper(scene).advance(initial_state(scene), steps)
+    except (pbdkit.ExperimentError, pbdkit.DivergedError):
+        assume(False)
+    u = scene.raster.table(state.u)
+    last = np.abs(u - scene.raster.table(state.previous)).max()
+    scale = max(1.0, np.abs(u).max())
+    assume(last < 1e-15 * scale)
+    found = (straight.position[-1] - straight.reference).values
+    reached = certificate(straight)["distance"] + 1e-9 * scale
+    assert np.abs(found - u).max() <= reached
+
+
+def test_a_released_body_keeps_what_stepping_keeps():
+    """No leader in the last step: the mean at the release remains (model.md, section 9)."""
+    leaders = [pulled(2.0, 1.0, until=7)]
+    straight = run(sheet(6, 5, leaders=leaders, steps=2000))
+    stepped = run(sheet(6, 5, leaders=leaders, steps=2000, solver={"type": "stepping"}))
+    np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-9)
+    assert abs(straight.u[-1]).max() > 0.1
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+@pytest.mark.parametrize("columns", [6, 30])
+def test_late_leaders_start_where_stepping_has_them(columns, lag):
+    leaders = [pulled(1.0, 0.5, until=5), LEFT | {"from": 6}]
+    parts = {"leaders": leaders, "frame": {"type": "mean", "lag": lag}}
+    straight = run(sheet(columns, 5, **parts, steps=20_000))
+    stepped = run(
+        sheet(
+            columns, 5, **parts, steps=20_000, record={"every": 20_000}, solver={"type": "stepping"}
+        )
+    )
+    np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-8)
+
+
+def test_a_nonlinear_rule_is_linearised_anew_and_rests_where_it_stands():
+    solver = STRAIGHT | {"tolerance": 1e-10}
+    ds = run(sheet(9, 7, rule={"type": "distance-weighted"}, leaders=[LEFT, pulled(3.0, 1.0)],
+                   solver=solver))  # fmt: skip
+    known = certificate(ds)
+    assert known["linearised"]
+    assert known["iterations"] > 1
+    assert known["residual"] < 1e-10
+
+
+def test_fracture_by_increments_breaks_what_is_too_long_and_nothing_else():
+    fracture = {"type": "threshold", "thresholds": [1.5]}
+    motion = {"type": "velocity", "velocity": [0.5, 0.0], "steps": 20}
+    leaders = [LEFT, {"select": {"edge": "right"}, "motion": motion}]
+    whole = run(sheet(9, 5, leaders=leaders, fracture={"type": "threshold", "thresholds": [9.0]}))
+    assert (whole.broken_step == -1).all()
+    torn = run(sheet(9, 5, leaders=leaders, fracture=fracture))
+    # Affine until the bonds reach 1.5: at step 8 the sheet of 8 bonds is 4 longer, at step 9 4.5.
+    assert set(torn.broken_step.values[torn.broken_step.values >= 0].tolist()) == {9}
+    assert torn.attrs["status"] == "complete"
+
+
+def test_motions_without_end_are_refused():
+    swinging = {"type": "oscillation", "amplitude": [1.0, 0.0], "period": 30.0}
+    leaders = [LEFT, {"select": {"edge": "right"}, "motion": swinging}]
+    with pytest.raises(pbdkit.ExperimentError, match=r"leaders.1.motion.*never comes to rest"):
+        run(sheet(leaders=leaders))
+
+
+class Pushed(pbdkit.FollowerRule):
+    """A barycentre that also goes its own way."""
+
+    type: str = "pushed"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / 4 + 0.01, total[1] / 4
+
+
+def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():
+    with pytest.raises(pbdkit.ExperimentError, match=r"a part of 12 particles \(with number"):
+        run(sheet(4, 3, rule=Pushed(type="pushed"), leaders=[]))
+    held = run(sheet(4, 3, rule=Pushed(type="pushed")))
+    assert certificate(held)["distance"] < 1e-8
+
+
+def test_a_tolerance_below_rounding_is_not_reached_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(pbdkit.DivergedError, match="rounding alone allows no better") as caught:
+        run(sheet(30, 30, solver=STRAIGHT | {"tolerance": 1e-16}))
+    assert caught.value.dataset.attrs["status"] == "unconverged"
+    change = "solver={type: equilibrium, tolerance: 1e-16}"
+    result = CliRunner().invoke(program, ["run", "paper/b", "--set", change])
+    assert result.exit_code == 4
+    assert "unconverged: rounding alone" in result.output
+
+
+def test_neighbours_found_anew_have_no_equilibrium_solver():
+    neighbours = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
+    with pytest.raises(pbdkit.ExperimentError, match="nothing tells where the steps lead"):
+        run(sheet(neighbours=neighbours))
