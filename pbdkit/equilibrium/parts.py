@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -139,16 +141,22 @@ class Floating(Part):
         self._left = _left_kernel(matrix)
         rows = self._left.T + (self._left.T @ before if before is not None else 0.0)
         bordered = _bordered(matrix, self._left, np.asarray(rows))
-        self._solver = linear_solver(bordered, "lu", symmetric=False)
+        self._solver: LinearSolver | None = None
+        with suppress(np.linalg.LinAlgError):  # modes that grow: only rest is an equilibrium
+            self._solver = linear_solver(bordered, "lu", symmetric=False)
 
     @property
     def name(self) -> str:
         """That of the linear solver."""
-        return self._solver.name
+        return "lu"
 
     def solve(self, r: Floats, accuracy: float, owed: Floats | None = None) -> Floats:
         """By this method."""
         push = self._left.T @ r
+        if self._solver is None:
+            if r.any():
+                raise DriftingError
+            return np.zeros(self._size)
         if np.abs(push).max(initial=0.0) > SINGULAR * max(1.0, float(np.linalg.norm(r))):
             raise DriftingError
         kept = np.zeros(len(push)) if owed is None else self._left.T @ owed
@@ -160,6 +168,8 @@ class Floating(Part):
         if isinstance(self._solver, Dense):
             own = np.abs(self._solver.inverse[: self._size, : self._size])
             return float((own @ r).max(initial=0.0))
+        if self._solver is None:
+            return math.inf if r.any() else 0.0
         return self._norm * float(r.max(initial=0.0))
 
     @property
@@ -169,6 +179,7 @@ class Floating(Part):
 
     @cached_property
     def _norm(self) -> float:
+        assert self._solver is not None
         return SAFETY * estimated_norm(self._solver, self._size + self._left.shape[1])
 
 

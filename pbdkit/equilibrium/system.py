@@ -44,12 +44,18 @@ class System:
         now, before = operator.couplings_now, operator.couplings_before
         both = Couplings(now.shape, now.parts + before.parts)
         self._both = both
-        if both.couples(0, 1) and both.couples(1, 0):
+        first = 1 if both.couples(0, 1) else 0
+        self._stages = [] if both.couples(first, 1 - first) else [self._stage((first,))]
+        # One axis has a share in the invariants of the other, where it moves it.
+        coupled = both.couples(1 - first, first)
+        if not self._stages or (coupled and self._has_floating(self._stages[0])):
             self._stages = [self._stage((0, 1))]
         else:
-            first = 1 if both.couples(0, 1) else 0
-            self._stages = [self._stage((first,))]
             self._stages.append(self._following(first))
+
+    @staticmethod
+    def _has_floating(stage: _Stage) -> bool:
+        return any(isinstance(part, Floating) for _, part in stage.parts)
 
     @property
     def methods(self) -> str:
