@@ -1,0 +1,1 @@
+"""Finite-element solutions of plane-stress problems, to measure the error of lattice rules."""
