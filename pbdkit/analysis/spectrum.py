@@ -40,11 +40,28 @@ def spectrum(matrix: Any) -> Spectrum:
         even = abs(group - group.T).max() <= 1e-12 * max(1.0, abs(group).max())
         symmetric &= bool(even)
         values.append(_extremes(group, bool(even)))
-    found = np.concatenate(values)
+    return spectrum_of(np.concatenate(values), symmetric)
+
+
+def spectrum_of(found: NDArray[np.complex128], symmetric: bool) -> Spectrum:
+    """The spectrum with these eigenvalues."""
     if not len(found):
         return Spectrum(0.0, 0.0, 0.0, True, found)
     real = found.real
     return Spectrum(float(abs(found).max()), float(real.min()), float(real.max()), symmetric, found)
+
+
+def just_below(matrix: Any, edge: float) -> NDArray[np.complex128]:
+    """Of each large group of a sparse matrix, the eigenvalue nearest to `edge` among those with a
+    smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has."""
+    from scipy.sparse.linalg import eigs
+
+    found = [
+        eigs(group.tocsc(), k=1, sigma=edge, which="SR", return_eigenvectors=False)
+        for group in (_groups(matrix) if matrix.shape[0] > DENSE else ())
+        if group.shape[0] > DENSE
+    ]
+    return np.concatenate([np.empty(0, complex), *found])
 
 
 def _groups(matrix: Any) -> Iterator[Any]:
