@@ -16,11 +16,12 @@ cos ω = s / (2 √b): the mode swings, and shrinks by √b a step.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Complex = NDArray[np.complex128]
+Complex = NDArray[np.complexfloating[Any, Any]]
 NEUTRAL = 1e-9
 """Eigenvalues this near to 1 in modulus count as 1."""
 STRAIGHT = 1e-6
