@@ -11,12 +11,18 @@ import numpy as np
 
 from pbdkit.analysis.matrices import Entries, connected
 from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.analysis.spectrum import Spectrum, spectrum
+from pbdkit.analysis.region import (
+    NEUTRAL,
+    Swing,
+    largest_stable_relaxation,
+    modes,
+    slowest_swing,
+    swings_below,
+)
+from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
 from pbdkit.scene.scene import Scene
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
-NEUTRAL = 1e-9
-"""Eigenvalues this near to 1 in modulus count as 1."""
 NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
 MOST_FOLLOWERS = 50_000
 """Above this the spectrum would take many seconds, and is left out."""
@@ -37,7 +43,15 @@ class Analysis:
     @cached_property
     def spectrum(self) -> Spectrum | None:
         """Of the step as the solver makes it, with relaxation, memory and lag."""
-        return spectrum(self.operator.augmented().matrix()) if self._within_reach else None
+        own, solver = self._rule_spectrum, self.scene.experiment.solver
+        if own is None:
+            reach = self._within_reach
+            return spectrum(self.operator.augmented().matrix()) if reach else None
+        if solver.relaxation == 1.0 and solver.memory == 0.0:
+            return own
+        # Radius and ends of what it is taken to are met at the ends of a real spectrum.
+        found = modes(own.eigenvalues, solver.relaxation, solver.memory)
+        return spectrum_of(found, own.symmetric and solver.memory == 0.0)
 
     @property
     def _within_reach(self) -> bool:
@@ -47,16 +61,15 @@ class Analysis:
 
     @cached_property
     def _rule_spectrum(self) -> Spectrum | None:
-        """Of the rule's own step, with neither relaxation nor memory."""
-        solver = self.scene.experiment.solver
-        frame = self.scene.frame
-        if self.spectrum is None or (frame and frame.map.lag):
-            return None
-        if solver.relaxation == 1.0 and solver.memory == 0.0:
-            return self.spectrum
-        # With no lag `before` is -b where particles move, so that the sum has no memory left.
+        """Of the rule's own step, with neither relaxation nor memory; None where the frame lags."""
+        lags = self.scene.frame is not None and self.scene.frame.map.lag
+        return None if lags or not self._within_reach else spectrum(self._rule_matrix())
+
+    def _rule_matrix(self) -> Any:
+        """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
+        no memory left."""
         now, before = self.operator.entries_now, self.operator.entries_before
-        every, share = np.arange(now.shape[0]), 1.0 / solver.relaxation
+        every, share = np.arange(now.shape[0]), 1.0 / self.scene.experiment.solver.relaxation
         rule = Entries(
             np.concatenate([now.rows, before.rows, every]),
             np.concatenate([now.columns, before.columns, every]),
@@ -65,7 +78,7 @@ class Analysis:
             ),
             now.shape,
         )
-        return spectrum(rule.matrix())
+        return rule.matrix()
 
     @property
     def spectral_radius(self) -> float | None:
@@ -79,17 +92,10 @@ class Analysis:
 
     @property
     def largest_stable_relaxation(self) -> float | None:
-        """With the memory as it is: 2 (1 + b) / (1 - λ_min) for real eigenvalues, and
-        min 2 Re z / |z|², z = 1 - λ, for complex ones without memory."""
+        """The relaxation below which all modes shrink, with the memory as it is:
+        2 (1 + b) / (1 - λ_min) for real eigenvalues."""
         own, memory = self._rule_spectrum, self.scene.experiment.solver.memory
-        if own is None or not len(own.eigenvalues) or abs(memory) >= 1.0:
-            return None
-        if own.largest > 1.0 + NEUTRAL or own.smallest > 1.0 - NEUTRAL:
-            return None
-        if np.abs(own.eigenvalues.imag).max() < NEUTRAL:
-            return 2.0 * (1.0 + memory) / (1.0 - own.smallest)
-        z = 1.0 - own.eigenvalues[np.abs(1.0 - own.eigenvalues) > NEUTRAL]
-        return float((2.0 * z.real / np.abs(z) ** 2).min()) if memory == 0.0 else None
+        return largest_stable_relaxation(own.eigenvalues, memory) if own else None
 
     @property
     def best_memory(self) -> float | None:
@@ -103,6 +109,29 @@ class Analysis:
     def stable(self) -> bool | None:
         """Whether no mode grows."""
         return self.spectrum.radius <= 1.0 + NEUTRAL if self.spectrum else None
+
+    def stable_at(self, relaxation: float, memory: float) -> bool | None:
+        """Whether no mode grows with that relaxation and memory in place of the experiment's.
+
+        None where the rule's own eigenvalues are not known: the frame lags, neighbours are found
+        anew, the body is too large."""
+        own = self._rule_spectrum
+        if own is None:
+            return None
+        found = modes(own.eigenvalues, relaxation, memory)
+        return bool(np.abs(found).max(initial=0.0) <= 1.0 + NEUTRAL)
+
+    def swing(self, relaxation: float, memory: float) -> Swing | None:
+        """The slowest swinging mode with that relaxation and memory: 2π / arg μ in steps, and |μ|,
+        √memory for real eigenvalues. None where no mode swings, or as for `stable_at`."""
+        own = self._rule_spectrum
+        if own is None:
+            return None
+        known = own.eigenvalues
+        if 0.0 < memory < 1.0 and own.largest > (edge := swings_below(relaxation, memory)):
+            # The slowest modes creep back. Of large groups, those that just swing are not known.
+            known = np.append(known, just_below(self._rule_matrix(), edge))
+        return slowest_swing(modes(known, relaxation, memory))
 
     @property
     def steps_to(self) -> dict[str, int | None]:

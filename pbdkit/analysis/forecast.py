@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.analysis import NEUTRAL, NO_REMEDY, Analysis
+from pbdkit.analysis.analysis import NO_REMEDY, Analysis
+from pbdkit.analysis.region import NEUTRAL
 from pbdkit.analysis.symbol import wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
@@ -20,7 +21,8 @@ from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
 @dataclass(frozen=True)
 class Forecast:
     """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
-    where it cannot tell or it would take too long; warnings."""
+    where it cannot tell or it would take too long; with memory, the period in steps of the slowest
+    mode that swings and by what it shrinks a step, None where nothing swings; warnings."""
 
     particles: int
     followers: int
@@ -32,6 +34,8 @@ class Forecast:
     largest_stable_relaxation: float | None
     stable: bool | None
     steps_to: dict[str, int | None]
+    period: float | None
+    decay: float | None
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -46,6 +50,8 @@ def forecast(scene: Scene) -> Forecast:
     analysis = Analysis(scene)
     exact = analysis.warnings()
     waves = [] if analysis.spectrum else _growing_waves(scene)
+    solver = scene.experiment.solver
+    swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
     return Forecast(
         particles=scene.raster.count,
         followers=int(np.count_nonzero(kinds == FOLLOWER)),
@@ -57,6 +63,8 @@ def forecast(scene: Scene) -> Forecast:
         largest_stable_relaxation=analysis.largest_stable_relaxation,
         stable=analysis.stable,
         steps_to=analysis.steps_to,
+        period=swing.period if swing else None,
+        decay=swing.decay if swing else None,
         warnings=(*_doubts(scene), *exact, *waves),
     )
 

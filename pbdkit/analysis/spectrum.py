@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.analysis.matrices import DENSE, connected
+from pbdkit.analysis.region import Complex
 
 BEYOND = 1e-7
 """How far outside the spectrum the shift of the inverse iteration lies."""
@@ -30,7 +30,7 @@ class Spectrum:
     smallest: float
     largest: float
     symmetric: bool
-    eigenvalues: NDArray[np.complex128]
+    eigenvalues: Complex
 
 
 def spectrum(matrix: Any) -> Spectrum:
@@ -40,11 +40,28 @@ def spectrum(matrix: Any) -> Spectrum:
         even = abs(group - group.T).max() <= 1e-12 * max(1.0, abs(group).max())
         symmetric &= bool(even)
         values.append(_extremes(group, bool(even)))
-    found = np.concatenate(values)
+    return spectrum_of(np.concatenate(values), symmetric)
+
+
+def spectrum_of(found: Complex, symmetric: bool) -> Spectrum:
+    """The spectrum with these eigenvalues."""
     if not len(found):
         return Spectrum(0.0, 0.0, 0.0, True, found)
     real = found.real
     return Spectrum(float(abs(found).max()), float(real.min()), float(real.max()), symmetric, found)
+
+
+def just_below(matrix: Any, edge: float) -> Complex:
+    """Of each large group of a sparse matrix, the eigenvalue nearest to `edge` among those with a
+    smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has."""
+    from scipy.sparse.linalg import eigs
+
+    found = [
+        eigs(group.tocsc(), k=1, sigma=edge, which="SR", return_eigenvectors=False)
+        for group in (_groups(matrix) if matrix.shape[0] > DENSE else ())
+        if group.shape[0] > DENSE
+    ]
+    return np.concatenate([np.empty(0, complex), *found])
 
 
 def _groups(matrix: Any) -> Iterator[Any]:
@@ -71,7 +88,7 @@ def _content(block: Any) -> tuple[Any, ...]:
     return block.shape, block.data.tobytes(), block.indices.tobytes()
 
 
-def _extremes(block: Any, symmetric: bool) -> NDArray[np.complex128]:
+def _extremes(block: Any, symmetric: bool) -> Complex:
     if block.shape[0] <= DENSE:
         dense = block if isinstance(block, np.ndarray) else block.toarray()
         found = np.linalg.eigvalsh(dense) if symmetric else np.linalg.eigvals(dense)

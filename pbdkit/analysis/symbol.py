@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
+from pbdkit.analysis.region import Complex, modes
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.scene import Scene
 
-Complex = NDArray[np.complexfloating[Any, Any]]
 WAVES = 48
 """Wave numbers along each axis; an even number, so that the shortest waves are among them."""
 
@@ -56,20 +56,12 @@ def wave_bound(scene: Scene) -> Bound | None:
         return None
     if not np.isfinite(eigenvalues).all():
         return None
-    relaxed = 1.0 + solver.relaxation * (eigenvalues - 1.0)
     return Bound(
         float(eigenvalues.real.min()),
         float(eigenvalues.real.max()),
         float(np.abs(eigenvalues.imag).max()),
-        float(np.abs(with_memory(relaxed, solver.memory)).max()),
+        float(np.abs(modes(eigenvalues, solver.relaxation, solver.memory)).max()),
     )
-
-
-def with_memory(eigenvalues: Complex, memory: float) -> Complex:
-    """Both roots of μ² - (λ + b) μ + b = 0 for every eigenvalue."""
-    half = (eigenvalues + memory) / 2.0
-    root = np.sqrt(half * half - memory + 0j)
-    return np.concatenate([half + root, half - root])
 
 
 def _eigenvalues(matrices: Complex) -> Complex:

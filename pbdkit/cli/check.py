@@ -39,5 +39,10 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
             click.echo(f"  settles    to {steps} steps")
     if found.largest_stable_relaxation is not None:
         click.echo(f"  relaxation stable below {found.largest_stable_relaxation:.6g}")
+    if found.period is not None:
+        click.echo(
+            f"  oscillates: slowest period {found.period:.4g} steps, "
+            f"shrinking by a factor of {found.decay:.4g} a step"
+        )
     for warning in found.warnings:
         click.echo(f"warning: {warning}")
