@@ -29,10 +29,8 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     flags = "parallel=True, " if wanted.parallel else ""
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
     out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(
-        2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,"
-    )
-    out.add(2, "points, entries, bodies, weights, rule, solver, first):")
+    out.add(2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y,")
+    out.add(2, "kept_x, kept_y, points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
     body = Writer()
     body.add(
@@ -45,6 +43,21 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
         "for k in range(4):",
         f"{INDENT}box[k] += growth[k]",
     )
+    _write_sweeps(body, sublattices, wanted)
+    body.add(
+        0,
+        "for e in range(led.size):",
+        f"{INDENT}fvx[led[e]], fvy[led[e]] = led_x[e], led_y[e]",
+        "for e in range(led.size):",
+        f"{INDENT}fux[led[e]], fuy[led[e]] = kept_x[e], kept_y[e]",
+    )
+    if wanted.frame:
+        _write_frame(body, wanted)
+    body.add(0, "ux, uy, vx, vy = vx, vy, ux, uy")
+    out.add(2, *body.lines)
+
+
+def _write_sweeps(body: Writer, sublattices: int, wanted: Wanted) -> None:
     arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, limits, share, step"
     for s in range(sublattices):
         body.add(
@@ -60,17 +73,6 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
             body.add(2, f"sweep_{s}({arguments}, a, b, {tail}")
         else:
             body.add(1, f"sweep_{s}({arguments}, i0, i1, {tail}")
-    body.add(
-        0,
-        "for e in range(led.size):",
-        f"{INDENT}fvx[led[e]], fvy[led[e]] = led_x[e], led_y[e]",
-        "for e in range(led.size):",
-        f"{INDENT}fux[led[e]], fuy[led[e]] = kept_x[e], kept_y[e]",
-    )
-    if wanted.frame:
-        _write_frame(body, wanted)
-    body.add(0, "ux, uy, vx, vy = vx, vy, ux, uy")
-    out.add(2, *body.lines)
 
 
 def _write_frame(body: Writer, wanted: Wanted) -> None:
