@@ -67,6 +67,14 @@ def slot_step(scene: Scene, slot: Slot) -> int:
     return ((slot.target - slot.source) * m + slot.cell[0]) * n + slot.cell[1]
 
 
+def has_neighbours(scene: Scene, sublattice: int, place: Indices) -> Present:
+    """Which particles have any; others stay, whatever the rule makes of nothing."""
+    found = np.zeros(len(place), bool)
+    for slot in scene.neighbourhood.slots[sublattice]:
+        found |= scene.raster.kind.ravel()[place + slot_step(scene, slot)] != EMPTY
+    return found
+
+
 def _alike(
     scene: Scene, state: State, steps: dict[Slot, int], place: Indices
 ) -> tuple[Indices, Indices]:

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import Couplings
-from pbdkit.analysis.linearising import Response, respond, slot_step
+from pbdkit.analysis.linearising import Response, has_neighbours, respond
 from pbdkit.analysis.matrices import Entries
+from pbdkit.analysis.nesting import moves_and_couplings
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
@@ -134,9 +135,12 @@ class _Assembly:
         cells = self._kind.size // self._scene.raster.shape[0]
         for s in range(self._scene.raster.shape[0]):
             own = place if self._scene.raster.shape[0] == 1 else place[place // cells == s]
-            own = own[self._has_neighbours(s, own)]
+            own = own[has_neighbours(self._scene, s, own)]
             if len(own):
-                self._add(own, respond(self._scene, self._state, s, own))
+                if self._scene.inner:
+                    self._add_nested(own)
+                else:
+                    self._add(own, respond(self._scene, self._state, s, own))
                 if memory:
                     self._now.add_scaled_identity(self._unknown[own], memory)
                     self._before.add_scaled_identity(self._unknown[own], -memory)
@@ -148,13 +152,6 @@ class _Assembly:
             self._led,
             self._source.ravel(),
         )
-
-    def _has_neighbours(self, sublattice: int, place: Indices) -> NDArray[np.bool_]:
-        """Particles with no neighbour stay, whatever the rule makes of nothing."""
-        found = np.zeros(len(place), bool)
-        for slot in self._scene.neighbourhood.slots[sublattice]:
-            found |= self._kind[place + slot_step(self._scene, slot)] != EMPTY
-        return found
 
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
@@ -175,6 +172,16 @@ class _Assembly:
                 constant = constant - np.where(present, _times(weight, u[:, there].T), 0.0)
             self._see(rows, there, weight)
         self._source[rows] = constant
+
+    def _add_nested(self, place: Indices) -> None:
+        """The rows of followers whose rule works on the moves of another."""
+        relaxation, rows = self._scene.experiment.solver.relaxation, self._unknown[place]
+        moves, couplings = moves_and_couplings(self._scene, self._state, place)
+        everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
+        u = self._state.u.reshape(2, -1)[:, everybody].T.astype(float, copy=False)
+        self._source[rows] = relaxation * (moves - couplings.times(u))
+        for own, column, blocks in couplings.parts:
+            self._see(rows[own], everybody[column], relaxation * blocks)
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""

@@ -77,12 +77,21 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 def _symbols(scene: Scene) -> Complex:
     """(wave, 2S, 2S): the rule's step on plane waves, of which opposite ones answer alike."""
+    moves: Complex = _moves(scene)
+    one = np.eye(2 * len(scene.neighbourhood.slots))
+    if scene.inner:
+        moves = moves @ (_symbols(scene.inner) - one)
+    symbols: Complex = one + moves
+    return symbols
+
+
+def _moves(scene: Scene) -> Complex:
+    """(wave, 2S, 2S): the moves that the rule makes of plane waves."""
     slots = scene.neighbourhood.slots
     angle = 2 * np.pi * np.arange(WAVES) / WAVES
     half = angle[: WAVES // 2 + 1]
     theta = np.stack(np.meshgrid(half, angle, indexing="ij"), axis=-1).reshape(-1, 2)
     symbols = np.zeros((len(theta), 2 * len(slots), 2 * len(slots)), complex)
-    symbols += np.eye(2 * len(slots))
     for s, own in enumerate(slots):
         here = slice(2 * s, 2 * s + 2)
         symbols[:, here, here] += _derivative(scene, own, None)

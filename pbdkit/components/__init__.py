@@ -19,6 +19,7 @@ def pbdkit_components() -> list[type[Component]]:
         neighbours,
         rules,
         springs,
+        strain_gradient,
     )
 
     return [
@@ -37,6 +38,7 @@ def pbdkit_components() -> list[type[Component]]:
         elasticity.Elastic,
         elasticity.Orthotropic,
         springs.Springs,
+        strain_gradient.StrainGradient,
         frames.MeanFrame,
         frames.FirstFrame,
         frames.MirrorFrame,

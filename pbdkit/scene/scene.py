@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,9 +28,9 @@ from pbdkit.scene.sizes import refuse_too_large
 class Scene:
     """An experiment on its lattice.
 
-    `constants` are what the elementwise functions are called with; `frame` is None without one,
-    `cells` where no frame weighs them; `leading` are the leader groups; `warnings` are for the
-    user.
+    `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner` (the
+    same scene with the rule's inner rule) are None where the scene has none. `leading` are the
+    leader groups, `warnings` are for the user.
     """
 
     experiment: Experiment
@@ -39,6 +39,7 @@ class Scene:
     constants: SceneConstants
     frame: Frame | None
     cells: Cells | None
+    inner: Scene | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
 
@@ -105,8 +106,32 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
     cells = filling.on(raster, tiling) if frame.weighs_cells else None
-    parts = (neighbourhood, raster, constants, following, cells, leading)
-    return Scene(experiment, *parts, tuple(warnings))
+    parts = (neighbourhood, raster, constants, following, cells, None, leading)
+    scene = Scene(experiment, *parts, tuple(warnings))
+    return replace(scene, inner=_inner(scene))
+
+
+def _inner(scene: Scene) -> Scene | None:
+    """The scene with the rule's inner rule in its place."""
+    experiment, rule = scene.experiment, scene.experiment.rule
+    with blaming(rule, "when asked for its inner rule", "rule"):
+        inner = rule.inner()
+    if inner is None:
+        return None
+    for unfit, part, remedy in (
+        (scene.frame, "frame", "{type: natural}, which has no points"),
+        (scene.has_fracture, "fracture", "{type: none}"),
+        (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
+    ):
+        if unfit:
+            raise ExperimentError(
+                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
+                f"this {part}; take {part}: {remedy}",
+                (part,),
+            )
+    experiment = experiment.model_copy(update={"rule": inner})
+    constants = ask_for_constants(experiment, _setting(scene.raster, scene.neighbourhood))
+    return replace(scene, experiment=experiment, constants=constants)
 
 
 def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:

@@ -77,6 +77,8 @@ def _obstacle(scene: Scene) -> str:
         return "numba is not installed: pip install 'pbdkit[fast]'"
     if scene.experiment.neighbours.nearness():
         return "neighbours are found anew at every step"
+    if scene.inner:
+        return "the rule works on the moves of another"
     if max(map(len, scene.neighbourhood.slots)) > 31:
         return "more than 31 neighbours"
     return ""
