@@ -44,6 +44,7 @@ def pbdkit_components() -> list[type[Component]]:
         frames.MirrorFrame,
         frames.NoFrame,
         free_edges.Natural,
+        free_edges.TractionFree,
         fracture.NoFracture,
         fracture.Threshold,
         diagnostics.PE1,

@@ -186,7 +186,7 @@ class _Search:
         return max(LINEAR, 10 * accuracy) * before + self._floor()
 
     def _rounding(self) -> float:
-        return rounding(self._state.u)
+        return self._system.amplification * rounding(self._state.u)
 
     def _floor(self) -> float:
         return self._rounding() * math.sqrt(max(1, self._left.size))

@@ -28,8 +28,8 @@ from pbdkit.scene.sizes import refuse_too_large
 class Scene:
     """An experiment on its lattice.
 
-    `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner` (the
-    same scene with the rule's inner rule) are None where the scene has none. `leading` are the
+    `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner`
+    (the scene with the rule's inner rule) are None where the scene has none. `leading` are the
     leader groups, `warnings` are for the user.
     """
 
