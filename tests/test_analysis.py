@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
 from property_cases import LATTICES, RULES
-from scene_strategies import experiments
+from scene_strategies import calibrated_experiments, experiments
 
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
@@ -44,7 +45,7 @@ def unknowns(scene, u, rows):
     deadline=None,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
-@given(experiments())
+@given(st.one_of(experiments(), calibrated_experiments()))
 def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
     """On random scenes, torn ones too; a nonlinear rule at the state where it is linearised."""
     try:

@@ -38,9 +38,12 @@ class CellElastic(FollowerRule):
     def ratios(self) -> Stiffness:
         """The stiffness over `modulus`: finite for every material that the rule takes."""
 
-    def stiffness(self) -> Stiffness:
-        """Ratios times modulus."""
-        return Stiffness(*(self.modulus() * ratio for ratio in self.ratios()))
+    def stiffness(self) -> Stiffness | None:
+        """Ratios times modulus, where that is finite."""
+        modulus = self.modulus()
+        if not math.isfinite(modulus):
+            return None
+        return Stiffness(*(modulus * ratio for ratio in self.ratios()))
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The modulus; ExperimentError where the lattice has no such cells."""
