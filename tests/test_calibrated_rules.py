@@ -220,8 +220,8 @@ def test_the_energy_of_springs_never_rises(seed, lattice):
 def springs_of(lattice):
     """(i, j, stiffness, rest length) of a 6 × 5 body from the springs' definition: stiffness ¾ on
     edges and ⅜ on diagonals of squares, √¾ on triangles, half where one cell is missing."""
-    scrambled = SPRINGS[lattice] | {"name": "springs", "body": SMALL_GRID, "steps": 1}
-    X = pbdkit.run(scrambled | {"frame": {"type": "none"}}, progress=False).reference.values
+    scene = {"name": "springs", "body": SMALL_GRID, "rule": {"type": "springs"}, "frame": NATURAL}
+    X = build_scene(pbdkit.Experiment(**SPRINGS[lattice], **scene, steps=1)).raster.reference()
     rest, found = np.linalg.norm(X[:, None] - X[None], axis=2), []
     for i, j in zip(*np.nonzero(np.triu(rest)), strict=True):
         if rest[i, j] < 0.51:
