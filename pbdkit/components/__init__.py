@@ -36,4 +36,5 @@ def pbdkit_components() -> list[type[Component]]:
         diagnostics.Displacement,
         diagnostics.Track,
         diagnostics.Broken,
+        diagnostics.SmallestCellArea,
     ]

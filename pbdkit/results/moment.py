@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Moment, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -130,3 +131,27 @@ class StateMoment(Moment):
             body = raster.kind[block.slices()] == FOLLOWER
             sums[block.slices()] = np.where(body, total, 0.0)
         return raster.table(sums[None])[:, 0]
+
+    def over_cells(
+        self,
+        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> Floats:
+        """Patch by patch, each with the cells of one shape."""
+        found = [np.empty(0)]
+        for patch in self._tables.scene.patches:
+            counted = self._intact(patch) if intact_only else patch.whole
+            values = function(patch.differences(self._state.u), patch.cell.rest)
+            found.append(np.broadcast_to(values, counted.shape)[counted])
+        return np.concatenate(found)
+
+    def _intact(self, patch: Patch) -> NDArray[np.bool_]:
+        """Which cells of a patch have no broken bond between their corners."""
+        fracturing, broken, intact = self._tables.fracturing, self._state.broken_step, patch.whole
+        if fracturing is None or broken is None:
+            return intact
+        sides = patch.cell.bonds(self._tables.scene.neighbourhood)
+        for block, slot in ((patch.corners[k], slot) for k, slot in sides):
+            intact = intact & ~fracturing.broken(block, slot, broken)
+        return intact
