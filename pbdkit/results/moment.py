@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -140,11 +140,23 @@ class StateMoment(Moment):
     ) -> Floats:
         """Patch by patch, each with the cells of one shape."""
         found = [np.empty(0)]
-        for patch in self._tables.scene.patches:
-            counted = self._intact(patch) if intact_only else patch.whole
-            values = function(patch.differences(self._state.u), patch.cell.rest)
+        for patch, counted in self.patches(intact_only=intact_only):
+            values = function(self.corners(patch), patch.cell.rest)
             found.append(np.broadcast_to(values, counted.shape)[counted])
         return np.concatenate(found)
+
+    def patches(self, *, intact_only: bool = False) -> Iterator[tuple[Patch, NDArray[np.bool_]]]:
+        """The cells of the body, and which of them count."""
+        for patch in self._tables.scene.patches:
+            yield patch, self._intact(patch) if intact_only else patch.whole
+
+    def corners(self, patch: Patch) -> tuple[Vector, ...]:
+        """u_k - u_0 of the corners."""
+        return patch.differences(self._state.u)
+
+    def number_at(self, patch: Patch, place: int) -> int:
+        """The lowest number of the corners of a cell, given by its flat place on the patch."""
+        return int(patch.rows(self._tables.raster, place).min()) + 1
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:
         """Which cells of a patch have no broken bond between their corners."""

@@ -18,6 +18,7 @@ from pbdkit.errors import PluginError
 from pbdkit.interfaces import Diagnostic, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
+from pbdkit.results.inversion import inside_out
 from pbdkit.results.layout import Column
 from pbdkit.results.moment import StateMoment, Tables
 from pbdkit.scene.scene import Scene
@@ -66,6 +67,7 @@ class Recorder:
         self._sink = sink
         self._tables = Tables(scene)
         self._last_recorded = -1
+        self.warnings: tuple[str, ...] = ()
         diagnostics = scene.experiment.diagnostics
         self._recorded = [d for d in diagnostics if not d.every_step]
         self._stepped = [d for d in diagnostics if d.every_step]
@@ -144,7 +146,11 @@ class Recorder:
             self._sink.put(values)
 
     def finish(self, state: State, outcome: Outcome) -> None:
-        """Hands over what is known at the end, and the attributes."""
+        """Hands over what is known at the end, and the attributes; `warnings` says what the user
+        should know of the last state."""
+        if outcome.status != "diverged":
+            warning = inside_out(StateMoment(state, self._tables))
+            self.warnings = (warning,) if warning else ()
         if self._scene.has_fracture:
             broken = StateMoment(state, self._tables).broken_step()
             if outcome.status == "diverged":  # what broke since the last record is no result
