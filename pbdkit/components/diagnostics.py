@@ -149,18 +149,19 @@ class SmallestCellArea(Diagnostic):
 
 
 def smallest_corner_area(d: tuple[Vector, ...], r: tuple[Vector, ...]) -> Any:
-    """min over the corners k of (x_k+1 - x_k) × (x_k-1 - x_k), over the same at rest."""
+    """min over the corners k of (x_k - x_k-1) × (x_k+1 - x_k), over the same at rest."""
+    rest = [Vector(r[k].x - r[k - 1].x, r[k].y - r[k - 1].y) for k in range(len(r))]
+    now = [
+        Vector(side.x + (d[k].x - d[k - 1].x), side.y + (d[k].y - d[k - 1].y))
+        for k, side in enumerate(rest)
+    ]
     corners = range(len(r)) if len(r) > 3 else range(1)  # the corners of a triangle agree
-    areas = []
-    for k in corners:
-        ahead, behind = (k + 1) % len(r), k - 1
-        a, b = (Vector(r[n].x - r[k].x, r[n].y - r[k].y) for n in (ahead, behind))
-        p, q = (
-            Vector(side.x + (d[n].x - d[k].x), side.y + (d[n].y - d[k].y))
-            for side, n in ((a, ahead), (b, behind))
-        )
-        areas.append((p.x * q.y - p.y * q.x) / (a.x * b.y - a.y * b.x))
-    return reduce(np.minimum, areas)
+    shares = [_cross(now[k - 1], now[k]) / _cross(rest[k - 1], rest[k]) for k in corners]
+    return reduce(np.minimum, shares)
+
+
+def _cross(a: Vector, b: Vector) -> Any:
+    return a.x * b.y - a.y * b.x
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:
