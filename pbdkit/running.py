@@ -29,7 +29,7 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.guard import Guard
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     import xarray
@@ -187,9 +187,22 @@ def _step_through(
             outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
     except FloatingPointError as error:
         reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
+        if recorder.last_recorded < state.step - 1:
+            reason += _keep(recorder, guard.last_good(engine, state.step, patience, stopping))
         outcome = Outcome("diverged", reason, state.step)
     recorder.finish(state, outcome)
     return outcome
+
+
+def _keep(recorder: Recorder, good: State | None) -> str:
+    """Records the last good state of a run that diverged, and says so."""
+    if good is None or good.step <= recorder.last_recorded:
+        return ""
+    try:
+        recorder.observe_last(good)
+    except FloatingPointError:  # of a diagnostic; nothing of that step is kept
+        return ""
+    return f"; kept is step {good.step}, the last no larger than the body and its leaders' ways"
 
 
 def _experiment(

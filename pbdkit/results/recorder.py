@@ -66,7 +66,8 @@ class Recorder:
         self._scene = scene
         self._sink = sink
         self._tables = Tables(scene)
-        self._last_recorded = -1
+        self.last_recorded = -1
+        """The last step of which positions were taken."""
         self.warnings: tuple[str, ...] = ()
         diagnostics = scene.experiment.diagnostics
         self._recorded = [d for d in diagnostics if not d.every_step]
@@ -125,7 +126,7 @@ class Recorder:
 
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""
-        if state.step > self._last_recorded:
+        if state.step > self.last_recorded:
             with np.errstate(all="ignore"):
                 self._observe(state, recorded=True, stepped=False)
 
@@ -139,7 +140,7 @@ class Recorder:
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
             values |= self._measured(self._recorded, moment)
-            self._last_recorded = state.step
+            self.last_recorded = state.step
         if stepped:
             values |= {"step": state.step} | self._measured(self._stepped, moment)
         if values:
@@ -154,7 +155,7 @@ class Recorder:
         if self._scene.has_fracture:
             broken = StateMoment(state, self._tables).broken_step()
             if outcome.status == "diverged":  # what broke since the last record is no result
-                broken = np.where(broken > self._last_recorded, -1, broken)
+                broken = np.where(broken > self.last_recorded, -1, broken)
             self._sink.put({"broken_step": broken})
         self._sink.finish(self._attributes(outcome))
 

@@ -36,6 +36,11 @@ class State:
     broken_step: NDArray[np.int32] | None
     starts: tuple[Floats | None, ...]
 
+    def copy(self) -> State:
+        """The same state in arrays of its own."""
+        broken = None if self.broken_step is None else self.broken_step.copy()
+        return State(self.step, self.u.copy(), self.previous.copy(), broken, self.starts)
+
 
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
