@@ -9,7 +9,9 @@ import pbdkit
 from pbdkit.results.memory import MemorySink
 from pbdkit.running import run_into
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.guard import EVERY, KEPT_EVERY, Guard
+from pbdkit.stepping import guard
+from pbdkit.stepping.guard import EVERY, Guard
+from pbdkit.stepping.state import initial_state
 
 BLOWN = {
     "name": "blown",
@@ -98,9 +100,16 @@ def diverged(**parts):
 
 
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
-@pytest.mark.parametrize("growth", [1.5, 1.01], ids=["at once", "after a copy"])
-def test_the_last_good_state_of_a_run_that_diverges_is_kept(engine, growth):
-    """Growth of 1.01 a step takes longer than the guard waits before it copies a state."""
+@pytest.mark.parametrize(
+    ("growth", "kept_every"), [(1.5, 5000), (1.05, 100)], ids=["from the start", "from a copy"]
+)
+def test_the_last_good_state_of_a_run_that_diverges_is_kept(
+    engine, growth, kept_every, monkeypatch
+):
+    """From the start again where the guard has copied no state yet."""
+    begun = []
+    monkeypatch.setattr(guard, "KEPT_EVERY", kept_every)
+    monkeypatch.setattr(guard, "initial_state", lambda s: begun.append(s) or initial_state(s))
     crack = [[2.5, -1.0], [2.5, 1.5]]
     parts = {
         "initial": {"type": "noise", "amplitude": 1e-9},
@@ -111,7 +120,8 @@ def test_the_last_good_state_of_a_run_that_diverges_is_kept(engine, growth):
     parts["solver"] = {"type": "stepping", "relaxation": relaxation, "engine": engine}
     sparse = diverged(record={"every": 5000}, **parts)
     last = int(sparse.time[-1])
-    assert last > (KEPT_EVERY if growth < 1.1 else 20)
+    assert last > (200 if kept_every == 100 else 20)  # a second copy goes over the first
+    assert len(begun) == (kept_every > last)
     assert sparse.stop_reason.endswith(
         f"kept is step {last}, the last no larger than the body and its leaders' ways"
     )

@@ -14,7 +14,7 @@ from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
 """Steps between two looks, at most; recorded steps are looked at too."""
-KEPT_EVERY = 1000
+KEPT_EVERY = 5000
 """Steps between two copies of the state, at least; what comes after is stepped once more."""
 BEYOND = 1e6
 """How many times the size of the body, its start and its leaders' ways a displacement may be."""
@@ -48,7 +48,7 @@ class Guard:
         if most <= self._size:
             self._last_good = state.step
             if state.step >= KEPT_EVERY + (self._kept.step if self._kept else 0):
-                self._kept = state.copy()
+                self._kept = state.copy(self._kept)
         if most <= BEYOND * self._size:
             return
         u = self._scene.raster.table(state.u)
@@ -68,7 +68,7 @@ class Guard:
             state = engine.advance(state)
             if not _most(state) <= self._size:
                 break
-            good = state.copy()
+            good = state.copy(good)
         return None if stopping() else good
 
 
