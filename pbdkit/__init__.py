@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         DivergedError,
         ExperimentError,
         PbdkitError,
+        PbdkitWarning,
         PluginError,
         StorageError,
     )
@@ -47,7 +48,8 @@ if TYPE_CHECKING:
 
 _HOME = {
     "pbdkit.errors": (
-        "DivergedError", "ExperimentError", "PbdkitError", "PluginError", "StorageError",
+        "DivergedError", "ExperimentError", "PbdkitError", "PbdkitWarning", "PluginError",
+        "StorageError",
     ),
     "pbdkit.experiment.model": ("Experiment",),
     "pbdkit.interfaces": (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
-from pbdkit.errors import DivergedError, ExperimentError
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -28,7 +29,7 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.guard import Guard
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     import xarray
@@ -41,12 +42,13 @@ _STRAIGHT = Choice("equilibrium", 1, "asked for")
 
 @dataclass(frozen=True)
 class Report:
-    """How a run went, for those who look at its cost."""
+    """How a run went, for those who look at its cost, and what is to be said of its end."""
 
     outcome: Outcome
     particles: int
     wall_s: float
     choice: Choice
+    warnings: tuple[str, ...] = ()
 
     @property
     def ns_per_particle_step(self) -> float:
@@ -78,7 +80,8 @@ def run(
 
     `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
     ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
-    DivergedError, with what was recorded before, when the run leaves the finite numbers.
+    DivergedError, with what was recorded before, when the run leaves the finite numbers. Warns,
+    with pbdkit.PbdkitWarning, where the last state is inside out.
     """
     sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
     refuse_too_much_output(scene)
@@ -86,6 +89,8 @@ def run(
     dataset = sink.dataset()
     if report.outcome.status in ("diverged", "unconverged"):
         raise DivergedError(report.outcome.stop_reason, dataset)
+    for warning in report.warnings:
+        warnings.warn(warning, PbdkitWarning, stacklevel=2)
     return dataset
 
 
@@ -135,7 +140,8 @@ def run_into(
     except BaseException:
         sink.abandon()
         raise
-    return Report(outcome, scene.raster.count, time.perf_counter() - begun, choice)
+    wall_s = time.perf_counter() - begun
+    return Report(outcome, scene.raster.count, wall_s, choice, recorder.warnings)
 
 
 def _go_straight(scene: Scene, recorder: Recorder) -> Outcome:
@@ -181,9 +187,22 @@ def _step_through(
             outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
     except FloatingPointError as error:
         reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
+        if recorder.last_recorded < state.step - 1:
+            reason += _keep(recorder, guard.last_good(engine, state.step, patience, stopping))
         outcome = Outcome("diverged", reason, state.step)
     recorder.finish(state, outcome)
     return outcome
+
+
+def _keep(recorder: Recorder, good: State | None) -> str:
+    """Records the last good state of a run that diverged, and says so."""
+    if good is None or good.step <= recorder.last_recorded:
+        return ""
+    try:
+        recorder.observe_last(good)
+    except FloatingPointError:  # of a diagnostic; nothing of that step is kept
+        return ""
+    return f"; kept is step {good.step}, the last no larger than the body and its leaders' ways"
 
 
 def _experiment(

@@ -51,6 +51,8 @@ def run(
     sink = OverlappingSink(NetcdfSink(path, replace=force, compression=loaded.record.compression))
     with asked_to_stop() as stopping:
         report = run_into(sink, scene, progress=not silent, stopping=stopping)
+    for warning in () if quiet else report.warnings:
+        click.echo(f"warning: {warning}", err=True)
     if as_json:
         click.echo(json.dumps(_figures(report, path)))
     elif not quiet and report.outcome.status == "complete":

@@ -18,6 +18,7 @@ from pbdkit.scene.cutting import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
+from pbdkit.scene.mesh import Patch, lattice_cells, patches
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
@@ -63,6 +64,11 @@ class Scene:
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
+
+    @cached_property
+    def patches(self) -> tuple[Patch, ...]:
+        """The cells of the body."""
+        return _body_cells(self.raster)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -185,12 +191,21 @@ def _edge_effects(experiment: Experiment) -> list[str]:
     ]
 
 
+def _body_cells(raster: Raster) -> tuple[Patch, ...]:
+    return tuple(p for p in patches(raster, lattice_cells(raster.lattice.cell())) if p.whole.any())
+
+
 def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
     taken: dict[str, int] = {}
     for n, diagnostic in enumerate(experiment.diagnostics):
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
             diagnostic.check(raster.count)
             diagnostic.coordinates()
+            if diagnostic.uses_cells and not _body_cells(raster):
+                raise ExperimentError(
+                    f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
+                    "belong to the body; make it wider, or leave the diagnostic out"
+                )
             for variable in diagnostic.variables():
                 if variable.name in taken:
                     other = f"diagnostics.{taken[variable.name]} does too"
