@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ HOURGLASS = np.array([1.0, -1.0, 1.0, -1.0])
 """The displacement of the corners that no mean strain knows."""
 
 
+@cache
 def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
@@ -24,6 +26,7 @@ def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
     K += stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+    K.flags.writeable = False
     return K
 
 
