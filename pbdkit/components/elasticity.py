@@ -97,8 +97,8 @@ class Elastic(CellElastic):
     """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
 
     On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
-    it is linear triangles. At ν = -1 on the square lattice it is the barycentre of all neighbours.
-    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal).
+    it is linear triangles. At ν = -1 it is the barycentre, of the four nearest on the square one.
+    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"
