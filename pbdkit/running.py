@@ -34,6 +34,8 @@ from pbdkit.stepping.state import State, initial_state
 if TYPE_CHECKING:
     import xarray
 
+    from pbdkit.identity.identity import Identity
+
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
 Components = Iterable[type[Component]]
@@ -100,6 +102,16 @@ def analyse(
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
     return Analysis(build_scene(_experiment(experiment, components)))
+
+
+def identify(
+    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
+) -> Identity:
+    """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
+    elastic body, with its constants, from the rule's answer to plane waves."""
+    from pbdkit.identity.finding import identified
+
+    return identified(build_scene(_experiment(experiment, components)))
 
 
 def rerun(

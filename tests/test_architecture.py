@@ -15,6 +15,7 @@ ORDER = [
     "scene",
     "stepping",
     "analysis",
+    "identity",
     "equilibrium",
     "results",
     "running",

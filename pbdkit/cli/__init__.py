@@ -12,6 +12,7 @@ import click
 COMMANDS = {
     "run": "run",
     "check": "check",
+    "identify": "identify",
     "experiments": "experiments",
     "init": "experiments",
     "plot": "plot",

@@ -98,7 +98,7 @@ class Elastic(CellElastic):
 
     On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
     it is linear triangles. At ν = -1 it is the barycentre, of the four nearest or all six.
-    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal).
+    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"

@@ -100,7 +100,7 @@ def _build(experiment: Experiment) -> Scene:
     warnings += _doubts(neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
     _check_diagnostics(experiment, raster)
-    constants = ask_for_constants(experiment, _setting(raster, neighbourhood))
+    constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
             f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
@@ -136,7 +136,7 @@ def _inner(scene: Scene) -> Scene | None:
                 (part,),
             )
     experiment = experiment.model_copy(update={"rule": inner})
-    constants = ask_for_constants(experiment, _setting(scene.raster, scene.neighbourhood))
+    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
     return replace(scene, experiment=experiment, constants=constants)
 
 
@@ -154,7 +154,8 @@ def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Fillin
     return fill_with_cells(experiment.body, experiment.lattice, tiling), tiling
 
 
-def _setting(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+    """What a rule may derive its constants from."""
     cell = raster.lattice.cell()
     lower, upper = np.full(2, np.inf), np.full(2, -np.inf)
     for rows in raster.chunks():
