@@ -22,7 +22,9 @@ from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
 class Forecast:
     """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
     where it cannot tell or it would take too long; with memory, the period in steps of the slowest
-    mode that swings and by what it shrinks a step, None where nothing swings; warnings."""
+    mode that swings and by what it shrinks a step, None where nothing swings; by how much the body
+    trails its equilibrium in the leaders' fastest steps, in lattice units, once that is steady and
+    when these steps end, None where no leader moves steadily; warnings."""
 
     particles: int
     followers: int
@@ -36,6 +38,8 @@ class Forecast:
     steps_to: dict[str, int | None]
     period: float | None
     decay: float | None
+    lag: float | None
+    lag_reached: float | None
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -65,6 +69,8 @@ def forecast(scene: Scene) -> Forecast:
         steps_to=analysis.steps_to,
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
+        lag=analysis.lag,
+        lag_reached=analysis.trailing.reached if analysis.trailing else None,
         warnings=(*_doubts(scene), *exact, *waves),
     )
 

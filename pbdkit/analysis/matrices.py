@@ -23,6 +23,15 @@ class Entries:
     values: NDArray[np.float64]
     shape: tuple[int, int]
 
+    def plus(self, other: Entries, factor: float = 1.0) -> Entries:
+        """The sum with `factor` times a matrix of the same shape."""
+        return Entries(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.columns, other.columns]),
+            np.concatenate([self.values, factor * other.values]),
+            self.shape,
+        )
+
     def matrix(self) -> Any:
         """Dense up to DENSE rows, else sparse."""
         if self.shape[0] > DENSE:

@@ -36,7 +36,8 @@ class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
     `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
-    2n + 1 its y, and the same for leaders. The couplings hold the same by particle.
+    2n + 1 its y, and the same for leaders. The couplings hold the same by particle; of those with
+    leaders, `couplings_shown` is the share that frame points show.
     """
 
     followers: Indices
@@ -44,6 +45,7 @@ class StepOperator:
     couplings_now: Couplings
     couplings_before: Couplings
     couplings_led: Couplings
+    couplings_shown: Couplings
     source: Floats
 
     @cached_property
@@ -125,7 +127,7 @@ class _Assembly:
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
         self._now, self._before = Couplings((free, free)), Couplings((free, free))
-        self._led = Couplings((free, led))
+        self._led, self._shown = Couplings((free, led)), Couplings((free, led))
         self._source = np.zeros((free, 2))
 
     def operator(self) -> StepOperator:
@@ -150,6 +152,7 @@ class _Assembly:
             self._now,
             self._before,
             self._led,
+            self._shown,
             self._source.ravel(),
         )
 
@@ -205,7 +208,8 @@ class _Assembly:
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
-            for couplings, those in ((self._led, of_leader), (free, ~of_leader)):
+            sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
+            for couplings, those in sums:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Setting, Vector
+from pbdkit.interfaces import Cell, Setting, Vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Cells, Tiling, tiling_of
@@ -19,10 +19,13 @@ from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.mesh import Patch, lattice_cells, patches
-from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
+from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
 from pbdkit.scene.sizes import refuse_too_large
+
+FLAT = 0.05
+"""Cells flatter than this are warned of."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def _build(experiment: Experiment) -> Scene:
         body, first = filling.body, filling.first
     else:
         body, first = fill(experiment.body, experiment.lattice)
-    warnings += _doubts(neighbourhood, body, layers) + _edge_effects(experiment)
+    warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
     _check_diagnostics(experiment, raster)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
@@ -165,8 +168,14 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     return Setting(cell, neighbourhood.slots, Vector(*lower.tolist()), Vector(*upper.tolist()))
 
 
-def _doubts(neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
+def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
     doubts = []
+    if flatness(cell) < FLAT:
+        doubts.append(
+            f"lattice: nearly degenerate, sites lie {1 / flatness(cell):.3g} times closer along "
+            "one line than its longer cell vector is long, so that neighbours by distance lie "
+            "along that line; take chebyshev neighbours, or open the angle between the vectors"
+        )
     if not neighbourhood.spans_plane():
         doubts.append(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
