@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
+from pbdkit.equilibrium.certificate import Certificate
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.settling import Settling
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
@@ -165,25 +167,39 @@ def _step_through(
 ) -> Outcome:
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
-    outcome, guard = Outcome("complete", "all steps done", steps), Guard(scene, state)
+    outcome, guard = None, Guard(scene, state)
+    asked = scene.experiment.solver.settle
+    settling = Settling(scene, asked, state) if asked else None
     try:
         recorder.observe(state)
-        while state.step < steps and not stopping():
+        while state.step < steps and not outcome and not stopping():
             wanted = recorder.next_after(state.step)
             reached = min(wanted, guard.next_look, state.step + patience)
+            if settling:
+                reached = min(reached, settling.next_look)
             state = engine.advance(state, reached - state.step)
             if reached == guard.next_look or recorder.records(reached):
                 guard.look(state)
             recorder.observe(state)
             show(state.step)
+            if settling and reached == settling.next_look:
+                outcome = _settled(state.step, settling.look(state))
         if state.step < steps:
             recorder.observe_last(state)
-            outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
+            stopped = f"stopped after step {state.step}"
+            outcome = outcome or Outcome("interrupted", stopped, state.step)
     except FloatingPointError as error:
         reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
         outcome = Outcome("diverged", reason, state.step)
+    outcome = outcome or Outcome("complete", "all steps done", steps)
     recorder.finish(state, outcome)
     return outcome
+
+
+def _settled(step: int, certificate: Certificate | None) -> Outcome | None:
+    if certificate is None:
+        return None
+    return Outcome("settled", f"settled: {certificate}", step, certificate.as_dict())
 
 
 def _experiment(
