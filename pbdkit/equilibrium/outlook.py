@@ -39,7 +39,7 @@ class Outlook:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """The system of an operator, and where its unknowns are on the flat raster."""
+    """A linearisation of the step, and where its unknowns are on the flat raster."""
 
     operator: StepOperator
     system: System
@@ -74,14 +74,15 @@ class Foresight:
         """
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         here = replace(state, u=u, previous=previous)
-        broken = 0 if state.broken_step is None else np.count_nonzero(state.broken_step >= 0)
+        broken = 0 if state.broken_step is None else int((state.broken_step >= 0).sum())
         if self._at_rest is None or broken != self._broken:
             self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
             self._linear = False
-        found = self._corrected(here, self._at_rest, at_rest=True)
-        if found is None:
-            found = self._corrected(here, self._linearised(here, u), at_rest=False)
-        assert found is not None
+        found = self._outlook(here, self._at_rest)
+        if not self._linear:
+            known = self._linearised(here, u)
+            found = self._outlook(here, known, anew=True)
+            self._past_iterations += known.system.iterations
         return found
 
     @property
@@ -97,45 +98,45 @@ class Foresight:
         system = System(operator, "auto", reference)
         return _Linearised(operator, system, self._scene.raster.place_of(operator.followers))
 
-    def _corrected(self, here: State, known: _Linearised, *, at_rest: bool) -> Outlook | None:
-        """None where the system is that of the scene at rest and the rule not known to be
-        linear."""
-        system, place = known.system, known.place
-        moves = self._moves.at(here.u, here.broken_step, place)
+    def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:
+        """By the system of the scene at rest, which also tells whether the rule is linear, or by
+        one that was linearised `anew` at the state."""
+        moves = self._moves.at(here.u, here.broken_step, known.place)
         ahead, distance = here.u.copy(), math.inf
-        try:
-            if not at_rest:
-                system.refuse_moving_floats(moves, rounding(here.u))
-            correction = system.solve(moves, ACCURACY, owed_by(known.operator, here, place))
-        except ExperimentError:
-            if at_rest and not self._linear:
-                return None
-        else:
-            ahead.reshape(2, -1)[:, place] += correction.T
-            left = self._moves.at(ahead, here.broken_step, place)
-            if at_rest and not self._is_linear(
-                moves, left, moves - system.times(correction), ahead
-            ):
-                return None
-            bound = system.distance(left, rounding(ahead)) * (1.0 if at_rest else FIRST_ORDER)
+        correction = self._correction(here, known, moves, anew)
+        if correction is not None:
+            ahead.reshape(2, -1)[:, known.place] += correction.T
+            left = self._moves.at(ahead, here.broken_step, known.place)
+            if not anew:
+                self._compare(moves, left, moves - known.system.times(correction), ahead)
+            bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
-        if not at_rest:
-            self._past_iterations += system.iterations
         return Outlook(
             u=ahead,
             distance=distance if math.isfinite(distance) else math.inf,
             residual=float(np.abs(moves).max(initial=0.0)),
-            method=system.methods,
-            bound=system.how,
-            linearised=not at_rest,
+            method=known.system.methods,
+            bound=known.system.how,
+            linearised=anew,
         )
 
-    def _is_linear(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Vectors) -> bool:
-        """Whether the correction left what the system says. Moves as small as what rounding does
-        tell nothing; then what was known before holds."""
+    def _correction(
+        self, here: State, known: _Linearised, moves: Vectors, anew: bool
+    ) -> Vectors | None:
+        """(follower, axis); None where there is no equilibrium, or none that is known."""
+        try:
+            if anew:
+                known.system.refuse_moving_floats(moves, rounding(here.u))
+            owed = owed_by(known.operator, here, known.place)
+            return known.system.solve(moves, ACCURACY, owed)
+        except ExperimentError:
+            return None
+
+    def _compare(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Vectors) -> None:
+        """Whether the correction left what the system says it would: the rule is linear. Moves as
+        small as what rounding does tell nothing; what was known before holds then."""
         floor = rounding(ahead) * math.sqrt(max(1, moves.size))
         with np.errstate(all="ignore"):
-            size, wrong = np.linalg.norm(moves), np.linalg.norm(left - expected)
+            size, wrong = float(np.linalg.norm(moves)), float(np.linalg.norm(left - expected))
         if size > TELLING * floor:
-            self._linear = bool(wrong <= LINEAR * size + floor)
-        return self._linear
+            self._linear = wrong <= LINEAR * size + floor

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
-FINEST, COARSEST = 64, 4
+FINEST, COARSEST = 256, 4
 """Looks lie apart by between these parts of the steps since the first: what comes late comes late
-by a 64th."""
-UNKNOWN = math.log(2.0)
-"""The rate at which steps are taken to shrink before two have been seen."""
+by a 256th, or by a step."""
+OVERDUE = 4
+"""Where steps are short but shrink no more (rounding, or a body that swings), a bound is made each
+time the steps since the first look are this many times more."""
 NEVER = 2**62
 
 
@@ -27,7 +28,7 @@ class Pace:
     def __init__(self, first: int, tolerance: float) -> None:
         self.next_look = first
         self._begin, self._tolerance = first - 1, tolerance
-        self._rate = UNKNOWN
+        self._rate = 0.0
         self._seen: tuple[int, float] | None = None
         self._bounded: tuple[int, float] | None = None
         self._overdue: int | None = None
@@ -42,9 +43,10 @@ class Pace:
         # Of two states within the tolerance none is farther from the other than twice that.
         short = longest <= 2.0 * self._tolerance
         if short and self._overdue is None:
-            self._overdue = 2 * elapsed
+            self._overdue = OVERDUE * elapsed
         distance = _distance(longest, self._rate)
-        if short and (distance <= self._tolerance or elapsed >= (self._overdue or 0)):
+        stalls = self._rate == 0.0 and elapsed >= (self._overdue or 0)
+        if short and (distance <= self._tolerance or stalls):
             return True
         self._wait(step, _steps_until(distance, self._tolerance, self._rate))
         return False
@@ -53,8 +55,9 @@ class Pace:
         """What the bound came to, where the run goes on."""
         here = (step, distance)
         rate = (_rate(self._bounded, here) if self._bounded else 0.0) or self._rate
-        self._bounded, self._overdue = here, 2 * (step - self._begin)
-        self._wait(step, _steps_until(distance, min(self._tolerance, distance / 2), rate))
+        wanted = self._tolerance if distance > self._tolerance else distance / 2
+        self._bounded, self._overdue = here, OVERDUE * (step - self._begin)
+        self._wait(step, _steps_until(distance, wanted, rate))
 
     def _wait(self, step: int, steps: float) -> None:
         elapsed = step - self._begin
