@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
-from pbdkit.equilibrium.certificate import Certificate
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
-from pbdkit.equilibrium.settling import Settling
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
@@ -30,10 +28,12 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.guard import Guard
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     import xarray
+
+    from pbdkit.equilibrium.settling import Settling
 
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
@@ -168,8 +168,7 @@ def _step_through(
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
     outcome, guard = None, Guard(scene, state)
-    asked = scene.experiment.solver.settle
-    settling = Settling(scene, asked, state) if asked else None
+    settling = _settling(scene, state)
     try:
         recorder.observe(state)
         while state.step < steps and not outcome and not stopping():
@@ -183,7 +182,7 @@ def _step_through(
             recorder.observe(state)
             show(state.step)
             if settling and reached == settling.next_look:
-                outcome = _settled(state.step, settling.look(state))
+                outcome = _settled(settling, state)
         if state.step < steps:
             recorder.observe_last(state)
             stopped = f"stopped after step {state.step}"
@@ -191,15 +190,24 @@ def _step_through(
     except FloatingPointError as error:
         reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
         outcome = Outcome("diverged", reason, state.step)
-    outcome = outcome or Outcome("complete", "all steps done", steps)
+    unsettled = f", not settled: {settling.obstacle}" if settling else ""
+    outcome = outcome or Outcome("complete", f"all steps done{unsettled}", steps)
     recorder.finish(state, outcome)
     return outcome
 
 
-def _settled(step: int, certificate: Certificate | None) -> Outcome | None:
-    if certificate is None:
+def _settling(scene: Scene, start: State) -> Settling | None:
+    asked = scene.experiment.solver.settle
+    if asked is None:
         return None
-    return Outcome("settled", f"settled: {certificate}", step, certificate.as_dict())
+    from pbdkit.equilibrium.settling import Settling  # only where it is asked for
+
+    return Settling(scene, asked, start)
+
+
+def _settled(settling: Settling, state: State) -> Outcome | None:
+    found = settling.look(state)
+    return Outcome("settled", str(found), state.step, found.as_dict()) if found else None
 
 
 def _experiment(

@@ -53,16 +53,22 @@ def run(
         report = run_into(sink, scene, progress=not silent, stopping=stopping)
     if as_json:
         click.echo(json.dumps(_figures(report, path)))
-    elif not quiet and report.outcome.status == "complete":
-        outcome = report.outcome
-        size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
-        click.echo(f"{outcome.status}: {size}, written to {path}")
-        if outcome.certificate:
-            click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
-            return 0
+    elif not quiet and report.outcome.status in ("complete", "settled"):
+        _say(report, path, settling=loaded.solver.settle is not None)
+    return _exit_code(report, path)
+
+
+def _say(report: Report, path: Path, *, settling: bool) -> None:
+    outcome = report.outcome
+    size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
+    click.echo(f"{outcome.status}: {size}, written to {path}")
+    if outcome.certificate:
+        click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
+    elif settling:
+        click.echo(outcome.stop_reason)
+    if report.choice.engine != "equilibrium":
         threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""
         click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
-    return _exit_code(report, path)
 
 
 def _refuse_existing(path: Path, force: bool) -> None:

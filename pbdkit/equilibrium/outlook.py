@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Vectors = NDArray[np.float64]
+Vectors = NDArray[np.floating[Any]]
 ACCURACY = 1e-8
 """How well linear systems are solved; the bound takes in what that leaves."""
 TELLING = 1e3
@@ -27,7 +28,8 @@ TELLING = 1e3
 class Outlook:
     """`u` is the equilibrium ahead as far as it is known, and no follower is farther from it than
     `distance`; `residual` is the largest move at the state, `bound` says how the distance was
-    obtained, by which linear `method`, and whether the rule was `linearised`."""
+    obtained, by which linear `method`, and whether the rule was `linearised`; `obstacle` why there
+    is no distance, where it is infinite."""
 
     u: Vectors
     distance: float
@@ -35,6 +37,7 @@ class Outlook:
     method: str
     bound: str
     linearised: bool
+    obstacle: str
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ class Foresight:
         one that was linearised `anew` at the state."""
         moves = self._moves.at(here.u, here.broken_step, known.place)
         ahead, distance = here.u.copy(), math.inf
-        correction = self._correction(here, known, moves, anew)
+        correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
             ahead.reshape(2, -1)[:, known.place] += correction.T
             left = self._moves.at(ahead, here.broken_step, known.place)
@@ -118,19 +121,20 @@ class Foresight:
             method=known.system.methods,
             bound=known.system.how,
             linearised=anew,
+            obstacle=obstacle,
         )
 
     def _correction(
         self, here: State, known: _Linearised, moves: Vectors, anew: bool
-    ) -> Vectors | None:
-        """(follower, axis); None where there is no equilibrium, or none that is known."""
+    ) -> tuple[Vectors | None, str]:
+        """(follower, axis); None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:
                 known.system.refuse_moving_floats(moves, rounding(here.u))
             owed = owed_by(known.operator, here, known.place)
-            return known.system.solve(moves, ACCURACY, owed)
-        except ExperimentError:
-            return None
+            return known.system.solve(moves, ACCURACY, owed), ""
+        except ExperimentError as error:
+            return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
     def _compare(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Vectors) -> None:
         """Whether the correction left what the system says it would: the rule is linear. Moves as

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pbdkit.equilibrium.certificate import CORRECTION, Certificate, scale_of
@@ -32,6 +34,10 @@ class Settling:
         self._foresight = Foresight(scene)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
+        self.obstacle = (
+            "steps are too few" if ends else "leaders do not come to rest before its end"
+        )
+        """Why the run has not settled, as found at the last look."""
 
     @property
     def next_look(self) -> int:
@@ -44,13 +50,25 @@ class Settling:
             way = (state.u - state.previous).ravel()
             longest, size = float(np.abs(way).max()), float(np.linalg.norm(way))
         if not self._pace.is_near(state.step, longest, size):
+            self.obstacle = f"in step {state.step} particles still moved by up to {longest:.2g}"
             return None
         outlook = self._foresight.from_(state)
         distance = outlook.distance + self._carrying * longest
-        if distance <= self._tolerance and not self._may_break(state, outlook):
+        self.obstacle = self._obstacle(state, outlook, distance)
+        if not self.obstacle:
             return self._certificate(outlook, distance)
         self._pace.note_distance(state.step, distance)
         return None
+
+    def _obstacle(self, state: State, outlook: Outlook, distance: float) -> str:
+        at = f"at step {state.step}"
+        if not math.isfinite(distance):
+            return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"
+        if distance > self._tolerance:
+            return f"{at} within {distance:.2g} of equilibrium, not within {self._tolerance:.2g}"
+        if self._may_break(state, outlook):
+            return f"{at} a bond may break on the last {distance:.2g} to equilibrium"
+        return ""
 
     def _may_break(self, state: State, outlook: Outlook) -> bool:
         """Whether a bond might break within the distance of the equilibrium at both its ends."""
