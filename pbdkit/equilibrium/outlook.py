@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,9 @@ from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import Floats, State
 
-Vectors = NDArray[np.floating[Any]]
+Vectors = NDArray[np.float64]
 ACCURACY = 1e-8
 """How well linear systems are solved; the bound takes in what that leaves."""
 TELLING = 1e3
@@ -31,7 +30,7 @@ class Outlook:
     obtained, by which linear `method`, and whether the rule was `linearised`; `obstacle` why there
     is no distance, where it is infinite."""
 
-    u: Vectors
+    u: Floats
     distance: float
     residual: float
     method: str
@@ -94,7 +93,7 @@ class Foresight:
         own = self._at_rest.system.iterations if self._at_rest else 0
         return self._past_iterations + own
 
-    def _linearised(self, state: State, u: Vectors) -> _Linearised:
+    def _linearised(self, state: State, u: Floats) -> _Linearised:
         operator = step_operator(self._scene, replace(state, u=u))
         reference = self._scene.raster.reference(operator.followers)
         self.linearisations += 1
@@ -136,7 +135,7 @@ class Foresight:
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
-    def _compare(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Vectors) -> None:
+    def _compare(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Floats) -> None:
         """Whether the correction left what the system says it would: the rule is linear. Moves as
         small as what rounding does tell nothing; what was known before holds then."""
         floor = rounding(ahead) * math.sqrt(max(1, moves.size))
