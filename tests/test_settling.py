@@ -1,6 +1,7 @@
 """solver.settle ends a run where it is certainly near equilibrium, never before, hardly after."""
 
 import json
+import re
 import subprocess
 import sys
 from functools import partial
@@ -94,7 +95,9 @@ def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tol
 @pytest.mark.parametrize("rule", ["barycentre", "mean-displacement", "mixed-coordinate"])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
 def test_it_ends_hardly_after_the_first_step_within_the_tolerance(lattice, rule, tolerance):
-    given_ = sheet(lattice=lattice, rule=rule, tolerance=tolerance, solver={"relaxation": 0.9})
+    near = {"type": "chebyshev", "shells": 1}
+    parts = {"lattice": lattice, "rule": rule, "neighbours": near}
+    given_ = sheet(**parts, tolerance=tolerance, solver={"relaxation": 0.9})
     ds = run(given_)
     assert ds.attrs["status"] == "settled"
     rest, _ = stepped_on(given_, ds)
@@ -196,12 +199,11 @@ def test_nonlinear_rules_settle_where_leaders_hold_them():
 def test_a_nonlinear_body_that_nothing_holds_goes_on_and_says_why():
     noise = {"type": "noise", "amplitude": 0.1}
     given_ = sheet(4, 3, rule="distance-weighted", solver={"relaxation": 0.5}, leaders=[],
-                   initial=noise, steps=500)  # fmt: skip
+                   initial=noise, steps=100)  # fmt: skip
     ds = run(given_)
     assert ds.attrs["status"] == "complete"
     reason = r"not settled: at step \d+ there is no unique .*a part of 12 particles.*hold it"
-    pytest.raises(AssertionError, match="x").__class__  # noqa: B018
-    assert __import__("re").search(reason, ds.attrs["stop_reason"])
+    assert re.search(reason, ds.attrs["stop_reason"])
 
 
 class Leaning(pbdkit.FollowerRule):
@@ -289,7 +291,7 @@ def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monke
     call = ["run", "paper/a", "--set", "solver.settle.tolerance=1e-3", "--set", "steps=5000"]
     done = CliRunner().invoke(program, call)
     assert done.exit_code == 0
-    assert "settled: 110 particles" in done.output or "settled: 100 particles" in done.output
+    assert "settled: 144 particles, 878 steps in " in done.output
     assert "of equilibrium (0.001 of the largest prescribed displacement), by the" in done.output
     assert "engine: numpy" in done.output
     figures = CliRunner().invoke(program, [*call, "--json", "--force"])
