@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
@@ -19,8 +20,6 @@ from pbdkit.stepping.state import Floats, State
 Vectors = NDArray[np.float64]
 ACCURACY = 1e-8
 """How well linear systems are solved; the bound takes in what that leaves."""
-TELLING = 1e3
-"""How many times what rounding does moves must be to tell a linear rule from another."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,12 @@ class Foresight:
         broken = 0 if state.broken_step is None else int((state.broken_step >= 0).sum())
         if self._at_rest is None or broken != self._broken:
             self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
-            self._linear = False
-        found = self._outlook(here, self._at_rest)
-        if not self._linear:
-            known = self._linearised(here, u)
-            found = self._outlook(here, known, anew=True)
-            self._past_iterations += known.system.iterations
+            self._linear = self._is_linear(here, self._at_rest)
+        if self._linear:
+            return self._outlook(here, self._at_rest)
+        known = self._linearised(here, u)
+        found = self._outlook(here, known, anew=True)
+        self._past_iterations += known.system.iterations
         return found
 
     @property
@@ -101,16 +100,13 @@ class Foresight:
         return _Linearised(operator, system, self._scene.raster.place_of(operator.followers))
 
     def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:
-        """By the system of the scene at rest, which also tells whether the rule is linear, or by
-        one that was linearised `anew` at the state."""
+        """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
         moves = self._moves.at(here.u, here.broken_step, known.place)
         ahead, distance = here.u.copy(), math.inf
         correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
             ahead.reshape(2, -1)[:, known.place] += correction.T
             left = self._moves.at(ahead, here.broken_step, known.place)
-            if not anew:
-                self._compare(moves, left, moves - known.system.times(correction), ahead)
             bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
         return Outlook(
@@ -135,11 +131,17 @@ class Foresight:
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
-    def _compare(self, moves: Vectors, left: Vectors, expected: Vectors, ahead: Floats) -> None:
-        """Whether the correction left what the system says it would: the rule is linear. Moves as
-        small as what rounding does tell nothing; what was known before holds then."""
-        floor = rounding(ahead) * math.sqrt(max(1, moves.size))
+    def _is_linear(self, here: State, known: _Linearised) -> bool:
+        """Whether followers put elsewhere, at random and as far as the body has come, move by what
+        the linearisation at rest says."""
+        size = float(np.abs(here.u).max()) or spacing_of(self._scene)
+        shape = (len(known.place), 2)
+        put = np.random.default_rng(0).uniform(-size, size, shape)
+        there = here.u.copy()
+        there.reshape(2, -1)[:, known.place] += put.T
+        change = self._moves.at(there, here.broken_step, known.place) - self._moves.at(
+            here.u, here.broken_step, known.place
+        )
         with np.errstate(all="ignore"):
-            size, wrong = float(np.linalg.norm(moves)), float(np.linalg.norm(left - expected))
-        if size > TELLING * floor:
-            self._linear = wrong <= LINEAR * size + floor
+            wrong = float(np.linalg.norm(change + known.system.times(put)))
+        return wrong <= LINEAR * float(np.linalg.norm(put))
