@@ -214,7 +214,7 @@ def _left_kernel(matrix: Any) -> Floats:
     basis = np.random.default_rng(0).normal(size=(size, MOST_MODES))
     for _ in range(4):
         basis = np.linalg.qr(nearly.solve_transposed(basis, ROUGH))[0]
-    turned, values, _ = np.linalg.svd(basis.T @ matrix)
+    turned, values, _ = np.linalg.svd(basis.T @ matrix, full_matrices=False)
     return np.asarray(basis @ turned[:, values <= SINGULAR])
 
 
