@@ -310,3 +310,17 @@ def test_runs_without_it_import_nothing_of_it():
     )
     done = subprocess.run([sys.executable, "-c", start], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
+@pytest.mark.parametrize("solver", [{}, {"memory": 0.3, "relaxation": 0.9}])
+@pytest.mark.parametrize("frame", ["mean", "lag"])
+def test_a_large_released_body_settles_within_what_is_certified(rule, solver, frame):
+    """More than 500 unknowns that nothing holds, which keep what they had at the release."""
+    leaders = [pull_right(0.3, 0.1) | {"until": 9}]
+    given_ = sheet(25, 24, rule=rule, leaders=leaders, solver=solver, frame=frame, steps=40_000)
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds, 40_000)
+    assert np.abs(rest).max() > 0.01
+    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
