@@ -64,7 +64,7 @@ def error_of(ds, rest):
 
 
 @settings(
-    max_examples=40,
+    max_examples=25,
     deadline=None,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
@@ -75,13 +75,13 @@ def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tol
     solver = drawn["solver"] | {"settle": {"tolerance": tolerance}, "engine": "numpy"}
     if drawn["rule"]["type"] == "distance-weighted":
         solver |= {"relaxation": 0.4, "memory": 0.0}
-    given_ = drawn | {"solver": solver, "steps": 3000, "record": LAST, "diagnostics": []}
+    given_ = drawn | {"solver": solver, "steps": 1000, "record": LAST, "diagnostics": []}
     try:
         ds = run(given_)
     except (pbdkit.ExperimentError, pbdkit.DivergedError):
         assume(False)
     assume(ds.attrs["status"] == "settled")
-    rest, broken = stepped_on(given_, ds)
+    rest, broken = stepped_on(given_, ds, 5000)
     assume(rest is not None)
     known = certificate(ds)
     assert error_of(ds, rest) <= known["distance"] + 1e-11 * max(1.0, np.abs(rest).max())
@@ -313,10 +313,11 @@ def test_runs_without_it_import_nothing_of_it():
 
 
 @pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
-@pytest.mark.parametrize("solver", [{}, {"memory": 0.3, "relaxation": 0.9}])
+@pytest.mark.parametrize("memory", [0.0, 0.3])
 @pytest.mark.parametrize("frame", ["mean", "lag"])
-def test_a_large_released_body_settles_within_what_is_certified(rule, solver, frame):
+def test_a_large_released_body_settles_within_what_is_certified(rule, memory, frame):
     """More than 500 unknowns that nothing holds, which keep what they had at the release."""
+    solver = {"memory": memory, "relaxation": 0.9}
     leaders = [pull_right(0.3, 0.1) | {"until": 9}]
     given_ = sheet(25, 24, rule=rule, leaders=leaders, solver=solver, frame=frame, steps=40_000)
     ds = run(given_)
@@ -324,3 +325,13 @@ def test_a_large_released_body_settles_within_what_is_certified(rule, solver, fr
     rest, _ = stepped_on(given_, ds, 40_000)
     assert np.abs(rest).max() > 0.01
     assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
+
+
+def test_what_swings_for_ever_never_settles():
+    """Relaxation 1 has a mode that alternates for ever (eigenvalue -1), by .0018 a step here."""
+    leaders = [pull_right(0.3, 0.1) | {"until": 9}]
+    parts = {"rule": "mixed-coordinate", "leaders": leaders, "frame": "lag", "steps": 4000}
+    ds = run(sheet(25, 24, **parts, solver={"engine": "numpy"}))
+    assert ds.attrs["status"] == "complete"
+    reason = r"not settled: in step \d+ particles still moved by up to 0.0018$"
+    assert re.search(reason, ds.attrs["stop_reason"])
