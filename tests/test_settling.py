@@ -196,6 +196,33 @@ def test_nonlinear_rules_settle_where_leaders_hold_them():
     assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.1 * error_of(ds, rest)
 
 
+def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
+    """A body without a frame that shrinks to a point: there the distance-weighted rule has no
+    derivative, and a correction that is too short by far must not be trusted."""
+    body = {"type": "dogbone", "length": 9.1, "width": 5.0, "gauge_length": 3.0,
+            "gauge_width": 2.1, "radius": 2.0, "origin": [-2.0, -1.0]}  # fmt: skip
+    hold = {"select": {"nearest": [[0.95, 1.6]]}, "motion": {"type": "hold"}, "from": 5}
+    given_ = sheet(
+        lattice={"type": "hexagonal", "a": 1.9},
+        body=body,
+        neighbours={"type": "chebyshev", "shells": 1},
+        rule="distance-weighted",
+        frame={"type": "none"},
+        initial={"type": "noise", "amplitude": 0.05},
+        leaders=[hold],
+        solver={"relaxation": 0.4},
+        steps=3000,
+    )
+    ds = run(given_)
+    rest, _ = stepped_on(given_, ds)
+    assert np.ptp((ds.reference.values + rest), axis=0).max() < 1e-9
+    assert ds.attrs["status"] == "settled"
+    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    early = run(given_ | {"steps": 320})
+    assert "not settled: at step" in early.attrs["stop_reason"]
+    assert "the rule bends too much" in early.attrs["stop_reason"]
+
+
 def test_a_nonlinear_body_that_nothing_holds_goes_on_and_says_why():
     noise = {"type": "noise", "amplitude": 0.1}
     given_ = sheet(4, 3, rule="distance-weighted", solver={"relaxation": 0.5}, leaders=[],

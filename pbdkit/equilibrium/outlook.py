@@ -21,6 +21,11 @@ Vectors = NDArray[np.float64]
 ACCURACY = 1e-8
 """How well linear systems are solved; the bound takes in what that leaves."""
 
+CONTRACTION = 0.1
+"""The share of the moves that a correction may leave for its linearisation to be trusted: further
+ones, each that much smaller, then lie within a ninth of the first."""
+BENT = "the rule bends too much between there and equilibrium for a bound"
+
 
 @dataclass(frozen=True)
 class Outlook:
@@ -55,7 +60,8 @@ class Foresight:
 
         distance ≤ max |c| + (bound on |A⁻¹|) · |move(u + c)|,
 
-    for rules that are not linear with A linearised at u, the second term to first order, doubled.
+    for rules that are not linear with A linearised at u, the second term to first order, doubled,
+    and only where the correction leaves a tenth of the moves at most.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -109,6 +115,8 @@ class Foresight:
             left = self._moves.at(ahead, here.broken_step, known.place)
             bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
+            if anew and not _smaller(left, moves, rounding(ahead)):
+                distance, obstacle = math.inf, BENT
         return Outlook(
             u=ahead,
             distance=distance if math.isfinite(distance) else math.inf,
@@ -145,3 +153,8 @@ class Foresight:
         with np.errstate(all="ignore"):
             wrong = float(np.linalg.norm(change + known.system.times(put)))
         return wrong <= LINEAR * float(np.linalg.norm(put))
+
+
+def _smaller(left: Vectors, moves: Vectors, rounding: float) -> bool:
+    most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding
+    return bool(np.abs(left).max(initial=0.0) <= most)
