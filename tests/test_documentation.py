@@ -30,14 +30,14 @@ def test_python_runs(page, code):
     names = {}
     exec(compile(code, page.name, "exec"), names)
     if "ds" in names:
-        assert names["ds"].attrs["status"] == "complete"
+        assert names["ds"].attrs["status"] in ("complete", "settled")
         assert abs(names["ds"].position - names["ds"].reference).max() > 0
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
 def test_experiments_run(page, code):
     experiment = pbdkit.Experiment.build(read_text(code, page.name))
-    assert pbdkit.run(experiment, progress=False).attrs["status"] == "complete"
+    assert pbdkit.run(experiment, progress=False).attrs["status"] in ("complete", "settled")
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("console"))
