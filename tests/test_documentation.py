@@ -30,7 +30,7 @@ def test_python_runs(page, code):
     names = {}
     exec(compile(code, page.name, "exec"), names)
     if "ds" in names:
-        assert names["ds"].attrs["status"] in ("complete", "settled")
+        assert names["ds"].attrs["status"] == "complete"
         assert abs(names["ds"].position - names["ds"].reference).max() > 0
 
 
