@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pbdkit.api import analyse, identify, load, rerun, run
     from pbdkit.errors import (
         DivergedError,
         ExperimentError,
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     )
     from pbdkit.registry.hooks import hookimpl
     from pbdkit.results.accessor import open
-    from pbdkit.running import analyse, identify, load, rerun, run
 
 _HOME = {
     "pbdkit.errors": (
@@ -60,7 +60,7 @@ _HOME = {
     ),
     "pbdkit.registry.hooks": ("hookimpl",),
     "pbdkit.results.accessor": ("open",),
-    "pbdkit.running": ("analyse", "identify", "load", "rerun", "run"),
+    "pbdkit.api": ("analyse", "identify", "load", "rerun", "run"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 

@@ -19,6 +19,7 @@ ORDER = [
     "equilibrium",
     "results",
     "running",
+    "api",
     "benching",
     "cli",
 ]

@@ -51,11 +51,11 @@ def bench(
     """Measure speed against error: engines, precisions and threads, at one or several sizes."""
     from rich.console import Console
 
+    from pbdkit.api import load
     from pbdkit.benching.measuring import Bench
     from pbdkit.benching.method import methods
     from pbdkit.benching.report import LEGEND, reasons, table
     from pbdkit.cli.pictures import refuse_unwritable
-    from pbdkit.running import load
 
     refuse_unwritable(picture, json_file)
     loaded = load(experiment, settings=(*settings, *([f"steps={steps}"] if steps else ())))

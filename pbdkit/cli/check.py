@@ -16,7 +16,7 @@ from pbdkit.cli.options import experiment_argument, json_option, set_option
 def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Validate an experiment and say what will happen, without running it."""
     from pbdkit.analysis.forecast import forecast
-    from pbdkit.running import load
+    from pbdkit.api import load
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)

@@ -22,8 +22,8 @@ def identify(
     experiment: str, settings: tuple[str, ...], as_json: bool, picture: Path | None
 ) -> None:
     """Say what the experiment's rule is physically, on its lattice and neighbours."""
+    from pbdkit.api import identify, load
     from pbdkit.cli.pictures import refuse_unwritable, save
-    from pbdkit.running import identify, load
 
     refuse_unwritable(picture)
     found = identify(load(experiment, settings=settings))

@@ -117,6 +117,10 @@ class System:
             found[:, axes] = x.reshape(-1, len(axes))
         return found
 
+    def times(self, c: Floats) -> Floats:
+        """A c, (follower, axis)."""
+        return c - self._both.times(c)
+
     def distance(self, moves: Floats, rounding: float) -> float:
         """A bound on the distance of any follower from the solution, given its moves and what
         rounding may have done to them."""
