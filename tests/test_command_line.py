@@ -240,7 +240,10 @@ def test_plugins_list_has_a_row_a_plugin_and_a_row_a_component(install: Any, cal
     rows = json.loads(call("plugins", "list", "--json").out)
     assert {*rows[-1]} == {"interface", "type", "distribution", "version", "state", "reason"}
     assert {row["distribution"] for row in rows} == {"pbdkit", "pbdkit-sick"}
-    assert (rows[-1]["state"], rows[-1]["reason"]) == ("broken", "ImportError: sick")
+    assert (rows[-1]["state"], rows[-1]["reason"]) == (
+        "broken",
+        "ImportError: sick (pbdkit_sick.py, line 1)",
+    )
 
 
 def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> None:

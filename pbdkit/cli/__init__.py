@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+from pbdkit.cli.options import with_no_plugins
+
 COMMANDS = {
     "run": "run",
     "check": "check",
@@ -32,13 +34,16 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """The command of that name, or a usage error with the nearest right one."""
         if name not in COMMANDS:
+            if ctx.resilient_parsing:  # a shell asks how to go on
+                return None
             from pbdkit.interfaces.naming import did_you_mean
 
             ctx.fail(f"there is no command '{name}'{did_you_mean(name, COMMANDS)}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
-        return command
+        return with_no_plugins(command)
 
 
+@with_no_plugins
 @click.group(
     cls=Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
