@@ -15,26 +15,18 @@ SUFFIXES = (".yaml", ".yml", ".json")
 def complete_experiments(
     context: click.Context, parameter: click.Parameter, begun: str
 ) -> list[CompletionItem]:
-    """The shipped experiments and the experiment files that begin so."""
+    """The shipped experiments and the experiment files here that begin so; where no shipped one
+    does, whatever the shell itself offers as files."""
     from click.shell_completion import CompletionItem
 
     from pbdkit.experiment.shipped import shipped_names
 
     names = [name for name in shipped_names() if name.startswith(begun)]
-    return [CompletionItem(name) for name in [*names, *_files(begun)]]
+    if not names:
+        return [CompletionItem(begun, type="file")]
+    return [CompletionItem(name) for name in [*names, *_experiment_files(begun)]]
 
 
-def _files(begun: str) -> list[str]:
-    """Files that may be experiments, and folders, which end in a slash."""
-    folder, _, word = begun.rpartition("/")
-    prefix = begun[: len(begun) - len(word)]
-    try:
-        entries = sorted(Path(folder or prefix or ".").iterdir())
-    except OSError:
-        return []
-    shown = [e for e in entries if e.name.startswith(word) and (word or e.name[0] != ".")]
-    return [
-        f"{prefix}{entry.name}{'/' if entry.is_dir() else ''}"
-        for entry in shown
-        if entry.is_dir() or entry.suffix in SUFFIXES
-    ]
+def _experiment_files(begun: str) -> list[str]:
+    files = [path for path in Path().glob("*") if path.suffix in SUFFIXES]
+    return sorted(path.name for path in files if path.name.startswith(begun))

@@ -41,7 +41,7 @@ def _rows(plugin: Plugin) -> list[dict[str, str]]:
     """One of the plugin and one of each of its components."""
     origin = {"distribution": plugin.distribution, "version": plugin.version}
     offers = [
-        {"interface": offer.interface.__name__ if offer.interface else "", "type": offer.type}
+        {"interface": offer.interface.__name__ if offer.interface else "", "type": offer.name}
         | origin
         | {"state": offer.state, "reason": offer.reason}
         for offer in plugin.offers

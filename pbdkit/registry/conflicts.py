@@ -18,7 +18,7 @@ def named(
         (plugin, offer)
         for plugin in plugins
         for offer in plugin.offers
-        if offer.interface is interface and offer.type == name
+        if offer.interface is interface and offer.name == name
     ]
 
 
@@ -41,17 +41,13 @@ def _judged(plugin: Plugin, plugins: list[Plugin], builtin: Plugin) -> Plugin:
 def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
     if offer.component is None or offer.interface is None:
         return offer
-    name, kind = offer.type, offer.interface.__name__
+    name, kind = offer.name, offer.interface.__name__
     chosen = f"write '{plugin.distribution}:{name}'"
     if named([builtin], offer.interface, name):
         reason = f"'{name}' is the name of a built-in {kind}; {chosen}, or give it another type"
         return replace(offer, state="conflict", reason=reason)
-    others = [
-        other
-        for other, o in named(plugins, offer.interface, name)
-        if o.component is not None
-        and (other is not plugin and not _is_same(other, o, plugin, offer))
-    ]
+    found = named(plugins, offer.interface, name)
+    others = [p for p, o in found if o.component is not None and not _is_same(p, o, plugin, offer)]
     if not others:
         return offer
     if any(canonical(p.distribution) == canonical(plugin.distribution) for p in others):

@@ -24,10 +24,10 @@ class Offer:
     """One thing on the list of a plugin.
 
     A component that can be used has the state ok or conflict. Of a broken one `interface` and
-    `type` are what is known.
+    `name`, its type, are what is known.
     """
 
-    type: str
+    name: str
     interface: type[Component] | None = None
     component: type[Component] | None = None
     state: str = "ok"
@@ -124,7 +124,7 @@ def _refuse_other_api(module: Any, entry: EntryPoint) -> None:
     if declared != API:
         raise IncompatibleError(
             f"it is written for version {declared} of the plugin API, and pbdkit "
-            f"{version(BUILTIN)} has version {API}; install a version of it, or of pbdkit, that fits"
+            f"{version(BUILTIN)} has version {API}; install a version of either that fits the other"
         )
 
 
@@ -153,15 +153,15 @@ def _known_interface(component: Any) -> type[Component] | None:
 
 def _apart(offers: list[Offer]) -> tuple[Offer, ...]:
     """The offers, with two classes that nothing could tell apart both broken."""
-    named = [(offer.interface, offer.type) for offer in offers if offer.component]
+    named = [(offer.interface, offer.name) for offer in offers if offer.component]
     return tuple(
         replace(
             offer,
             component=None,
             state="broken",
-            reason=f"it offers two classes with the type '{offer.type}'; give one of them another",
+            reason=f"it offers two classes with the type '{offer.name}'; give one of them another",
         )
-        if named.count((offer.interface, offer.type)) > 1
+        if named.count((offer.interface, offer.name)) > 1
         else offer
         for offer in offers
     )

@@ -59,7 +59,7 @@ class Registry:
         if ":" in name:
             return self._find_in_distribution(interface, *name.split(":", 1))
         own = named([self._builtin, self._given], interface, name)
-        offers = own or [(p, o) for p, o in named(self.installed, interface, name) if o.component]
+        offers = own or named(self.installed, interface, name)
         classes = {p.distribution: o.component for p, o in offers if o.component is not None}
         if len(classes) > 1:
             choice = ", ".join(f"'{distribution}:{name}'" for distribution in classes)
@@ -87,7 +87,7 @@ class Registry:
                 if offer.component is not None and offer.interface is interface:
                     names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
                     if plugin not in (self._builtin, self._given):
-                        names.append(f"{plugin.distribution}:{offer.type}")
+                        names.append(f"{plugin.distribution}:{offer.name}")
         return {component: list(dict.fromkeys(names)) for component, names in found.items()}
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
@@ -139,12 +139,12 @@ class Registry:
     def _name_in(self, plugin: Plugin, offer: Offer) -> str:
         own = [self._builtin, self._given]
         if plugin in own:
-            return offer.type
-        alone = "installed" in self.__dict__ and not named(own, offer.interface, offer.type)
-        offers = named(self.installed, offer.interface, offer.type) if alone else []
+            return offer.name
+        alone = "installed" in self.__dict__ and not named(own, offer.interface, offer.name)
+        offers = named(self.installed, offer.interface, offer.name) if alone else []
         if len({p.distribution for p, o in offers if o.component}) == 1:
-            return offer.type
-        return f"{plugin.distribution}:{offer.type}"
+            return offer.name
+        return f"{plugin.distribution}:{offer.name}"
 
     def _find_in_distribution(
         self, interface: type[Component], distribution: str, name: str
@@ -160,13 +160,12 @@ class Registry:
             known = did_you_mean(distribution, {p.distribution for p in self._points})
             raise PluginError(f"'{name}' is asked of {distribution}, which is not installed{known}")
         offers = named(plugins, interface, name)
-        for _, offer in offers:
-            if offer.component is not None:
-                return offer.component
+        if usable := [offer.component for _, offer in offers if offer.component is not None]:
+            return usable[0]
         for plugin in [p for p, _ in offers] or plugins:
             if plugin.state not in ("ok", "conflict"):
                 raise PluginError(f"'{name}' is asked of {plugin}, which is {_why(plugin)}")
-        offered = [o.type for p in plugins for o in p.offers if o.interface is interface]
+        offered = [o.name for p in plugins for o in p.offers if o.interface is interface]
         hint = did_you_mean(name, offered)
         raise ExperimentError(f"{distribution} offers no {interface.__name__} '{name}'{hint}")
 
@@ -199,13 +198,13 @@ def _given(components: Iterable[type[Component]], builtin: Plugin) -> tuple[Offe
         except TypeError as error:
             raise ExperimentError(f"components: {error}") from None
         offer = offer_of(component)
-        if offer.interface and named([builtin], offer.interface, offer.type):
+        if offer.interface and named([builtin], offer.interface, offer.name):
             raise ExperimentError(
-                f"components: '{offer.type}' is the name of a built-in "
+                f"components: '{offer.name}' is the name of a built-in "
                 f"{offer.interface.__name__}; give {component.__name__} another type"
             )
-        twins = [o for o in offers if (o.interface, o.type) == (offer.interface, offer.type)]
+        twins = [o for o in offers if (o.interface, o.name) == (offer.interface, offer.name)]
         if any(o.component is not component for o in twins):
-            raise ExperimentError(f"components: two classes have the type '{offer.type}'")
+            raise ExperimentError(f"components: two classes have the type '{offer.name}'")
         offers += [] if twins else [offer]
     return tuple(offers)
