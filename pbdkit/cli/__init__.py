@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from importlib import import_module
@@ -22,6 +23,8 @@ COMMANDS = {
     "schema": "schema",
 }
 """Every command with the module of pbdkit.cli in which it stands."""
+COMPLETING = "_PBDKIT_COMPLETE"
+"""The variable by which a shell asks how a line goes on."""
 
 
 class Commands(click.Group):
@@ -73,14 +76,16 @@ def main(arguments: list[str] | None = None) -> None:
         code = _failed("interrupted", 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
+        if isinstance(error, SystemExit) and COMPLETING in os.environ:
+            raise
         if debug:
             traceback.print_exc()
         code = _report(error)
     sys.exit(code or 0)
 
 
-def _report(error: Exception) -> int:
+def _report(error: BaseException) -> int:
     from pbdkit import errors
 
     codes = {

@@ -6,10 +6,15 @@ import inspect
 import re
 from typing import Any
 
+from pydantic import ValidationError
+
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.registry.wording import worded
+from pbdkit.registry.wording import one_line, worded
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+REFUSALS = ("missing", "value_error", "assertion_error")
+"""Kinds of pydantic's errors that are no fault of a default: a parameter is not given, or the
+component's own validator refuses it."""
 
 
 def interface_of(component: type[Component]) -> type[Component]:
@@ -22,6 +27,7 @@ def check_component(component: Any) -> None:
     check_class(component)
     _check_functions(component)
     _check_parameters(component)
+    _check_defaults(component)
 
 
 def check_class(component: Any) -> None:
@@ -87,3 +93,18 @@ def _check_parameters(component: type[Component]) -> None:
             f"the parameters of {component.__name__} cannot be described in a JSON Schema: "
             f"{worded(error)}"
         ) from None
+
+
+def _check_defaults(component: type[Component]) -> None:
+    """They are of the types that the parameters declare: the user could not mend them."""
+    try:
+        component.model_validate({})
+    except ValidationError as error:
+        for fault in error.errors():
+            if fault["loc"] and fault["type"] not in REFUSALS:
+                raise TypeError(
+                    f"the default of {component.__name__}.{fault['loc'][0]} does not fit: "
+                    f"{one_line(fault['msg'])}, got {fault['input']!r}"
+                ) from None
+    except (Exception, SystemExit):  # what its own code raises is said where it is used
+        return

@@ -132,7 +132,7 @@ def _offer(component: Any, check: Callable[[Any], None], point: Point) -> Offer:
     try:
         check(component)
         return offer_of(component)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = worded(error, point.package)
         return Offer(_known_type(component), _known_interface(component), None, "broken", reason)
 
