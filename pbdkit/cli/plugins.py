@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -14,6 +15,15 @@ if TYPE_CHECKING:
     from pbdkit.registry.loading import Plugin
 
 UNLIMITED = 10_000
+INTERFACES = (
+    "FollowerRule",
+    "Lattice",
+    "NeighbourMetric",
+    "FramePolicy",
+    "FractureModel",
+    "Diagnostic",
+)
+"""The open interfaces by name, here so that `--help` imports none of them."""
 
 
 @click.group()
@@ -35,6 +45,36 @@ def list_(as_json: bool) -> None:
         click.echo(json.dumps(rows))
     else:
         _print(rows)
+
+
+@plugins.command()
+@click.argument("name")
+@click.option(
+    "--interface",
+    type=click.Choice(INTERFACES),
+    default=INTERFACES[0],
+    show_default=True,
+    help="What the plugin adds.",
+)
+@click.option(
+    "--dir",
+    "parent",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default=".",
+    help="Where the project's folder is made; here by default.",
+)
+def new(name: str, interface: str, parent: Path) -> None:
+    """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
+    from pbdkit.skeleton.names import names_from
+    from pbdkit.skeleton.project import write_project
+
+    names = names_from(name, interface)
+    folder = write_project(names, interface, parent)
+    click.echo(
+        f"{folder}: the {interface} '{names.type}' stands in {names.module}.py; next:\n"
+        f"  pip install -e {folder if folder.is_absolute() else f'./{folder}'}\n"
+        f"  pbdkit run {folder / 'example.yaml'}"
+    )
 
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
