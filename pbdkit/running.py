@@ -13,6 +13,7 @@ from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.watching import StoppedError, Watch
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
@@ -22,7 +23,7 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.memory import MemorySink
-from pbdkit.results.progress import progress_bar
+from pbdkit.results.progress import progress_bar, settling_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
@@ -117,17 +118,18 @@ def rerun(
 def run_into(
     sink: Sink, scene: Scene, *, progress: bool, stopping: Callable[[], bool] = lambda: False
 ) -> Report:
-    """Steps the scene to its end, or until `stopping` says so, and records it into the sink."""
+    """Takes the scene to its end, or until `stopping` says so, and records it into the sink."""
     recorder = Recorder(scene, sink)
     straight = isinstance(scene.experiment.solver, Equilibrium)
     engine, choice = (None, _STRAIGHT) if straight else make_engine(scene, choose(scene))
     begun = time.perf_counter()
     try:
         recorder.begin()
-        with progress_bar(scene.experiment.steps, progress and not straight) as show:
-            if engine is None:
-                outcome = _go_straight(scene, recorder)
-            else:
+        if engine is None:
+            with settling_bar(progress) as tell:
+                outcome = _go_straight(scene, recorder, Watch(stopping, tell))
+        else:
+            with progress_bar(scene.experiment.steps, progress) as show:
                 outcome = _step_through(scene, engine, recorder, show, stopping)
     except ExperimentError as error:
         sink.abandon()
@@ -138,15 +140,20 @@ def run_into(
     return Report(outcome, scene.raster.count, time.perf_counter() - begun, choice)
 
 
-def _go_straight(scene: Scene, recorder: Recorder) -> Outcome:
+def _go_straight(scene: Scene, recorder: Recorder, watch: Watch) -> Outcome:
     state, steps = initial_state(scene), scene.experiment.steps
     recorder.observe(state)
     try:
-        certificate = settle(scene, state)
+        certificate = settle(scene, state, watch)
         outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
     except UnconvergedError as error:
         found = error.certificate
         outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+    except StoppedError:
+        reason = f"stopped on the way to equilibrium, after step {state.step}"
+        recorder.observe_last(state)
+        recorder.finish(state, outcome := Outcome("interrupted", reason, state.step))
+        return outcome
     state.step = steps
     try:
         recorder.observe(state)
