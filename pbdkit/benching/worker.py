@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.benching import settler
 from pbdkit.errors import PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.running import load
@@ -39,6 +40,8 @@ def main(folder: Path) -> None:
 
 
 def _do(job: dict[str, Any], folder: Path) -> dict[str, Any]:
+    if "reference" in job:
+        return _do_settling(job, folder)
     experiment = load(job["experiment"], settings=job["settings"])
     if job["what"] == "imports":
         _import_engine(experiment)
@@ -53,6 +56,24 @@ def _do(job: dict[str, Any], folder: Path) -> dict[str, Any]:
         result["best_s"] = _best(scene, engine, best)
         result["particles"] = scene.raster.count
     return result
+
+
+def _do_settling(job: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The jobs of settling.py."""
+    settings, reference = job["settings"], Path(job["reference"])
+    experiment = load(job["experiment"], settings=settings)
+    if job["what"] == "exact":
+        return settler.find_exact(experiment, job["tolerances"], folder)
+    if job["what"] == "rate":
+        return settler.seconds_a_step(experiment)
+    if job["what"] == "step":
+        return {"rows": settler.step_to(experiment, job["at"], reference)}
+    each = (f"solver.tolerance={tolerance:g}" for tolerance in job["tolerances"])
+    experiments = [load(job["experiment"], settings=(*settings, one)) for one in each]
+    settler.import_solvers("pyamg")
+    imports = peak_memory()
+    rows = settler.settle_to(experiments, reference)
+    return {"rows": rows, "peak_memory_mib": max(0, peak_memory() - imports) / 2**20}
 
 
 def _import_engine(experiment: Experiment) -> None:
