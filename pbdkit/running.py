@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.watching import StoppedError, Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium
-from pbdkit.results.progress import progress_bar
+from pbdkit.results.progress import equilibrium_bar, progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
@@ -46,17 +47,18 @@ class Report:
 def run_into(
     sink: Sink, scene: Scene, *, progress: bool, stopping: Callable[[], bool] = lambda: False
 ) -> Report:
-    """Steps the scene to its end, or until `stopping` says so, and records it into the sink."""
+    """Takes the scene to its end, or until `stopping` says so, and records it into the sink."""
     recorder = Recorder(scene, sink)
     straight = isinstance(scene.experiment.solver, Equilibrium)
     engine, choice = (None, _STRAIGHT) if straight else make_engine(scene, choose(scene))
     begun = time.perf_counter()
     try:
         recorder.begin()
-        with progress_bar(scene.experiment.steps, progress and not straight) as show:
-            if engine is None:
-                outcome = _go_straight(scene, recorder)
-            else:
+        if engine is None:
+            with equilibrium_bar(progress) as tell:
+                outcome = _go_straight(scene, recorder, Watch(stopping, tell))
+        else:
+            with progress_bar(scene.experiment.steps, progress) as show:
                 outcome = _step_through(scene, engine, recorder, show, stopping)
     except ExperimentError as error:
         sink.abandon()
@@ -68,15 +70,20 @@ def run_into(
     return Report(outcome, scene.raster.count, wall_s, choice, recorder.warnings)
 
 
-def _go_straight(scene: Scene, recorder: Recorder) -> Outcome:
+def _go_straight(scene: Scene, recorder: Recorder, watch: Watch) -> Outcome:
     state, steps = initial_state(scene), scene.experiment.steps
     recorder.observe(state)
     try:
-        certificate = settle(scene, state)
+        certificate = settle(scene, state, watch)
         outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
     except UnconvergedError as error:
         found = error.certificate
         outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+    except StoppedError:
+        reason = f"stopped on the way to equilibrium, after step {state.step}"
+        recorder.observe_last(state)
+        recorder.finish(state, outcome := Outcome("interrupted", reason, state.step))
+        return outcome
     state.step = steps
     try:
         recorder.observe(state)
@@ -96,7 +103,7 @@ def _step_through(
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
     outcome, guard = None, Guard(scene, state)
-    settling = _settling(scene, state)
+    settling = _settling(scene, state, Watch(stopping))
     try:
         recorder.observe(state)
         while state.step < steps and not outcome and not stopping():
@@ -137,15 +144,18 @@ def _keep(recorder: Recorder, good: State | None) -> str:
     return f"; kept is step {good.step}, the last no larger than the body and its leaders' ways"
 
 
-def _settling(scene: Scene, start: State) -> Settling | None:
+def _settling(scene: Scene, start: State, watch: Watch) -> Settling | None:
     asked = scene.experiment.solver.settle
     if asked is None:
         return None
     from pbdkit.equilibrium.settling import Settling  # only where it is asked for
 
-    return Settling(scene, asked, start)
+    return Settling(scene, asked, start, watch)
 
 
 def _settled(settling: Settling, state: State) -> Outcome | None:
-    found = settling.look(state)
+    try:
+        found = settling.look(state)
+    except StoppedError:  # the loop will hear of it
+        return None
     return Outcome("settled", str(found), state.step, found.as_dict()) if found else None

@@ -47,16 +47,21 @@ class Couplings:
 
     def between(self, a: int, b: int) -> Entries:
         """Of the matrix from axis b to axis a alone, an unknown a particle."""
-        parts = [(r, c, blocks[:, a, b]) for r, c, blocks in self.parts if blocks[:, a, b].any()]
+        parts = [
+            (rows, columns, blocks[:, a, b])
+            for rows, columns, blocks in self.parts
+            if _of_one(blocks)[:, a, b].any()
+        ]
         return _joined(parts, self.shape)
 
     def couples(self, a: int, b: int) -> bool:
         """Whether anything leads from axis b to axis a."""
-        return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
+        return any(_of_one(blocks)[:, a, b].any() for _, _, blocks in self.parts)
 
     def is_isotropic(self) -> bool:
         """Whether both axes move alike."""
-        return all(np.array_equal(b[:, 0, 0], b[:, 1, 1]) for _, _, b in self.parts)
+        blocks = [_of_one(blocks) for _, _, blocks in self.parts]
+        return all(np.array_equal(b[:, 0, 0], b[:, 1, 1]) for b in blocks)
 
     def times(self, vectors: Floats) -> Floats:
         """The product with vectors, (particle, 2)."""
@@ -66,6 +71,22 @@ class Couplings:
             for axis in (0, 1):
                 product[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
         return product
+
+
+def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
+    """Those chosen; still a view where all are one."""
+    if is_one(blocks):
+        return blocks[: np.count_nonzero(chosen)]
+    return blocks[chosen]
+
+
+def is_one(blocks: Floats) -> bool:
+    """Whether the blocks are views of a single one."""
+    return len(blocks) > 1 and blocks.strides[0] == 0
+
+
+def _of_one(blocks: Floats) -> Floats:
+    return blocks[:1] if is_one(blocks) else blocks
 
 
 def _joined(parts: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> Entries:

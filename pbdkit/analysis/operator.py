@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import Couplings
+from pbdkit.analysis.couplings import Couplings, some_of
 from pbdkit.analysis.linearising import Response, has_neighbours, respond
 from pbdkit.analysis.matrices import Entries
 from pbdkit.analysis.nesting import moves_and_couplings
@@ -132,7 +132,7 @@ class _Assembly:
 
     def operator(self) -> StepOperator:
         memory = self._scene.experiment.solver.memory
-        self._now.add_scaled_identity(np.arange(len(self._followers)), 1.0)
+        self._now.add_scaled_identity(np.arange(len(self._followers), dtype=np.int32), 1.0)
         place = self._scene.raster.place_of(self._followers)
         cells = self._kind.size // self._scene.raster.shape[0]
         for s in range(self._scene.raster.shape[0]):
@@ -194,11 +194,11 @@ class _Assembly:
             if some.all():
                 couplings.add(rows, self._unknown[there], weight)
             elif some.any():
-                couplings.add(rows[some], self._unknown[there[some]], weight[some])
+                couplings.add(rows[some], self._unknown[there[some]], some_of(weight, some))
         frame, some = self._scene.frame, kinds == FRAME
         if frame is None or not some.any():
             return
-        point, rows, weight = self._unknown[there[some]], rows[some], weight[some]
+        point, rows, weight = self._unknown[there[some]], rows[some], some_of(weight, some)
         first = np.searchsorted(frame.map.point, point)
         last = np.searchsorted(frame.map.point, point + 1)
         for e in range(int((last - first).max(initial=0))):

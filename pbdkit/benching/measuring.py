@@ -97,24 +97,29 @@ class Bench:
         self, what: str, settings: tuple[str, ...], folder: Path, cache: Path
     ) -> dict[str, Any]:
         """The result of a job in a fresh process, with a cache folder of its own."""
-        folder.mkdir(parents=True, exist_ok=True)
         job = {"what": what, "experiment": self.experiment, "settings": settings}
-        (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        done = subprocess.run(
-            [sys.executable, "-m", "pbdkit.benching.worker", str(folder)],
-            env=os.environ | {"PBDKIT_CACHE_DIR": str(cache)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            said = [line for line in done.stderr.splitlines() if line.strip()]
-            why = said[-1] if said else f"it ended with status {done.returncode} (out of memory?)"
-            raise ExperimentError(f"the measurement failed: {why}")
-        result: dict[str, Any] = json.loads((folder / "result.json").read_text("utf-8"))
-        if "fault" in result:
-            raise FAULTS.get(result["fault"], ExperimentError)(result["message"])
-        return result
+        return worked(job, folder, cache)
+
+
+def worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
+    """The result of a job (worker.py) in a fresh process, with a cache folder of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "pbdkit.benching.worker", str(folder)],
+        env=os.environ | {"PBDKIT_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        why = said[-1] if said else f"it ended with status {done.returncode} (out of memory?)"
+        raise ExperimentError(f"the measurement failed: {why}")
+    result: dict[str, Any] = json.loads((folder / "result.json").read_text("utf-8"))
+    if "fault" in result:
+        raise FAULTS.get(result["fault"], ExperimentError)(result["message"])
+    return result
 
 
 def _error(folder: Path, reference: Path, steps: Iterable[int]) -> float | None:

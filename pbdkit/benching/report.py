@@ -69,16 +69,21 @@ def as_dict(bench: Bench, rows: Iterable[Row]) -> dict[str, Any]:
         "experiment": bench.experiment,
         "settings": list(bench.settings),
         "steps": bench.steps,
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "processors": processors(),
-            "system": platform.system(),
-            "python": sys.version.split()[0],
-        },
+        "machine": machine(),
         "measurements": [_measurement(row) for row in rows if isinstance(row, Measured)],
         "not_measured": [
             _method(row) | {"reason": row.reason} for row in rows if isinstance(row, NotMeasured)
         ],
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What it was measured on."""
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "processors": processors(),
+        "system": platform.system(),
+        "python": sys.version.split()[0],
     }
 
 

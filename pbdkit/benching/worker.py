@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.api import load
+from pbdkit.benching import equilibrium_worker
 from pbdkit.errors import PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.scene.scene import Scene, build_scene
@@ -39,6 +40,8 @@ def main(folder: Path) -> None:
 
 
 def _do(job: dict[str, Any], folder: Path) -> dict[str, Any]:
+    if "reference" in job:
+        return _do_equilibrium(job, folder)
     experiment = load(job["experiment"], settings=job["settings"])
     if job["what"] == "imports":
         _import_engine(experiment)
@@ -53,6 +56,24 @@ def _do(job: dict[str, Any], folder: Path) -> dict[str, Any]:
         result["best_s"] = _best(scene, engine, best)
         result["particles"] = scene.raster.count
     return result
+
+
+def _do_equilibrium(job: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The jobs of equilibria.py."""
+    settings, reference = job["settings"], Path(job["reference"])
+    experiment = load(job["experiment"], settings=settings)
+    if job["what"] == "exact":
+        return equilibrium_worker.find_exact(experiment, job["tolerances"], folder)
+    if job["what"] == "rate":
+        return equilibrium_worker.seconds_a_step(experiment)
+    if job["what"] == "step":
+        return {"rows": equilibrium_worker.step_to(experiment, job["at"], reference)}
+    each = (f"solver.tolerance={tolerance:g}" for tolerance in job["tolerances"])
+    experiments = [load(job["experiment"], settings=(*settings, one)) for one in each]
+    equilibrium_worker.import_solvers("pyamg")
+    imports = peak_memory()
+    rows = equilibrium_worker.settle_to(experiments, reference)
+    return {"rows": rows, "peak_memory_mib": max(0, peak_memory() - imports) / 2**20}
 
 
 def _import_engine(experiment: Experiment) -> None:

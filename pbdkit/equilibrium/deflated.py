@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.linear import LinearSolver, is_symmetric, linear_solver
+from pbdkit.equilibrium.linear import is_symmetric, linear_solver
+from pbdkit.equilibrium.parts import SINGULAR
+from pbdkit.equilibrium.solving import LinearSolver
 
 Floats = NDArray[np.float64]
-SINGULAR = 1e-10
-"""Relative size below which a singular value counts as zero."""
 SHIFT = 1e-11
 MOST_MODES = 6
 ROUNDS = 2

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.equilibrium.certificate import Certificate
+from pbdkit.equilibrium.krylov import product
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.watching import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -37,8 +39,10 @@ class Finder:
     """Looks for the equilibria of a scene, to a tolerance that is a length, by one of the solver's
     methods. `scale` is the length that shares are of."""
 
-    def __init__(self, scene: Scene, tolerance: float, scale: float, method: str) -> None:
-        self.scene, self.method = scene, method
+    def __init__(
+        self, scene: Scene, tolerance: float, scale: float, method: str, watch: Watch
+    ) -> None:
+        self.scene, self.method, self.watch = scene, method, watch
         self.tolerance, self.scale = tolerance, scale
         self.moves = Moves(scene)
 
@@ -48,7 +52,7 @@ class Finder:
         The first linearisation is that of the scene at rest, exact for linear rules. Others are
         linearised anew where they have come to (Newton's iteration, with shorter corrections where
         the moves would grow). Raises ExperimentError where a part of the body has no equilibrium,
-        and UnconvergedError.
+        UnconvergedError, and StoppedError.
         """
         return _Search(self, state, step).run()
 
@@ -59,6 +63,7 @@ class _Search:
         self._linearisations = self._inner = 0
         self._linear = False
         at_rest = replace(state, u=np.zeros_like(state.u))
+        finder.watch.begin("assembling")
         operator = step_operator(finder.scene, at_rest, step)
         self._place = finder.scene.raster.place_of(operator.followers)
         self._X = finder.scene.raster.reference(operator.followers)
@@ -100,6 +105,7 @@ class _Search:
     def _correct_anew(self) -> None:
         """Newton's iteration."""
         while self._linearisations < MOST_LINEARISATIONS:
+            self._finder.watch.begin(f"linearising for the {self._linearisations + 1}. time")
             operator = step_operator(self._finder.scene, self._state, self._step)
             self._system = self._systematised(operator)
             self._system.refuse_moving_floats(self._left, self._rounding())
@@ -148,7 +154,7 @@ class _Search:
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return System(operator, self._finder.method, self._X)
+        return System(operator, self._finder.method, self._X, self._finder.watch)
 
     def _shift(self, correction: Vectors, share: float) -> None:
         self._state.u.reshape(2, -1)[:, self._place] += share * correction.T
@@ -183,4 +189,4 @@ class _Search:
 
 def _size(moves: Vectors) -> float:
     with np.errstate(over="ignore"):
-        return float(np.linalg.norm(moves))
+        return math.sqrt(product(moves.ravel(), moves.ravel()))

@@ -6,23 +6,30 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, never_rests, scale_of
 from pbdkit.equilibrium.finding import Finder
+from pbdkit.equilibrium.watching import StoppedError, Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.leaders import last_event, place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
+VALUES_A_CALL = 200_000_000
+"""An engine makes so many values' steps a call, some tenths of a second."""
 
-def settle(scene: Scene, state: State) -> Certificate:
+
+def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
     """Takes a scene, in place, from its initial state to the equilibrium of its last step.
 
     Until the roles change for the last time steps are made, so that leaders start, and parts that
     nothing holds remain, where stepping has them. Where bonds can break, the leaders' way is made
     in increments instead: settle, break what is too long, settle again until nothing breaks.
-    Raises ExperimentError where there is no equilibrium, and UnconvergedError.
+    Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
+    the watch says so: then the state is the last that had been reached.
     """
+    watch = watch or Watch()
     solver, steps = scene.experiment.solver, scene.experiment.steps
     assert isinstance(solver, Equilibrium)
     for n, leading in enumerate(scene.leading):
@@ -33,13 +40,11 @@ def settle(scene: Scene, state: State) -> Certificate:
                 ("leaders", n, "motion"),
             )
     scale = scale_of(scene, state)
-    finder = Finder(scene, solver.tolerance * scale, scale, solver.method)
+    finder = Finder(scene, solver.tolerance * scale, scale, solver.method, watch)
     if scene.has_fracture:
         return _load(scene, state, finder, solver.increments)
-    engine, _ = make_engine(scene, choose(scene))
-    reached = engine.advance(state, _last_change_of_roles(scene) - state.step)
-    state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
-    state.step = reached.step
+    if last := _last_change_of_roles(scene):
+        _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
 
 
@@ -50,10 +55,27 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
+def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> None:
+    """Steps, in calls short enough for interruptions to be heard."""
+    watch.begin("stepping until the roles change")
+    first = state.step
+    a_call = max(1, VALUES_A_CALL // state.u.size)
+    while state.step < last:
+        reached = engine.advance(state, min(a_call, last - state.step))
+        state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
+        state.step = reached.step
+        watch.look((state.step - first) / (last - first))
+
+
 def _settle_at(scene: Scene, state: State, finder: Finder, step: int) -> Certificate:
+    before = state.u.copy(), state.starts
     led, state.starts = prescribe(scene, state, step)
     place(state.u, led)
-    certificate = finder.find(state, step)
+    try:
+        certificate = finder.find(state, step)
+    except StoppedError:
+        state.u[...], state.starts = before
+        raise
     state.step = step
     state.previous[...] = state.u
     return certificate
@@ -67,6 +89,7 @@ def _load(scene: Scene, state: State, finder: Finder, increments: int) -> Certif
     count = min(increments, last)
     certificate = None
     for step in np.unique(np.linspace(1, last, count).round().astype(int)).tolist():
+        finder.watch.load = f"step {step} of {last}, "
         while True:
             certificate = _settle_at(scene, state, finder, step)
             broken = np.count_nonzero(state.broken_step >= 0)

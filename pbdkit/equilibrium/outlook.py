@@ -13,6 +13,7 @@ from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.watching import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
@@ -64,8 +65,8 @@ class Foresight:
     and only where the correction leaves a tenth of the moves at most.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene, self._moves = scene, Moves(scene)
+    def __init__(self, scene: Scene, watch: Watch) -> None:
+        self._scene, self._moves, self._watch = scene, Moves(scene), watch
         self._at_rest: _Linearised | None = None
         self._broken = 0
         self._linear = False
@@ -102,7 +103,7 @@ class Foresight:
         operator = step_operator(self._scene, replace(state, u=u))
         reference = self._scene.raster.reference(operator.followers)
         self.linearisations += 1
-        system = System(operator, "auto", reference)
+        system = System(operator, "auto", reference, self._watch)
         return _Linearised(operator, system, self._scene.raster.place_of(operator.followers))
 
     def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:

@@ -9,6 +9,7 @@ import numpy as np
 from pbdkit.equilibrium.certificate import CORRECTION, Certificate, scale_of
 from pbdkit.equilibrium.outlook import Foresight, Outlook
 from pbdkit.equilibrium.pacing import NEVER, Pace
+from pbdkit.equilibrium.watching import Watch
 from pbdkit.experiment.solvers import Settle
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -25,13 +26,13 @@ class Settling:
     with lag can carry it on counts as distance.
     """
 
-    def __init__(self, scene: Scene, settle: Settle, start: State) -> None:
+    def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
         self._scale = scale_of(scene, start)
         self._tolerance = settle.tolerance * self._scale
         steps, leading = scene.experiment.steps, scene.leading
         ends = not any(is_cut_short(group, steps) for group in leading)
         self._pace = Pace(last_event(scene) if ends else NEVER, self._tolerance)
-        self._foresight = Foresight(scene)
+        self._foresight = Foresight(scene, watch)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
         self.obstacle = (
@@ -45,7 +46,8 @@ class Settling:
         return self._pace.next_look
 
     def look(self, state: State) -> Certificate | None:
-        """At the end of that step: the certificate where the run has settled."""
+        """At the end of that step: the certificate where the run has settled. Raises StoppedError
+        where the watch says so."""
         with np.errstate(all="ignore"):
             way = (state.u - state.previous).ravel()
             longest, size = float(np.abs(way).max()), float(np.linalg.norm(way))

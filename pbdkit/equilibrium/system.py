@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import Couplings
 from pbdkit.analysis.matrices import DENSE, connected
 from pbdkit.analysis.operator import StepOperator
-from pbdkit.equilibrium.parts import DriftingError, Floating, Held, Part
+from pbdkit.equilibrium.floating import Floating
+from pbdkit.equilibrium.parts import DriftingError, Held, Part
+from pbdkit.equilibrium.watching import Watch
 from pbdkit.errors import ExperimentError
 
 Floats = NDArray[np.float64]
@@ -39,8 +41,9 @@ class System:
     `X` are the followers' reference positions (follower, axis), for the coarser grids of multigrid.
     """
 
-    def __init__(self, operator: StepOperator, method: str, X: Floats) -> None:
+    def __init__(self, operator: StepOperator, method: str, X: Floats, watch: Watch) -> None:
         self._operator, self._method, self._X = operator, method, X
+        self._watch = watch
         now, before = operator.couplings_now, operator.couplings_before
         both = Couplings(now.shape, now.parts + before.parts)
         self._both = both
@@ -195,7 +198,7 @@ class System:
         if len(axes) == 2 and kernel is None:
             kernel = self._rigid_modes()
         try:
-            part = Held(matrix, self._method, kernel)
+            part = Held(matrix, self._method, kernel, self._watch)
             if part.conditioned:
                 return part
         except np.linalg.LinAlgError:
@@ -240,7 +243,7 @@ def _one_minus(matrix: Any) -> Any:
         return np.eye(len(matrix)) - matrix
     from scipy.sparse import eye_array
 
-    return (eye_array(matrix.shape[0]) - matrix).tocsr()
+    return (eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
 
 
 def _within(matrix: Any, unknowns: Indices) -> Any:

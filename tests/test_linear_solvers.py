@@ -1,0 +1,204 @@
+"""Which linear solver serves which matrix, what it finds, and how a search is stopped."""
+
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium import linear
+from pbdkit.equilibrium.krylov import conjugate_gradients
+from pbdkit.equilibrium.linear import linear_solver
+from pbdkit.equilibrium.watching import StoppedError, Watch
+
+sparse = pytest.importorskip("scipy.sparse")
+NAMES = ["lu", "multigrid", "conjugate-gradients"]
+
+
+def averaging(nx, ny, upwind=0.0):
+    """1 - P of means of four neighbours, held all round; not symmetric where there is wind."""
+
+    def along(n):
+        return sparse.diags_array([np.full(n - 1, 1 - upwind), np.full(n - 1, 1 + upwind)],
+                                  offsets=[-1, 1])  # fmt: skip
+
+    mean = sparse.kron(along(nx), sparse.eye_array(ny)) + sparse.kron(
+        sparse.eye_array(nx), along(ny)
+    )
+    return (sparse.eye_array(nx * ny) - mean / 4).tocsr()
+
+
+def solver_of(matrix, method="auto", **more):
+    return linear_solver(matrix, method, symmetric=linear.is_symmetric(matrix), **more)
+
+
+def test_the_method_follows_size_and_symmetry(monkeypatch):
+    pytest.importorskip("pyamg")
+    monkeypatch.setattr(linear, "LARGEST_LU", 700)
+    small, medium, large = averaging(10, 20), averaging(30, 20), averaging(40, 20)
+    assert isinstance(solver_of(small), linear.Dense)
+    assert isinstance(solver_of(medium), linear.SparseLU)
+    assert solver_of(large).name == "multigrid, conjugate-gradients"
+    assert solver_of(averaging(40, 20, 0.3)).name == "multigrid, gmres"
+    assert solver_of(averaging(40, 20, 0.3), "conjugate-gradients").name == "gmres"
+    assert isinstance(solver_of(large, "lu"), linear.SparseLU)
+
+
+def test_without_pyamg_lu_serves_every_size_and_multigrid_is_refused(monkeypatch):
+    monkeypatch.setattr(linear, "LARGEST_LU", 700)
+    monkeypatch.setattr(linear, "find_spec", lambda name: None)
+    assert isinstance(solver_of(averaging(40, 20)), linear.SparseLU)
+    with pytest.raises(pbdkit.ExperimentError, match=r"needs pyamg: pip install 'pbdkit\[fast\]'"):
+        solver_of(averaging(40, 20), "multigrid")
+
+
+@pytest.mark.parametrize("upwind", [0.0, 0.3], ids=["symmetric", "not symmetric"])
+@pytest.mark.parametrize("method", NAMES)
+def test_every_method_solves_both_ways(method, upwind):
+    if method == "multigrid":
+        pytest.importorskip("pyamg")
+    matrix = averaging(35, 30, upwind)
+    b = np.random.default_rng(1).normal(size=matrix.shape[0]) * 1e-60
+    solver = solver_of(matrix, method)
+    for x, of in ((solver.solve(b, 1e-9), matrix), (solver.solve_transposed(b, 1e-9), matrix.T)):
+        assert np.linalg.norm(b - of @ x) <= 2e-9 * np.linalg.norm(b)
+    assert not solver.solve(np.zeros_like(b), 1e-9).any()
+    assert (solver.iterations > 0) == (method != "lu")
+
+
+def test_a_cycle_of_the_grids_is_symmetric_and_contracts():
+    pytest.importorskip("pyamg")
+    from pbdkit.equilibrium.grids import classical
+
+    matrix = averaging(60, 50)
+    cycle, (a, b) = classical(matrix), np.random.default_rng(2).normal(size=(2, 3000))
+    assert a @ cycle(b) == pytest.approx(b @ cycle(a), rel=1e-4)
+    x = np.zeros_like(b)
+    for _ in range(10):
+        x += cycle(b - matrix @ x)
+    assert np.linalg.norm(b - matrix @ x) < 1e-6 * np.linalg.norm(b)
+
+
+def test_conjugate_gradients_end_where_they_cannot_go_on():
+    told = []
+    b = np.array([1.0, 1.0])
+    x = conjugate_gradients(np.diag([1.0, -1.0]), b, 1e-9, None, 9, told.append)
+    assert (x == 0.0).all()
+    assert told == []
+    x = conjugate_gradients(np.diag([1.0, 4.0]), b, 1e-12, None, 9, told.append)
+    np.testing.assert_allclose(x, [1.0, 0.25], rtol=1e-14)
+    assert len(told) == 2
+    assert told[-1] < 1e-12
+
+
+HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+
+
+def sheet(**parts):
+    motion = {"type": "velocity", "velocity": [0.25, 0.0], "steps": 4}
+    return {
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": 9, "rows": 7},
+        "rule": {"type": "barycentre"},
+        "leaders": [HOLD, {"select": {"edge": "right"}, "motion": motion}],
+        "diagnostics": [{"type": "displacement"}],
+        "steps": 20,
+        "solver": {"type": "equilibrium", "method": "conjugate-gradients"},
+    } | parts
+
+
+RING = {"type": "ring", "inner": 6.0, "outer": 19.0, "centre": [20.0, 0.0]}
+HOOK = {"type": "polygon", "vertices": [[0, 0], [40, 0], [40, 9], [9, 9], [9, 30], [0, 30]]}
+
+
+@pytest.mark.parametrize("body", [RING, HOOK], ids=lambda body: body["type"])
+@pytest.mark.parametrize("neighbours", ["coordination", "chebyshev"])
+def test_multigrid_stays_within_its_certificate_on_bodies_with_corners(body, neighbours):
+    left, right = ({"box": [x, -50.0, x + 6.0, 50.0]} for x in (0.0, 34.0))
+    moved = {"type": "displace", "displacement": [1.0, 0.5]}
+    leaders = [HOLD | {"select": left}, {"select": right, "motion": moved}]
+    pytest.importorskip("pyamg")
+    parts = {"body": body, "neighbours": {"type": neighbours}, "frame": {"type": "none"}}
+    parts |= {"leaders": leaders}
+    solver = {"type": "equilibrium", "tolerance": 1e-5, "method": "multigrid"}
+    found = pbdkit.run(sheet(**parts, solver=solver), progress=False)
+    direct = solver | {"tolerance": 1e-11, "method": "lu"}
+    exact = pbdkit.run(sheet(**parts, solver=direct), progress=False)
+    known = json.loads(found.attrs["certificate"])
+    assert abs(found.u[-1] - exact.u[-1]).max() <= known["distance"] <= 1e-5
+
+
+def stopping_at(monkeypatch, what, load="", by=lambda: signal.raise_signal(signal.SIGINT)):
+    begin = Watch.begin
+
+    def begun(self, now):
+        if now == what and self.load.startswith(load):
+            by()
+        begin(self, now)
+
+    monkeypatch.setattr(Watch, "begin", begun)
+
+
+@pytest.mark.parametrize("what", ["assembling", "bounding the error", "solving"])
+def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
+    Path("s.json").write_text(json.dumps(sheet()))
+    stopping_at(monkeypatch, what)
+    result = call("run", "s.json")
+    assert result.code == 130
+    assert result.err == (
+        "pbdkit: interrupted: stopped on the way to equilibrium, after step 0; what was recorded "
+        "until then is in sheet.nc\n"
+    )
+    ds = pbdkit.open("sheet.nc")
+    assert ds.attrs["status"] == "interrupted"
+    assert ds.time.values.tolist() == [0]
+    assert not ds.u.values.any()
+
+
+def test_an_interrupted_load_keeps_the_last_increment_that_settled(call, monkeypatch):
+    fracture = {"type": "threshold", "thresholds": [9.0]}
+    Path("s.json").write_text(json.dumps(sheet(fracture=fracture)))
+    stopping_at(monkeypatch, "solving", "step 4 of 4")
+    assert call("run", "s.json").code == 130
+    ds = pbdkit.open("sheet.nc")
+    assert ds.time.values.tolist() == [0, 3]
+    affine = 0.75 * ds.reference.isel(axis=0) / 8
+    error = abs(ds.u.isel(time=-1, axis=0) - affine).where(ds.kind.isel(time=-1) < 2).max()
+    assert error < 1e-7
+
+
+def test_an_iteration_hears_of_it():
+    asked = []
+    matrix = averaging(30, 30)
+    watch = Watch(lambda: len(asked) == 3, lambda what, share: asked.append(share))
+    solver = solver_of(matrix, "conjugate-gradients", watch=watch)
+    with pytest.raises(StoppedError):
+        solver.solve(np.ones(900), 1e-9)
+    assert solver.iterations == 4
+    assert all(0.0 <= share < 1.0 for share in asked)
+
+
+def test_progress_is_told_in_phases_and_shares(monkeypatch):
+    from pbdkit.equilibrium.loading import settle
+    from pbdkit.scene.scene import build_scene
+    from pbdkit.stepping.state import initial_state
+
+    told = []
+    scene = build_scene(pbdkit.Experiment(**sheet()))
+    settle(scene, initial_state(scene), Watch(show=lambda what, share: told.append((what, share))))
+    phases = list(dict.fromkeys(what for what, _ in told))
+    assert phases == ["assembling", "bounding the error", "solving"]
+    shares = [share for what, share in told if what == "solving"]
+    assert shares[0] == 0.0
+    assert shares[-1] == 1.0
+
+
+def test_progress_is_drawn_on_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr("pbdkit.results.progress.PATIENCE_S", 0.0)
+    monkeypatch.setattr("pbdkit.results.progress.REFRESH_S", 0.0)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    pbdkit.run(sheet(), progress=True)
+    assert "solving" in capsys.readouterr().err
