@@ -115,6 +115,12 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false or solver: {type: stepping}",
                 key="solver",
             )
+        if self.rule.remembers() and isinstance(self.solver, Equilibrium):
+            raise fault(
+                f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
+                "all of them; take solver: {type: stepping}",
+                key="solver",
+            )
         return self
 
     @property

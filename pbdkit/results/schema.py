@@ -21,7 +21,7 @@ ATTRIBUTES = (
 def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
     """What a dataset holds; without `installed`, of the built-in diagnostics alone."""
     base = layout.base_columns()
-    optional = [*layout.bond_columns(), layout.broken_column(), layout.step_column()]
+    optional = [*layout.bond_columns(), *layout.broken_columns(), layout.step_column()]
     for diagnostic in registry.components(Diagnostic, installed=installed).values():
         optional += _columns_of(diagnostic)
     columns = base + optional
@@ -50,7 +50,7 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
         variables = diagnostic.model_construct(type="").variables()
     except AttributeError:
         return []
-    return [layout.diagnostic_column(v, diagnostic.every_step) for v in variables]
+    return [layout.diagnostic_column(v, diagnostic) for v in variables]
 
 
 def _group(columns: list[Column], required: list[Column]) -> dict[str, Any]:

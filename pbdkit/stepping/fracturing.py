@@ -1,4 +1,4 @@
-"""Breaking bonds, and what stands in for the lost neighbours."""
+"""Breaking bonds, and what the rule sees of those that are broken or softened."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import FractureModel, Slot, Vector, where
+from pbdkit.interfaces import FractureModel, Slot, Vector, length, where
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.raster import Block
+from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembering import changing, renew, shown
+from pbdkit.stepping.state import State
 from pbdkit.stepping.sums import difference
 
 Steps = NDArray[np.int32]
@@ -22,7 +25,9 @@ class Fracturing:
 
     def __init__(self, scene: Scene) -> None:
         self._model: FractureModel = scene.experiment.fracture
-        self._parameters = scene.constants.fracture
+        self._parameters, self._limits = scene.constants.fracture, scene.constants.limits
+        self._numbers = bond_numbers(scene.experiment)
+        self._softens, self._updates = self._model.softens(), self._model.updates()
         self._breakable = []
         self._plane_of: dict[Slot, tuple[int, bool]] = {}
         frame_too = self._model.breaks_frame_bonds()
@@ -30,26 +35,47 @@ class Fracturing:
             self._plane_of |= {plane.slot: (n, True), plane.opposite: (n, False)}
             if block := plane_block(scene.raster, plane):
                 where_ = bonds_in(scene.raster, block, plane, frame_too)
-                constants = scene.constants.limits[plane.slot]
-                self._breakable.append((n, plane.slot, block, where_, constants))
+                self._breakable.append((n, plane.slot, block, where_))
 
-    def break_bonds(self, m: NDArray[Any], broken_step: Steps, step: int) -> None:
-        """Marks, in place, the bonds that break in the intermediate configuration m."""
-        for n, slot, block, breakable, constants in self._breakable:
+    def break_bonds(self, m: NDArray[Any], state: State, step: int) -> None:
+        """Renews, in place, what is remembered of the bonds in the intermediate configuration m,
+        and marks those that break, with their length."""
+        assert state.broken_step is not None
+        assert state.broken_length is not None
+        for n, slot, block, breakable in self._breakable:
             _, rows, columns = block.slices()
-            plane = broken_step[n, rows, columns]
-            d = difference(m, block, slot)
+            plane = state.broken_step[n, rows, columns]
+            d, r = difference(m, block, slot), slot.rest
+            intact = breakable & (plane < 0)
+            own = [value[n, rows, columns] for value in state.bond_values]
+            c = (*self._limits[slot], *shown(own))
             with np.errstate(all="ignore"), blaming(self._model, f"at step {step}"):
-                breaks = self._model.breaks(d, slot.rest, constants, self._parameters)
-            plane[breakable & (plane < 0) & breaks] = step
+                if self._updates:
+                    fresh = self._model.update(d, r, c, self._parameters)
+                    renew(changing(self._numbers, own), fresh, intact)
+                breaks = self._model.breaks(d, r, c, self._parameters)
+            if (now := intact & breaks).any():
+                plane[now] = step
+                lengths = length(Vector(r.x + d.x, r.y + d.y))
+                state.broken_length[n, rows, columns][now] = lengths[now]
 
-    def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, broken_step: Steps) -> Vector:
-        """The difference that the rule sees: that of the fictitious point where the bond broke."""
-        broken = self.broken(block, slot, broken_step)
-        if not broken.any():
+    def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, state: State) -> Vector:
+        """The difference that the rule sees: softened, or that of the fictitious point where the
+        bond broke."""
+        assert state.broken_step is not None
+        n, rows, columns = self._home(block, slot)
+        broken = state.broken_step[n, rows, columns] >= 0
+        any_broken = bool(broken.any())
+        if not (any_broken or self._softens):
             return d
         with blaming(self._model, "to place a fictitious point"):
             lost = self._model.fictitious(u, slot.rest, self._parameters)
+        if self._softens:
+            c = (*self._limits[slot], *(v[n, rows, columns] for v in shown(state.bond_values)))
+            with blaming(self._model, "to soften a bond"):
+                d = self._model.seen(d, lost, slot.rest, c, self._parameters)
+        if not any_broken:
+            return d
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
 
     def plane_of(self, slot: Slot) -> tuple[int, bool]:
@@ -57,11 +83,13 @@ class Fracturing:
         return self._plane_of[slot]
 
     def broken(self, block: Block, slot: Slot, broken_step: Steps) -> NDArray[np.bool_]:
-        """Where on the block the bond along a slot is broken.
-
-        A bond lives on the plane of its positive slot: at this end or at the other.
-        """
-        n, positive = self.plane_of(slot)
-        _, rows, columns = (block if positive else block.seen_through(slot)).slices()
-        broken: NDArray[np.bool_] = broken_step[n, rows, columns] >= 0
+        """Where on the block the bond along a slot is broken."""
+        broken: NDArray[np.bool_] = broken_step[self._home(block, slot)] >= 0
         return broken
+
+    def _home(self, block: Block, slot: Slot) -> tuple[int, slice, slice]:
+        """Where the bonds of a block along a slot live: on the plane of the positive slot, at this
+        end or at the other."""
+        n, positive = self._plane_of[slot]
+        _, rows, columns = (block if positive else block.seen_through(slot)).slices()
+        return n, rows, columns

@@ -6,16 +6,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.remembering import changing, renew, shown
+from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.sums import Present, difference, planes, presence, read_only, sum_over_slots
 
 BLOCK_CELLS = 16384
@@ -60,12 +61,13 @@ class SlotFollowers(Followers):
         self._rule = scene.experiment.rule
         self._parameters = scene.constants.rule
         self._fracturing = fracturing
+        self._numbers = particle_numbers(scene.experiment)
         self._parts = [part for s in range(scene.raster.shape[0]) for part in self._cut(s)]
 
-    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+    def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
         for part in self._parts:
-            self._move(part, m, new, broken_step)
+            self._move(part, m, new, state)
 
     def _cut(self, sublattice: int) -> list[_Part]:
         whole = self._scene.raster.body_block(sublattice)
@@ -85,20 +87,23 @@ class SlotFollowers(Followers):
             None if movable.all() else movable,
         )
 
-    def _move(
-        self, part: _Part, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None
-    ) -> None:
+    def _move(self, part: _Part, m: Floats, new: Floats, state: State) -> None:
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
-            if self._fracturing and broken_step is not None:
-                d = self._fracturing.seen(d, u, part.block, slot, broken_step)
+            if self._fracturing:
+                d = self._fracturing.seen(d, u, part.block, slot, state)
             return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
 
         total = sum_over_slots(part.slots, part.present, contribution)
-        move = self._rule.apply(total, Here(u, part.X), self._parameters)
+        own = [value[part.block.slices()] for value in state.particle_values]
+        here = Here(u, part.X, shown(own))
+        move = self._rule.apply(total, here, self._parameters)
         out = planes(new, part.block)
-        for here, step, plane in zip(u, move, out, strict=True):
-            moved = target(here, step, plane, self._solver)
-            plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)
+        for at, step, plane in zip(u, move, out, strict=True):
+            moved = target(at, step, plane, self._solver)
+            plane[...] = moved if part.movable is None else np.where(part.movable, moved, at)
+        if self._rule.remembers():
+            fresh = self._rule.remember(total, here, self._parameters)
+            renew(changing(self._numbers, own), fresh, part.movable)

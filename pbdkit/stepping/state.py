@@ -14,6 +14,7 @@ from pbdkit.scene.cracks import crosses
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembering import Values, initial_bond_values, initial_particle_values
 
 Floats = NDArray[np.floating[Any]]
 
@@ -25,16 +26,21 @@ class State:
     `u` is the displacement, (axis, sublattice, cell, cell), zero where no particle is, and
     `previous` the same at the end of the step before: memory needs it, PE2 shows it, and the next
     step is written into it. `broken_step` holds, for each plane of bonds (plane, cell, cell), the
-    step at which each broke and -1 where none did; None where nothing can break. `starts` has for
+    step at which each broke and -1 where none did, and `broken_length` its length just then in the
+    intermediate configuration, 0 where none broke; None where nothing can break. `starts` has for
     each leader group that has begun the displacements from which its motion counts, (axis,
-    particle).
+    particle). `bond_values` and `particle_values` are what the fracture model remembers of each
+    bond, as `broken_step` lies, and the rule of each particle, (sublattice, cell, cell).
     """
 
     step: int
     u: Floats
     previous: Floats
     broken_step: NDArray[np.int32] | None
+    broken_length: Floats | None
     starts: tuple[Floats | None, ...]
+    bond_values: Values = ()
+    particle_values: Values = ()
 
 
 def initial_state(scene: Scene) -> State:
@@ -46,7 +52,9 @@ def initial_state(scene: Scene) -> State:
         _displace(scene, u.reshape(2, -1))
         previous[...] = u
     broken = _broken_by_cracks(scene) if scene.has_fracture else None
-    return State(0, u, previous, broken, (None,) * len(scene.leading))
+    lengths = None if broken is None else np.zeros(broken.shape, precision)
+    bonds, particles = initial_bond_values(scene), initial_particle_values(scene)
+    return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), bonds, particles)
 
 
 def _displace(scene: Scene, u: Floats) -> None:
