@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pbdkit.experiment.model import Experiment
     from pbdkit.interfaces import (
         BasisSite,
+        Bonds,
         Cell,
         Component,
         Diagnostic,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
         Nearness,
         NeighbourMetric,
         Offset,
+        Particles,
+        Remembered,
         Setting,
         Slot,
         Variable,
@@ -53,10 +56,10 @@ _HOME = {
     ),
     "pbdkit.experiment.model": ("Experiment",),
     "pbdkit.interfaces": (
-        "BasisSite", "Cell", "Component", "Diagnostic", "FollowerRule", "FractureModel",
+        "BasisSite", "Bonds", "Cell", "Component", "Diagnostic", "FollowerRule", "FractureModel",
         "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "Moment", "Nearness",
-        "NeighbourMetric", "Offset", "Setting", "Slot", "Variable", "Vector", "length",
-        "squared_length", "where",
+        "NeighbourMetric", "Offset", "Particles", "Remembered", "Setting", "Slot", "Variable",
+        "Vector", "length", "squared_length", "where",
     ),
     "pbdkit.registry.hooks": ("hookimpl",),
     "pbdkit.results.accessor": ("open",),

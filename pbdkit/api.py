@@ -89,17 +89,22 @@ def rerun(
     dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
 ) -> xarray.Dataset:
     """The same run again, bit for bit, from the experiment that the dataset carries."""
+    return run(experiment_of(dataset, components), progress=progress)
+
+
+def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
+    """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
+    it wants components that are not there."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
     source = Source("dataset", json.loads(dataset.attrs["experiment"]))
     try:
-        experiment = Experiment.build(source, components)
+        return Experiment.build(source, components)
     except ExperimentError as error:
         given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
-    return run(experiment, progress=progress)
 
 
 def _experiment(

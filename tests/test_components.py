@@ -21,6 +21,7 @@ from pbdkit.components.rules import (
     MixedCoordinate,
 )
 from pbdkit.components.springs import Springs
+from pbdkit.components.straining import Strain
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
 from pbdkit.scene.neighbourhood import build_neighbourhood
@@ -33,6 +34,8 @@ REQUIRED = {
     "thresholds": [6.0, 0.1],
     "numbers": [3, 1],
     "radius": 1.5,
+    "failure": 0.6,
+    "onset": 0.2,
     "poisson_ratio": 0.3,
     "modulus_ratio": 0.5,
     "shear_ratio": 0.4,
@@ -168,8 +171,10 @@ def test_zero_differences_of_opposite_pairs_mean_rest(rule):
         Threshold(thresholds=(1.5,)),
         Threshold(thresholds=(1.5,), placement=1.2),
         Threshold(thresholds=(1.5,), fictitious="reference"),
+        Strain(failure=0.5),
+        Strain(failure=0.5, fictitious="reference"),
     ],
-    ids=["none", "cell", "loosened", "reference"],
+    ids=["none", "cell", "loosened", "reference", "strain", "strain, reference"],
 )
 def test_fracture_functions_are_pure_and_the_same_from_both_ends(model):
     rng = np.random.default_rng(0)

@@ -48,7 +48,7 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
         reference = oracle.advance(reference, steps)
         for n, engine in enumerate(engines):
             states[n] = engine.advance(states[n], steps)
-            for name in ("u", "previous", "broken_step"):
+            for name in ("u", "previous", "broken_step", "broken_length"):
                 np.testing.assert_array_equal(getattr(states[n], name), getattr(reference, name))
             assert states[n].step == reference.step
 

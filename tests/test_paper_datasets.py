@@ -33,6 +33,7 @@ BASE = {
 }
 FRACTURE = {
     "broken_step": (("bond",), None),
+    "broken_strain": (("bond",), "float64"),
     "pe1_intact": (("time", "particle"), "float64"),
     "broken_bonds": (("time",), "int64"),
 }

@@ -69,7 +69,8 @@ def _respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Res
     slots = scene.neighbourhood.slots[sublattice]
     steps = {slot: slot_step(scene, slot) for slot in slots}
     kinds = np.arange(len(place))
-    if not scene.experiment.rule.uses_reference and not state.u.any():
+    same = not scene.experiment.rule.uses_reference and not _differ(scene, state)
+    if same and not state.u.any():
         kinds, place = _alike(scene, state, steps, place)
     some = _Followers(scene, state, steps, place)
     neighbours = {slot: some.derivative(slot) for slot in slots}
@@ -88,6 +89,13 @@ def has_neighbours(scene: Scene, sublattice: int, place: Indices) -> Present:
     for slot in scene.neighbourhood.slots[sublattice]:
         found |= scene.raster.kind.ravel()[place + slot_step(scene, slot)] != EMPTY
     return found
+
+
+def _differ(scene: Scene, state: State) -> bool:
+    """Whether what is remembered of bonds or particles, and reaches the rule, is not the same
+    everywhere."""
+    of_bonds = state.bond_values if scene.experiment.fracture.softens() else ()
+    return any((values != values.flat[0]).any() for values in (*of_bonds, *state.particle_values))
 
 
 def _alike(
@@ -124,30 +132,41 @@ def _shares_beside(scene: Scene, slot: Slot, place: Indices) -> tuple[Floats, Fl
 
 
 class _Bonds:
-    """Which bonds are broken, by the place of one end."""
+    """Which bonds are broken or softened, by the place of one end."""
 
     def __init__(self, scene: Scene, state: State) -> None:
-        self._steps = state.broken_step
+        self._steps, self._values = state.broken_step, state.bond_values
         self.any_broken = self._steps is not None and bool((self._steps >= 0).any())
-        self._fracturing = Fracturing(scene) if self.any_broken else None
         self._model, self._parameters = scene.experiment.fracture, scene.constants.fracture
+        self._limits, self._softens = scene.constants.limits, self._model.softens()
+        self.any_changed = self.any_broken or (self._steps is not None and self._softens)
+        self._fracturing = Fracturing(scene) if self.any_changed else None
         self._cells = scene.raster.shape[1] * scene.raster.shape[2]
 
     def broken(self, slot: Slot, step: int, place: Indices) -> Present:
         """Whether the bond along a slot is broken, for each place."""
-        assert self._fracturing is not None
         assert self._steps is not None
-        plane, positive = self._fracturing.plane_of(slot)
-        start = place if positive else place + step
-        broken: Present = self._steps[plane].ravel()[start % self._cells] >= 0
+        broken: Present = self._at_home(self._steps, slot, step, place) >= 0
         return broken
 
-    def seen(self, d: Vector, u: Vector, slot: Slot, broken: Present) -> Vector:
+    def constants(self, slot: Slot, step: int, place: Indices) -> tuple[Any, ...]:
+        """The constants of the bonds along a slot and what is remembered of them."""
+        own = (self._at_home(value, slot, step, place) for value in self._values)
+        return (*self._limits[slot], *own)
+
+    def seen(self, d: Vector, u: Vector, slot: Slot, broken: Present, c: Any) -> Vector:
         """The difference that the rule sees."""
-        if not broken.any():
+        if not (broken.any() or self._softens):
             return d
         lost = self._model.fictitious(u, slot.rest, self._parameters)
+        d = self._model.seen(d, lost, slot.rest, c, self._parameters)
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
+
+    def _at_home(self, planes: Any, slot: Slot, step: int, place: Indices) -> Any:
+        assert self._fracturing is not None
+        plane, positive = self._fracturing.plane_of(slot)
+        start = place if positive else place + step
+        return planes[plane].ravel()[start % self._cells]
 
 
 class _Followers:
@@ -167,11 +186,12 @@ class _Followers:
                 self._weights[slot] = (*self._weights[slot][: -len(WHOLE_CELLS)], *sides)
         self._u = Vector(*u[:, place].astype(float))
         self._d = {slot: Vector(*(u[:, place + n] - u[:, place])) for slot, n in steps.items()}
-        self._broken = {
-            slot: self._bonds.broken(slot, step, place)
+        self._changed = {
+            slot: (self._bonds.broken(slot, step, place), self._bonds.constants(slot, step, place))
             for slot, step in steps.items()
-            if self._bonds.any_broken
+            if self._bonds.any_changed
         }
+        self._own = tuple(value.ravel()[place] for value in state.particle_values)
         self._X = Vector(None, None)
         if self._rule.uses_reference:
             s, m, n = np.unravel_index(place, scene.raster.shape)
@@ -211,8 +231,8 @@ class _Followers:
         d = self._d[slot]
         if nudge:
             d = Vector(d.x + nudge.x, d.y + nudge.y)
-        if slot in self._broken:
-            d = self._bonds.seen(d, here, slot, self._broken[slot])
+        if slot in self._changed:
+            d = self._bonds.seen(d, here, slot, *self._changed[slot])
         return self._rule.gather(d, slot.rest, self._weights[slot], self._constants.rule)
 
     def _sum(self, contributions: dict[Slot, Contributions]) -> Contributions:
@@ -220,4 +240,4 @@ class _Followers:
 
     def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
         with np.errstate(all="ignore"):
-            return self._rule.apply(total, Here(here, self._X), self._constants.rule)
+            return self._rule.apply(total, Here(here, self._X, self._own), self._constants.rule)

@@ -80,7 +80,7 @@ def _is_affine(scene: Scene, state: State, followers: NDArray[np.intp]) -> bool:
     if np.abs(terms[leaders] @ map_ - u[:, there].T).max() > allowed:
         return False
     u[:, followers] = (terms[kinds == FOLLOWER] @ map_).T
-    moves = Moves(scene).at(state.u, state.broken_step, followers)
+    moves = Moves(scene).at(state, followers)
     return bool(np.abs(moves).max(initial=0.0) <= allowed)
 
 

@@ -19,6 +19,7 @@ COMMANDS = {
     "experiments": "experiments",
     "init": "experiments",
     "plot": "plot",
+    "explain": "explain",
     "bench": "bench",
     "plugins": "plugins",
     "schema": "schema",

@@ -17,7 +17,8 @@ COMPONENTS = {
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame",
     "free_edges": "Natural TractionFree",
     "fracture": "NoFracture Threshold",
-    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea",
+    "straining": "Strain Damage",
+    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
 }
 """By module of this folder the classes that it offers."""
 

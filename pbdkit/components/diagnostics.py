@@ -11,6 +11,7 @@ from pydantic import Field
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Diagnostic, Moment, Variable, Vector, length
+from pbdkit.interfaces.fracture import breaking_order
 
 LENGTH = "lattice unit"
 
@@ -162,6 +163,35 @@ def smallest_corner_area(d: tuple[Vector, ...], r: tuple[Vector, ...]) -> Any:
 
 def _cross(a: Vector, b: Vector) -> Any:
     return a.x * b.y - a.y * b.x
+
+
+class CrackPath(Diagnostic):
+    """The bonds that broke, in the order in which they did: by step, and within a step the most
+    stretched first. Bonds that were broken from the start come first, with no strain."""
+
+    type: Literal["crack-path"] = "crack-path"
+
+    uses_bonds: ClassVar[bool] = True
+    at_end: ClassVar[bool] = True
+    own_dimension: ClassVar[str] = "crack"
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`crack_bond`, `crack_step`, `crack_strain`, `crack_midpoint`."""
+        bond = "broken bonds in their order, as positions along `bond` from 0"
+        strain = "strain with which the bond broke, NaN where it was broken from the start"
+        where = "middle of the broken bond in the reference configuration"
+        return (
+            Variable("crack_bond", ("crack",), bond, "1", dtype="i8"),
+            Variable("crack_step", ("crack",), "step at which the bond broke", "step", dtype="i4"),
+            Variable("crack_strain", ("crack",), strain, "1"),
+            Variable("crack_midpoint", ("crack", "axis"), where, LENGTH),
+        )
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """A row a broken bond."""
+        steps, strains = now.broken_step(), now.broken_strain()
+        order = breaking_order(steps, strains)
+        return order, steps[order], strains[order], now.bonds().midpoint[order]
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:

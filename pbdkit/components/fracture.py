@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FractureModel, Slot, Vector, squared_length, where
+from pbdkit.interfaces import FractureModel, Slot, Vector, length, squared_length, where
 from pbdkit.interfaces.fracture import Segment
 
 Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
@@ -39,8 +40,8 @@ class NoFracture(FractureModel):
         return Vector(0.0, 0.0)
 
 
-class Threshold(FractureModel):
-    """A bond breaks when |r + d|² > threshold², one threshold a shell (the paper's section 5).
+class Parting(FractureModel):
+    """What models share whose fictitious points stand at m_j + λ R or at X_k.
 
     The fictitious point that takes the lost neighbour's place stands at m_j + λ R
     (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
@@ -49,8 +50,6 @@ class Threshold(FractureModel):
     start.
     """
 
-    type: Literal["threshold"] = "threshold"
-    thresholds: Thresholds
     placement: float = 1.0
     fictitious_at: Literal["cell", "reference"] = Field("cell", alias="fictitious")
     frame_bonds: bool = True
@@ -71,6 +70,27 @@ class Threshold(FractureModel):
         """The `cracks`."""
         return self.cracks
 
+    @staticmethod
+    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
+        """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
+        return Vector(
+            where(p.at_reference, -u.x, p.excess * r.x), where(p.at_reference, -u.y, p.excess * r.y)
+        )
+
+
+class Threshold(Parting):
+    """A bond breaks when |r + d|² > threshold², one threshold a shell (the paper's section 5).
+
+    The fictitious point that takes the lost neighbour's place stands at m_j + λ R
+    (`fictitious: cell`, `placement` λ: 1 recovers the undeformed cell, above it loosens, below it
+    contracts) or at X_k (`fictitious: reference`). `frame_bonds: false` spares the bonds to the
+    frame. `cracks` are segments [[x, y], [x, y]]; the bonds that cross them are broken from the
+    start.
+    """
+
+    type: Literal["threshold"] = "threshold"
+    thresholds: Thresholds
+
     def constants(self, slot: Slot) -> tuple[float, ...]:
         """The squared threshold of the slot's shell.
 
@@ -86,11 +106,9 @@ class Threshold(FractureModel):
         return squared_length(Vector(r.x + d.x, r.y + d.y)) > c[0]
 
     @staticmethod
-    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
-        """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
-        return Vector(
-            where(p.at_reference, -u.x, p.excess * r.x), where(p.at_reference, -u.y, p.excess * r.y)
-        )
+    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+        """The threshold as a strain."""
+        return np.sqrt(c[0]) / length(r) - 1.0
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
         """Refuses a wrong number of thresholds, and thresholds below every rest length."""

@@ -161,7 +161,7 @@ class _Search:
         self._left = self._moves()
 
     def _moves(self) -> Vectors:
-        return self._finder.moves.at(self._state.u, self._state.broken_step, self._place)
+        return self._finder.moves.at(self._state, self._place)
 
     def _is_better_than(self, moves: Vectors) -> bool:
         return _size(self._left) < _size(moves)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, never_rests, scale_of
-from pbdkit.equilibrium.finding import Finder
+from pbdkit.equilibrium.finding import Finder, UnconvergedError
 from pbdkit.equilibrium.watching import StoppedError, Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium
@@ -18,6 +18,8 @@ from pbdkit.stepping.state import State, initial_state
 
 VALUES_A_CALL = 200_000_000
 """An engine makes so many values' steps a call, some tenths of a second."""
+MOST_SETTLINGS = 2000
+"""So often bonds may change in an increment, one after the other or little by little."""
 
 
 def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
@@ -84,21 +86,47 @@ def _settle_at(scene: Scene, state: State, finder: Finder, step: int) -> Certifi
 def _load(scene: Scene, state: State, finder: Finder, increments: int) -> Certificate:
     """In increments up to the last motion or change of roles, breaking bonds on the way."""
     fracturing, steps = Fracturing(scene), scene.experiment.steps
-    assert state.broken_step is not None
     last = last_event(scene)
     count = min(increments, last)
-    certificate = None
+    certificate: Certificate | None = None
     for step in np.unique(np.linspace(1, last, count).round().astype(int)).tolist():
         finder.watch.load = f"step {step} of {last}, "
-        while True:
+        for _ in range(MOST_SETTLINGS):
             certificate = _settle_at(scene, state, finder, step)
-            broken = np.count_nonzero(state.broken_step >= 0)
-            fracturing.break_bonds(state.u, state.broken_step, step)
-            if np.count_nonzero(state.broken_step >= 0) == broken:
+            if not _bonds_change(scene, fracturing, state, step):
                 break
+        else:
+            assert certificate is not None
+            raise UnconvergedError(
+                f"bonds still change after they settled {MOST_SETTLINGS} times in step {step}",
+                certificate,
+            )
     state.step = steps
     assert certificate is not None
     return certificate
+
+
+def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int) -> bool:
+    """Whether bonds break or change in the settled state; changes within the tolerance are left
+    out, so that the certificate speaks of the bonds as they are."""
+    before = [value.copy() for value in state.bond_values]
+    broken = _broken(state)
+    fracturing.break_bonds(state.u, state, step)
+    if _broken(state) > broken:
+        return True
+    solver = scene.experiment.solver
+    assert isinstance(solver, Equilibrium)
+    for old, new in zip(before, state.bond_values, strict=True):
+        if (np.abs(new - old) > solver.tolerance * np.maximum(1.0, np.abs(old))).any():
+            return True
+    for old, new in zip(before, state.bond_values, strict=True):
+        new[...] = old
+    return False
+
+
+def _broken(state: State) -> int:
+    assert state.broken_step is not None
+    return int(np.count_nonzero(state.broken_step >= 0))
 
 
 def _last_change_of_roles(scene: Scene) -> int:

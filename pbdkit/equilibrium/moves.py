@@ -9,7 +9,7 @@ from pbdkit.analysis.operator import StepOperator
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing, Steps
+from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats, State
 
@@ -28,8 +28,9 @@ class Moves:
         )
         self._after: Floats | None = None
 
-    def at(self, u: Floats, broken_step: Steps | None, place: Indices) -> NDArray[np.float64]:
-        """(follower, axis) at the flat places; brings u's frame into line."""
+    def at(self, state: State, place: Indices) -> NDArray[np.float64]:
+        """(follower, axis) at the flat places; brings the state's frame into line."""
+        u = state.u
         flat = u.reshape(2, -1)
         if self._scene.frame:
             self._scene.frame.follow(flat, flat)
@@ -37,7 +38,7 @@ class Moves:
             self._after = np.empty_like(u)
         self._after[...] = u
         with np.errstate(all="ignore"):
-            self._followers.move(u, self._after, broken_step)
+            self._followers.move(u, self._after, state)
         moved = (self._after.reshape(2, -1)[:, place] - flat[:, place]).T
         return moved.astype(float)
 

@@ -108,12 +108,12 @@ class Foresight:
 
     def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:
         """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
-        moves = self._moves.at(here.u, here.broken_step, known.place)
+        moves = self._moves.at(here, known.place)
         ahead, distance = here.u.copy(), math.inf
         correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
             ahead.reshape(2, -1)[:, known.place] += correction.T
-            left = self._moves.at(ahead, here.broken_step, known.place)
+            left = self._moves.at(replace(here, u=ahead), known.place)
             bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
             if anew and not _smaller(left, moves, rounding(ahead)):
@@ -148,8 +148,8 @@ class Foresight:
         put = np.random.default_rng(0).uniform(-size, size, shape)
         there = here.u.copy()
         there.reshape(2, -1)[:, known.place] += put.T
-        change = self._moves.at(there, here.broken_step, known.place) - self._moves.at(
-            here.u, here.broken_step, known.place
+        change = self._moves.at(replace(here, u=there), known.place) - self._moves.at(
+            here, known.place
         )
         with np.errstate(all="ignore"):
             wrong = float(np.linalg.norm(change + known.system.times(put)))

@@ -74,9 +74,9 @@ class Settling:
 
     def _may_break(self, state: State, outlook: Outlook) -> bool:
         """Whether a bond might break within the distance of the equilibrium at both its ends."""
-        if self._fracturing is None or state.broken_step is None:
+        if self._fracturing is None:
             return False
-        return self._fracturing.may_break(outlook.u, state.broken_step, 2.0 * outlook.distance)
+        return self._fracturing.may_break(outlook.u, state, 2.0 * outlook.distance)
 
     def _certificate(self, outlook: Outlook, distance: float) -> Certificate:
         return Certificate(

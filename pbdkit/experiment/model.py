@@ -121,6 +121,19 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false, or leave solver.settle out",
                 key="solver",
             )
+        if self.solver.settle and (self.rule.remembers() or self.fracture.softens()):
+            part = self.rule if self.rule.remembers() else self.fracture
+            raise fault(
+                f"'{part.type}' remembers, so that no distance from equilibrium is known; leave "
+                "solver.settle out",
+                key="solver",
+            )
+        if self.rule.remembers() and isinstance(self.solver, Equilibrium):
+            raise fault(
+                f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
+                "all of them; take solver: {type: stepping}",
+                key="solver",
+            )
         return self
 
     @property

@@ -7,6 +7,7 @@ from pbdkit.interfaces.fracture import FractureModel
 from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
 from pbdkit.interfaces.neighbours import Nearness, NeighbourMetric, Slot
+from pbdkit.interfaces.remembered import Bonds, Particles, Remembered
 from pbdkit.interfaces.rule import FollowerRule, Here, Setting, Stiffness
 
 INTERFACES: dict[str, type[Component]] = {
@@ -22,6 +23,7 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "INTERFACES",
     "BasisSite",
+    "Bonds",
     "Cell",
     "Component",
     "Diagnostic",
@@ -37,6 +39,8 @@ __all__ = [
     "NeighbourMetric",
     "Offset",
     "Pair",
+    "Particles",
+    "Remembered",
     "Setting",
     "Slot",
     "Stiffness",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.remembered import Bonds
 
 Floats = NDArray[np.floating[Any]]
 
@@ -20,7 +21,8 @@ Floats = NDArray[np.floating[Any]]
 class Variable:
     """One variable of the dataset: its name, dimensions, dtype and attributes.
 
-    `dims` are without the leading time or step, which the framework adds.
+    `dims` are without the leading time or step, which the framework adds unless the diagnostic is
+    measured at the end.
     """
 
     name: str
@@ -82,12 +84,31 @@ class Moment(ABC):
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
+    @abstractmethod
+    def bonds(self) -> Bonds:
+        """The table of bonds, in the order of the dataset."""
+
+    @abstractmethod
+    def broken_step(self) -> NDArray[np.int32]:
+        """(bond,): the step at which each bond broke, -1 where it has not, 0 at a given crack."""
+
+    @abstractmethod
+    def broken_strain(self) -> NDArray[np.float64]:
+        """(bond,): the strain with which each bond broke, in the intermediate configuration; NaN
+        where it has not, or was broken from the start."""
+
+    @abstractmethod
+    def remembered(self, name: str) -> NDArray[Any]:
+        """A number that the fracture model remembers, (bond,) in the order of the dataset, or the
+        rule, (particle,); frame points have its initial value."""
+
 
 class Diagnostic(Component):
     """A quantity of the run that goes into the dataset.
 
     To add a diagnostic, write `variables` and `measure`. It is evaluated at recorded steps only,
-    or at every step where it declares `every_step`; nothing of it exists where nobody asks.
+    at every step where it declares `every_step`, or once, after the last step, where it declares
+    `at_end`; nothing of it exists where nobody asks.
     """
 
     uses_bonds: ClassVar[bool] = False
@@ -97,6 +118,10 @@ class Diagnostic(Component):
     row for instance, is then refused."""
     every_step: ClassVar[bool] = False
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
+    at_end: ClassVar[bool] = False
+    """Measure once, after the last step; the variables have no leading dimension."""
+    own_dimension: ClassVar[str] = ""
+    """With `at_end`: a dimension that gets its length from the values, known only then."""
 
     @abstractmethod
     def variables(self) -> tuple[Variable, ...]:

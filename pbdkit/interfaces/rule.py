@@ -6,10 +6,13 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.remembered import Drawn, Particles, Remembered, is_own
 
 
 class Here(NamedTuple):
@@ -17,11 +20,13 @@ class Here(NamedTuple):
 
     `u` is its displacement in the intermediate configuration; `X` its reference position from the
     lattice's site (0, 0), so that no digit depends on where the body lies, given to rules that
-    declare `uses_reference`, otherwise None.
+    declare `uses_reference`, otherwise None. `own` are the numbers that the rule remembers of the
+    particle, in the order of `particle_state`.
     """
 
     u: Vector
     X: Vector
+    own: tuple[Any, ...] = ()
 
 
 class Stiffness(NamedTuple):
@@ -107,3 +112,32 @@ class FollowerRule(Component):
         in the lattice's units, from the sums. Calibrated rules have it; it vanishes in
         equilibrium."""
         raise NotImplementedError("the rule is not calibrated to a material: it knows no forces")
+
+    def particle_state(self) -> tuple[Remembered, ...]:
+        """The numbers that the rule remembers of each particle of the body, seen as ``here.own``;
+        by default none."""
+        return ()
+
+    def draw(self, particles: Particles, generator: np.random.Generator) -> Drawn:
+        """Where these numbers start, (particle,) by name, if not all at their `initial`.
+
+        The generator depends on the experiment's `seed` and on nothing else.
+        """
+        return {}
+
+    @staticmethod
+    def remember(total: Any, here: Here, p: Any) -> tuple[Any, ...]:
+        """The new values of the numbers that change, in their order, from what `apply` is given.
+
+        By default they stay. Leaders remember as followers do; who has no neighbour keeps its
+        numbers.
+        """
+        return ()
+
+    def remembers(self) -> bool:
+        """Whether what it remembers changes."""
+        return is_own(self, FollowerRule, "remember")
+
+    def draws(self) -> bool:
+        """Whether particles differ from the start."""
+        return is_own(self, FollowerRule, "draw")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import Variable
+from pbdkit.interfaces import Diagnostic, Remembered, Variable
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 CONVENTIONS = "CF-1.11"
@@ -85,10 +85,22 @@ def bond_columns() -> list[Column]:
     ]
 
 
-def broken_column() -> Column:
-    """When each bond broke, where there is fracture."""
-    meaning = "step at which the bond broke, -1 if it has not"
-    return Column("broken_step", ("bond",), "i4", When.END, _described(meaning))
+def broken_columns() -> list[Column]:
+    """When each bond broke, and how far stretched, where there is fracture."""
+    step = "step at which the bond broke, -1 if it has not"
+    strain = "strain with which the bond broke, NaN if it has not or was broken from the start"
+    return [
+        Column("broken_step", ("bond",), "i4", When.END, _described(step)),
+        Column("broken_strain", ("bond",), "f8", When.END, _described(strain, "1")),
+    ]
+
+
+def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:
+    """A number that a part remembers of each `owner`, bond or particle."""
+    grows = number.changes and part_renews
+    dims, when = (("time", owner), When.RECORD) if grows else ((owner,), When.START)
+    attributes = _described(number.long_name, number.units)
+    return Column(number.name, dims, number.dtype, when, attributes)
 
 
 def step_column() -> Column:
@@ -101,8 +113,11 @@ def own_coordinate(name: str, dtype: str) -> Column:
     return Column(name, (name,), dtype, When.START, _described(name), True)
 
 
-def diagnostic_column(variable: Variable, every_step: bool) -> Column:
+def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnostic]) -> Column:
     """A diagnostic's variable with its leading dimension."""
-    leading, when = ("step", When.STEP) if every_step else ("time", When.RECORD)
+    leading, when = ("step", When.STEP) if diagnostic.every_step else ("time", When.RECORD)
+    dims = (leading, *variable.dims)
+    if diagnostic.at_end:
+        dims, when = variable.dims, When.END
     attributes = _described(variable.long_name, variable.units, **variable.attributes)
-    return Column(variable.name, (leading, *variable.dims), variable.dtype, when, attributes)
+    return Column(variable.name, dims, variable.dtype, when, attributes)

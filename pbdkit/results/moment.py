@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Moment, Slot, Vector
+from pbdkit.interfaces import Bonds, Moment, Slot, Vector, length
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
+from pbdkit.stepping.remembering import describe_bonds
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.sums import difference, presence, sum_over_slots
 
@@ -60,10 +63,11 @@ class Tables:
 
 
 class StateMoment(Moment):
-    """A state as a table."""
+    """A state as a table; bonds that broke later than asked for count as they were before."""
 
-    def __init__(self, state: State, tables: Tables) -> None:
+    def __init__(self, state: State, tables: Tables, no_later_than: int | None = None) -> None:
         self.step = state.step
+        self._no_later_than = state.step if no_later_than is None else no_later_than
         self._state = state
         self._tables = tables
 
@@ -105,11 +109,45 @@ class StateMoment(Moment):
         broken = self._state.broken_step
         return 0 if broken is None else int((broken >= 0).sum())
 
+    def bonds(self) -> Bonds:
+        """Made anew: seldom wanted."""
+        return describe_bonds(self._tables.scene)
+
     def broken_step(self) -> NDArray[np.int32]:
-        """(bond,): the step at which each bond broke, -1 where it has not."""
+        """From the planes; none has where none can."""
         bonds, broken = self._tables.scene.bonds, self._state.broken_step
-        assert broken is not None
-        return broken.reshape(len(broken), -1)[bonds.plane, bonds.place]
+        if broken is None:
+            return np.full(len(bonds.ends), -1, np.int32)
+        steps: NDArray[np.int32] = broken.reshape(len(broken), -1)[bonds.plane, bonds.place]
+        return np.where(steps > self._no_later_than, np.int32(-1), steps)
+
+    def broken_strain(self) -> NDArray[np.float64]:
+        """From the lengths, in float64 whatever the run's precision."""
+        scene, lengths = self._tables.scene, self._state.broken_length
+        steps = self.broken_step()
+        strains = np.full(len(steps), np.nan)
+        if lengths is not None:
+            rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
+            broken = np.flatnonzero(steps > 0)
+            plane, place = scene.bonds.plane[broken], scene.bonds.place[broken]
+            strains[broken] = lengths.reshape(len(lengths), -1)[plane, place] / rests[plane] - 1
+        return strains
+
+    def remembered(self, name: str) -> NDArray[Any]:
+        """In the order of the bonds' table, or of the particles' numbers."""
+        scene, state = self._tables.scene, self._state
+        for number, values in zip(bond_numbers(scene.experiment), state.bond_values, strict=True):
+            if number.name == name:
+                found: NDArray[Any] = values.reshape(len(values), -1)[
+                    scene.bonds.plane, scene.bonds.place
+                ]
+                return found
+        numbers = particle_numbers(scene.experiment)
+        for number, values in zip(numbers, state.particle_values, strict=True):
+            if number.name == name:
+                return self._tables.raster.table(values[None])[:, 0]
+        known = [n.name for n in (*bond_numbers(scene.experiment), *numbers)]
+        raise ValueError(f"no part remembers '{name}'{did_you_mean(name, known)}")
 
     def sum_over_neighbours(
         self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False

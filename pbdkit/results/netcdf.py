@@ -13,12 +13,14 @@ import netCDF4
 import numpy as np
 
 from pbdkit.errors import StorageError
-from pbdkit.results.layout import Column
+from pbdkit.results.layout import Column, When
 from pbdkit.results.recorder import Sink, Values
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading
 the history of a particle touches one chunk a batch, reading a snapshot little more than itself."""
+OPEN_CHUNK = 1024
+"""Entries a chunk along a dimension whose length is known at the end only."""
 FULL_BYTES = 2**20
 
 
@@ -112,6 +114,8 @@ class NetcdfSink(Sink):
             if inner:  # parts of equal size, so that the last one wastes nothing
                 inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
             chunks = (self._batch[column.name], *inner)
+        elif column.when is When.END and column.dims and column.dims[0] not in sizes:
+            chunks = (OPEN_CHUNK, *(sizes[d] for d in column.dims[1:]))
         packed = self._compression if column.dtype != "str" else {}
         variable = self._file.createVariable(
             column.name, dtype, column.dims, chunksizes=chunks, fill_value=False, **packed

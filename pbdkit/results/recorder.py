@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from pbdkit.analysis.forecast import prediction
-from pbdkit.errors import PluginError
-from pbdkit.interfaces import Diagnostic, Variable
+from pbdkit.interfaces import Diagnostic
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.inversion import inside_out
 from pbdkit.results.layout import Column
+from pbdkit.results.measuring import measured_at_end, refuse_unfit, refuse_unknown
 from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.remembered import RememberedColumns
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -69,9 +70,11 @@ class Recorder:
         self.last_recorded = -1
         """The last step of which positions were taken."""
         self.warnings: tuple[str, ...] = ()
+        self._remembered = RememberedColumns(scene)
         diagnostics = scene.experiment.diagnostics
-        self._recorded = [d for d in diagnostics if not d.every_step]
+        self._recorded = [d for d in diagnostics if not (d.every_step or d.at_end)]
         self._stepped = [d for d in diagnostics if d.every_step]
+        self._last = [d for d in diagnostics if d.at_end]
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
@@ -84,6 +87,7 @@ class Recorder:
             sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
         records = experiment.recording.count(experiment.steps)
+        self._sizes = sizes
         self._sink.begin(columns, sizes, {"time": records, "step": experiment.steps + 1})
         for name, values in known.items():
             self._sink.put({name: values()})
@@ -139,7 +143,9 @@ class Recorder:
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
-            values |= self._measured(self._recorded, moment)
+            values |= self._remembered.at(moment) | self._measured(self._recorded, moment)
+            if self.last_recorded < 0:
+                values |= self._remembered.once(moment)
             self.last_recorded = state.step
         if stepped:
             values |= {"step": state.step} | self._measured(self._stepped, moment)
@@ -149,14 +155,17 @@ class Recorder:
     def finish(self, state: State, outcome: Outcome) -> None:
         """Hands over what is known at the end, and the attributes; `warnings` says what the user
         should know of the last state."""
-        if outcome.status != "diverged":
-            warning = inside_out(StateMoment(state, self._tables))
-            self.warnings = (warning,) if warning else ()
+        # Where a run diverged, what broke since the last record is no result.
+        diverged = outcome.status == "diverged"
+        moment = StateMoment(state, self._tables, self.last_recorded if diverged else state.step)
+        if not diverged and (warning := inside_out(moment)):
+            self.warnings = (warning,)
         if self._scene.has_fracture:
-            broken = StateMoment(state, self._tables).broken_step()
-            if outcome.status == "diverged":  # what broke since the last record is no result
-                broken = np.where(broken > self.last_recorded, -1, broken)
-            self._sink.put({"broken_step": broken})
+            steps, strains = moment.broken_step(), moment.broken_strain()
+            self._sink.put({"broken_step": steps, "broken_strain": strains})
+        for diagnostic in self._last:
+            with np.errstate(all="ignore"):
+                self._sink.put(measured_at_end(diagnostic, moment, self._sizes))
         self._sink.finish(self._attributes(outcome))
 
     def _columns(self) -> list[Column]:
@@ -164,16 +173,17 @@ class Recorder:
         if self._scene.shows_bonds:
             columns += layout.bond_columns()
         if self._scene.has_fracture:
-            columns.append(layout.broken_column())
+            columns += layout.broken_columns()
+        columns += self._remembered.checked({c.name for c in columns})
         if self._stepped:
             columns.append(layout.step_column())
         for diagnostic in self._scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 columns.append(layout.own_coordinate(name, values.dtype.str[1:]))
-            known = {d for c in columns for d in c.dims}
+            known = {d for c in columns for d in c.dims} | {diagnostic.own_dimension} - {""}
             for variable in diagnostic.variables():
-                _refuse_unknown(diagnostic, variable, known, {c.name for c in columns})
-                columns.append(layout.diagnostic_column(variable, diagnostic.every_step))
+                refuse_unknown(diagnostic, variable, known, {c.name for c in columns})
+                columns.append(layout.diagnostic_column(variable, diagnostic))
         return [self._as_recorded(column) for column in columns]
 
     def _as_recorded(self, column: Column) -> Column:
@@ -191,7 +201,7 @@ class Recorder:
             with blaming(diagnostic, f"at step {moment.step}"):
                 measured = diagnostic.measure(moment)
                 for variable, value in zip(diagnostic.variables(), measured, strict=True):
-                    _refuse_unfit(variable, value, self._shapes[variable.name], moment.step)
+                    refuse_unfit(variable, value, self._shapes[variable.name], moment.step)
                     values[variable.name] = np.array(value)
         return values
 
@@ -209,25 +219,3 @@ class Recorder:
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         } | ({"certificate": json.dumps(outcome.certificate)} if outcome.certificate else {})
-
-
-def _refuse_unknown(
-    diagnostic: Diagnostic, variable: Variable, dims: set[str], names: set[str]
-) -> None:
-    what = f"Diagnostic '{diagnostic.type}' declares the variable '{variable.name}'"
-    if variable.name in names:
-        raise PluginError(f"{what}, and that name is taken")
-    if unknown := [dim for dim in variable.dims if dim not in dims]:
-        raise PluginError(f"{what} with the dimension '{unknown[0]}', which it gives no values")
-
-
-def _refuse_unfit(variable: Variable, value: Any, shape: tuple[int, ...], step: int) -> None:
-    """Raises ValueError for another shape than declared, FloatingPointError for what is not
-    finite."""
-    if np.shape(value) != shape:
-        raise ValueError(f"'{variable.name}' has the shape {np.shape(value)}, not {shape}")
-    finite = np.isfinite(value)
-    if not finite.all():
-        place = np.argwhere(~finite)[0]
-        whose = f"particle {place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
-        raise FloatingPointError(f"{variable.name} of {whose} at step {step}")

@@ -22,7 +22,7 @@ ATTRIBUTES = (
 def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
     """What a dataset holds; without `installed`, of the built-in diagnostics alone."""
     base = layout.base_columns()
-    optional = [*layout.bond_columns(), layout.broken_column(), layout.step_column()]
+    optional = [*layout.bond_columns(), *layout.broken_columns(), layout.step_column()]
     for diagnostic in registry.components(Diagnostic, installed=installed).values():
         optional += _columns_of(diagnostic)
     columns = base + optional
@@ -49,7 +49,7 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
     assert issubclass(diagnostic, Diagnostic)
     try:
         variables = diagnostic.model_construct(type="").variables()
-        columns = [layout.diagnostic_column(v, diagnostic.every_step) for v in variables]
+        columns = [layout.diagnostic_column(v, diagnostic) for v in variables]
         json.dumps([_described(column) for column in columns])
     except Exception:  # it is somebody's code, which nobody asked to run
         return []

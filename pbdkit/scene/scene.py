@@ -22,6 +22,7 @@ from pbdkit.scene.mesh import Patch, lattice_cells, patches
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
+from pbdkit.scene.remembering import remembered_names
 from pbdkit.scene.sizes import refuse_too_large
 
 FLAT = 0.05
@@ -206,7 +207,7 @@ def _body_cells(raster: Raster) -> tuple[Patch, ...]:
 
 
 def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
-    taken: dict[str, int] = {}
+    taken = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
             diagnostic.check(raster.count)
@@ -218,6 +219,6 @@ def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
                 )
             for variable in diagnostic.variables():
                 if variable.name in taken:
-                    other = f"diagnostics.{taken[variable.name]} does too"
+                    other = f"{taken[variable.name]} does too"
                     raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
-                taken[variable.name] = n
+                taken[variable.name] = f"diagnostics.{n}"

@@ -13,6 +13,7 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Diagnostic
 from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.remembering import Declared, bond_numbers, particle_numbers
 
 MIB = 2**20
 WORKSPACE_BYTES = 100
@@ -45,7 +46,9 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.solver.precision == "float64" else 4
-    state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1)
+    bonds, own = bond_numbers(experiment), particle_numbers(experiment)
+    state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1 + value)
+    state += planes * _bytes_of(bonds, value) + _bytes_of(own, value)
     table = (
         1
         + 8
@@ -54,22 +57,36 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
         + experiment.shows_bonds * planes * BOND_BYTES
     )
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
+    return Sizes(particles, memory, _output(experiment, particles, planes))
+
+
+def _output(experiment: Experiment, particles: int, planes: float) -> int:
+    """Bytes of the dataset, with `planes` bonds a particle, all of which may break."""
+    bonds, own = bond_numbers(experiment), particle_numbers(experiment)
     records = experiment.recording.count(experiment.steps)
     recorded = np.dtype(experiment.record.dtype).itemsize
     entries = {
         stepped: sum(
             _bytes_an_entry(d, particles, recorded)
             for d in experiment.diagnostics
-            if d.every_step == stepped
+            if d.every_step == stepped and not d.at_end
         )
         for stepped in (False, True)
     }
     per_record, every_step = particles * (2 * recorded + 1) + entries[False], entries[True]
     once = particles * (2 * 8 + 2 * 4 + 2 * 8)
     if experiment.shows_bonds:
-        once += math.ceil(particles * planes * (2 * 8 + 1 + 4 * experiment.fracture.can_break))
-    output = once + records * per_record + (experiment.steps + 1) * every_step
-    return Sizes(particles, memory, output)
+        once += math.ceil(particles * planes * (2 * 8 + 1 + 12 * experiment.fracture.can_break))
+    of_bonds, of_particles = (
+        _recorded_bytes(numbers, renews, recorded)
+        for numbers, renews in (
+            (bonds, experiment.fracture.updates()),
+            (own, experiment.rule.remembers()),
+        )
+    )
+    once += math.ceil(particles * (planes * of_bonds[0] + of_particles[0]))
+    per_record += math.ceil(particles * (planes * of_bonds[1] + of_particles[1]))
+    return once + records * per_record + (experiment.steps + 1) * every_step
 
 
 def refuse_too_large(
@@ -92,6 +109,18 @@ def machine_memory() -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
         return 16 * 2**30
+
+
+def _bytes_of(numbers: Declared, value: int) -> int:
+    return sum(value if n.dtype == "f8" else np.dtype(n.dtype).itemsize for n in numbers)
+
+
+def _recorded_bytes(numbers: Declared, part_renews: bool, recorded: int) -> tuple[int, int]:
+    """What is written of each bond or particle once, and at every record."""
+    shown = tuple(n for n in numbers if n.recorded)
+    growing = tuple(n for n in shown if n.changes and part_renews)
+    fixed = tuple(n for n in shown if n not in growing)
+    return _bytes_of(fixed, 8), _bytes_of(growing, recorded)
 
 
 def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int) -> int:

@@ -81,6 +81,10 @@ def _obstacle(scene: Scene) -> str:
         return "neighbours are found anew at every step"
     if scene.inner:
         return "the rule works on the moves of another"
+    if scene.experiment.fracture.bond_state() or scene.experiment.fracture.softens():
+        return f"fracture '{scene.experiment.fracture.type}' keeps a state of each bond"
+    if scene.experiment.rule.particle_state():
+        return f"rule '{scene.experiment.rule.type}' keeps a state of each particle"
     if max(map(len, scene.neighbourhood.slots)) > 31:
         return "more than 31 neighbours"
     return ""

@@ -6,10 +6,9 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
 
 REAL = "fiub"
 """The kinds of numpy's types that are numbers a particle can move by."""
@@ -19,10 +18,11 @@ class Followers(ABC):
     """The followers of a scene, and how they find their neighbours."""
 
     @abstractmethod
-    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+    def move(self, m: Floats, new: Floats, state: State) -> None:
         """Writes the displacements of all body particles into `new`, from the intermediate
         configuration m; `new` comes holding those of the step before. Particles without any
-        neighbour stay. What it writes for leaders is overwritten."""
+        neighbour stay. What it writes for leaders is overwritten. Of the state it takes what bonds
+        and particles remember, and renews, in place, what particles do."""
 
 
 def target(here: Any, move: Any, before: Any, solver: Stepping | Equilibrium) -> Any:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.interfaces import Here, Nearness, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import positions
+from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.remembering import changing, renew
+from pbdkit.stepping.state import Floats, State
 
 
 class GatheringFollowers(Followers):
@@ -30,7 +33,7 @@ class GatheringFollowers(Followers):
         self._scale = np.sqrt(np.array(near.weights))
         self._radius = near.radius * (1 + 1e-9)
 
-    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+    def move(self, m: Floats, new: Floats, state: State) -> None:
         """Bonds do not last here, so that none can be broken."""
         u = m.reshape(2, -1)[:, self._place]
         j, k = self._pairs(self._X + u)
@@ -40,15 +43,27 @@ class GatheringFollowers(Followers):
             np.bincount(j, np.broadcast_to(part, j.shape), count)
             for part in self._rule.gather(d, r, (), self._parameters)
         )
-        move = self._rule.apply(total, Here(Vector(*u), Vector(*self._X)), self._parameters)
+        own = tuple(value.ravel()[self._place] for value in state.particle_values)
+        here = Here(Vector(*u), Vector(*self._X), own)
+        move = self._rule.apply(total, here, self._parameters)
         movable = self._body[np.bincount(j, minlength=count)[self._body] > 0]
         place = self._place[movable]
+        if self._rule.remembers():
+            self._remember(total, here, state, movable)
         flat = new.reshape(2, -1)
-        for here, step, plane in zip(u, move, flat, strict=True):
+        for u_here, step, plane in zip(u, move, flat, strict=True):
             before = plane[self._place]
-            moved = target(here, step, before, self._scene.experiment.solver)
-            plane[self._place[self._body]] = here[self._body]
+            moved = target(u_here, step, before, self._scene.experiment.solver)
+            plane[self._place[self._body]] = u_here[self._body]
             plane[place] = moved[movable]
+
+    def _remember(self, total: tuple[Any, ...], here: Here, state: State, movable: Indices) -> None:
+        """`here` holds copies, so that what is written is not read again."""
+        numbers, place = particle_numbers(self._scene.experiment), self._place[movable]
+        fresh = changing(numbers, here.own)
+        renew(fresh, self._rule.remember(total, here, self._parameters), None)
+        for plane, values in zip(changing(numbers, state.particle_values), fresh, strict=True):
+            plane.reshape(-1)[place] = values[movable]
 
     def _pairs(self, x: Floats) -> tuple[Indices, Indices]:
         """(j, k): every body particle j with each of its neighbours k, sorted."""

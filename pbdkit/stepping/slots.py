@@ -6,16 +6,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.remembering import changing, renew, shown
+from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.sums import Present, difference, planes, presence, read_only, sum_over_slots
 
 BLOCK_CELLS = 16384
@@ -61,19 +62,26 @@ class SlotFollowers(Followers):
         self._parameters = scene.constants.rule
         self._fracturing = fracturing
         self._inner = SlotFollowers(scene.inner, None, Stepping()) if scene.inner else None
+        self._numbers = particle_numbers(scene.experiment)
         self._parts = [part for s in range(scene.raster.shape[0]) for part in self._cut(s)]
 
-    def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
+    def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
-        seen = self._inner.moves(m) if self._inner else m
+        seen = self._inner.moves(m, state) if self._inner else m
         for part in self._parts:
-            self._place(part, self._moves(part, seen, broken_step), m, new)
+            total, here = self._sums(part, seen, state)
+            move = self._rule.apply(total, here, self._parameters)
+            self._place(part, move, m, new)
+            if self._rule.remembers():
+                own = [value[part.block.slices()] for value in state.particle_values]
+                fresh = self._rule.remember(total, here, self._parameters)
+                renew(changing(self._numbers, own), fresh, part.movable)
 
-    def moves(self, m: Floats) -> Floats:
+    def moves(self, m: Floats, state: State) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        seen, out = self._inner.moves(m) if self._inner else m, np.zeros_like(m)
+        seen, out = self._inner.moves(m, state) if self._inner else m, np.zeros_like(m)
         for part in self._parts:
-            moves = self._moves(part, seen, None)
+            moves = self._rule.apply(*self._sums(part, seen, state), self._parameters)
             for move, plane in zip(moves, planes(out, part.block), strict=True):
                 plane[...] = move if part.movable is None else np.where(part.movable, move, 0.0)
         return out
@@ -96,19 +104,19 @@ class SlotFollowers(Followers):
             None if movable.all() else movable,
         )
 
-    def _moves(
-        self, part: _Part, m: Floats, broken_step: NDArray[np.int32] | None
-    ) -> tuple[Any, Any]:
+    def _sums(self, part: _Part, m: Floats, state: State) -> tuple[tuple[Any, ...], Here]:
+        """What `apply` is given on a block."""
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
-            if self._fracturing and broken_step is not None:
-                d = self._fracturing.seen(d, u, part.block, slot, broken_step)
+            if self._fracturing:
+                d = self._fracturing.seen(d, u, part.block, slot, state)
             return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
 
         total = sum_over_slots(part.slots, part.present, contribution)
-        return self._rule.apply(total, Here(u, part.X), self._parameters)
+        own = [value[part.block.slices()] for value in state.particle_values]
+        return total, Here(u, part.X, shown(own))
 
     def _place(self, part: _Part, move: tuple[Any, Any], m: Floats, new: Floats) -> None:
         """Writes where the particles of a block go."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from pbdkit.scene.cracks import crosses
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembering import Values, initial_bond_values, initial_particle_values
 
 Floats = NDArray[np.floating[Any]]
 
@@ -25,28 +26,51 @@ class State:
     `u` is the displacement, (axis, sublattice, cell, cell), zero where no particle is, and
     `previous` the same at the end of the step before: memory needs it, PE2 shows it, and the next
     step is written into it. `broken_step` holds, for each plane of bonds (plane, cell, cell), the
-    step at which each broke and -1 where none did; None where nothing can break. `starts` has for
+    step at which each broke and -1 where none did, and `broken_length` its length just then in the
+    intermediate configuration, 0 where none broke; None where nothing can break. `starts` has for
     each leader group that has begun the displacements from which its motion counts, (axis,
-    particle).
+    particle). `bond_values` and `particle_values` are what the fracture model remembers of each
+    bond, as `broken_step` lies, and the rule of each particle, (sublattice, cell, cell).
     """
 
     step: int
     u: Floats
     previous: Floats
     broken_step: NDArray[np.int32] | None
+    broken_length: Floats | None
     starts: tuple[Floats | None, ...]
+    bond_values: Values = ()
+    particle_values: Values = ()
 
     def copy(self, over: State | None = None) -> State:
         """The same state in arrays of its own, or in those of a state of the same scene that
         nobody needs any more: memory that is new costs several times as much as what is copied."""
         if over is None:
-            broken = None if self.broken_step is None else self.broken_step.copy()
-            return State(self.step, self.u.copy(), self.previous.copy(), broken, self.starts)
-        np.copyto(over.u, self.u)
-        np.copyto(over.previous, self.previous)
-        if over.broken_step is not None and self.broken_step is not None:
-            np.copyto(over.broken_step, self.broken_step)
-        return State(self.step, over.u, over.previous, over.broken_step, self.starts)
+            over = replace(self, **{name: _copied(getattr(self, name)) for name in _CARRIED})
+        else:
+            for name in _CARRIED:
+                _copy(getattr(self, name), getattr(over, name))
+        return replace(over, step=self.step, starts=self.starts)
+
+
+_CARRIED = ("u", "previous", "broken_step", "broken_length", "bond_values", "particle_values")
+"""What steps are written into."""
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(array.copy() for array in value)
+    return None if value is None else value.copy()
+
+
+def _copy(value: Any, over: Any) -> None:
+    if value is not None:
+        for array, target in zip(_each(value), _each(over), strict=True):
+            np.copyto(target, array)
+
+
+def _each(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 def initial_state(scene: Scene) -> State:
@@ -58,7 +82,9 @@ def initial_state(scene: Scene) -> State:
         _displace(scene, u.reshape(2, -1))
         previous[...] = u
     broken = _broken_by_cracks(scene) if scene.has_fracture else None
-    return State(0, u, previous, broken, (None,) * len(scene.leading))
+    lengths = None if broken is None else np.zeros(broken.shape, precision)
+    bonds, particles = initial_bond_values(scene), initial_particle_values(scene)
+    return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), bonds, particles)
 
 
 def _displace(scene: Scene, u: Floats) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pbdkit.registry.blame import blaming
@@ -40,15 +42,15 @@ class Stepper(Engine):
         led, starts = prescribe(self._scene, state, step)
         before = [(places, u.reshape(2, -1)[:, places].copy()) for places, _ in led]
         place(u, led)
-        if self._fracturing and state.broken_step is not None:
-            self._fracturing.break_bonds(u, state.broken_step, step)
+        if self._fracturing:
+            self._fracturing.break_bonds(u, state, step)
         # What leaves the finite numbers is found at recording.
         with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
-            self._followers.move(u, new, state.broken_step)
+            self._followers.move(u, new, state)
         place(new, led)
         place(u, before)
         self._move_frame(u, new)
-        return State(step, new, u, state.broken_step, starts)
+        return replace(state, step=step, u=new, previous=u, starts=starts)
 
     def _move_frame(self, old: Floats, new: Floats) -> None:
         """u of every frame point from the body's, of this step or, with lag, of the last."""

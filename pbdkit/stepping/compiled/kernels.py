@@ -15,7 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from pbdkit.interfaces import FollowerRule, FractureModel, Here, Vector
+from pbdkit.interfaces import FollowerRule, FractureModel, Here, Vector, length
 from pbdkit.stepping.compiled.functions import compiled, source_key
 
 
@@ -27,7 +27,7 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
     """
     functions: list[Any] = [rule.gather, rule.apply]
     if fracture:
-        functions += [fracture.breaks, fracture.fictitious]
+        functions += [fracture.breaks, fracture.fictitious, length]
     parts = [source, source_key(*functions), numba.__version__, np.__version__, sys.version]
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     path = cache_folder() / f"kernel_{key}.py"
@@ -40,6 +40,7 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
         "apply": compiled(rule.apply),
         "breaks": compiled(fracture.breaks) if fracture else None,
         "fictitious": compiled(fracture.fictitious) if fracture else None,
+        "length": compiled(length),
     }
     return _module(path, names).run
 

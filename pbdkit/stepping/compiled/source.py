@@ -28,7 +28,7 @@ def write_kernel(cell: Cell, neighbourhood: Neighbourhood, wanted: Wanted) -> st
 def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     flags = "parallel=True, " if wanted.parallel else ""
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
-    out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
+    out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, lengths, limits,")
     out.add(2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y,")
     out.add(2, "kept_x, kept_y, points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
@@ -58,7 +58,7 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
 
 
 def _write_sweeps(body: Writer, sublattices: int, wanted: Wanted) -> None:
-    arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, limits, share, step"
+    arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, lengths, limits, share, step"
     for s in range(sublattices):
         body.add(
             0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -69,18 +70,19 @@ class CompiledStepper(Engine):
         u, new = state.u, state.previous
         now, before = (new, u) if count % 2 else (u, new)
         self._reach.after(now, before)
-        return State(state.step + count, now, before, state.broken_step, starts)
+        return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
 
     def _call(self, state: State, count: int, places: Indices, values: Floats) -> None:
         """Makes `count` steps in the arrays of the state; with none it only compiles."""
         u, new, c = state.u, state.previous, self._constant
         broken = c["broken"] if state.broken_step is None else state.broken_step
+        lengths = c["lengths"] if state.broken_length is None else state.broken_length
         kept = np.empty_like(values)
         if self.threads > 1:
             numba.set_num_threads(self.threads)
         self._run(
             u[0], u[1], new[0], new[1], self._masks, self._lost, self._spared,
-            self._scene.raster.kind, broken, c["limits"], c["share"], state.step, count,
+            self._scene.raster.kind, broken, lengths, c["limits"], c["share"], state.step, count,
             self._reach.blocks, self._reach.box, self._reach.growth, 4 * self.threads, places,
             values[0], values[1], kept[0], kept[1], c["points"], c["entries"], c["bodies"],
             c["weights"], c["rule"], c["solver"], c["first"],
@@ -90,7 +92,9 @@ class CompiledStepper(Engine):
         """A call of no steps, so that what does not compile is known before the first."""
         u = np.zeros((2, 1, 1, 1), self._scene.experiment.solver.precision)
         broken = np.zeros((1, 1, 1), np.int32) if self._scene.has_fracture else None
-        state, self._lost = State(0, u, u.copy(), broken, ()), np.zeros((1, 1, 1), self._bits)
+        lengths = None if broken is None else np.zeros(broken.shape, u.dtype)
+        state = State(0, u, u.copy(), broken, lengths, ())
+        self._lost = np.zeros((1, 1, 1), self._bits)
         self._call(state, 0, np.empty(0, np.intp), np.empty((2, 0), state.u.dtype))
 
     def _wanted(self) -> Wanted:
@@ -142,6 +146,7 @@ class CompiledStepper(Engine):
             "limits": limits,
             "share": (scene.cells.share if scene.cells else np.empty((0,) * 4)).astype(number),
             "broken": np.empty((0, 0, 0), np.int32),
+            "lengths": np.empty((0, 0, 0), number),
             "points": frame.place if frame else none,
             "entries": entries,
             "bodies": frame.body_place if frame else none,

@@ -8,8 +8,8 @@ from pbdkit.interfaces import Cell, Slot
 from pbdkit.scene.cells import Side, Tiling
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import FOLLOWER
-from pbdkit.stepping.compiled.wanted import INDENT, Wanted, Writer, number
+from pbdkit.stepping.compiled.events import write_events
+from pbdkit.stepping.compiled.wanted import Wanted, Writer, number
 
 _ZERO = {False: "float64(0.0)", True: "float32(0.0)"}
 
@@ -19,7 +19,7 @@ def write_sweep(
 ) -> None:
     """A function that moves the followers of one sublattice in some rows."""
     out.add(0, "", "", '@njit(error_model="numpy")')
-    out.add(0, f"def sweep_{s}(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
+    out.add(0, f"def sweep_{s}(ux, uy, vx, vy, masks, lost, spared, kind, broken, lengths, limits,")
     out.add(2, "share, step, i0, i1, j0, j1, rule, solver, first):")
     out.add(1, f"p = {_parameters('Rule', wanted.rule_parameters, 'rule')}")
     values = "".join(f"{number(v, wanted)}, " for v in wanted.fracture_parameters.values())
@@ -47,7 +47,7 @@ def write_sweep(
         out.add(3, *_slot_lines(k, slot, around, wanted))
     _write_target(out, s, cell, len(slots), wanted)
     if wanted.fracture:
-        _write_events(out, s, slots, around)
+        write_events(out, s, slots, around, wanted)
 
 
 def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> Iterator[str]:
@@ -120,24 +120,6 @@ def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -
         if wanted.some_missing:
             out.add(3, f"{c}2 = {c}2 if (here[j] >> {slots}) & 1 else {c}")
         out.add(3, f"o{c}[j] = {c}2")
-
-
-def _write_events(out: Writer, s: int, slots: tuple[Slot, ...], around: Neighbourhood) -> None:
-    """Keeps the lost bonds of the row, and notes the step of those that broke just now: rare."""
-    out.add(3, "changed = changed | (now ^ bits)", "gone[j] = now")
-    out.add(2, "if changed:")
-    out.add(3, "for j in range(j0, j1):", f"{INDENT}now = int64(lost[{s}, i, j])")
-    for k, slot in enumerate(slots):
-        for n, plane in enumerate(around.planes):
-            if plane.slot == slot:
-                out.add(4, f"if (now >> {k}) & 1 and broken[{n}, i, j] < 0:")
-                out.add(5, f"broken[{n}, i, j] = step")
-            if plane.opposite == slot:
-                m, k2 = slot.cell
-                there = f"i + {m}, j + {k2}"
-                out.add(4, f"if (now >> {k}) & 1 and broken[{n}, {there}] < 0:")
-                out.add(5, f"if kind[{slot.target}, {there}] != {FOLLOWER}:")
-                out.add(6, f"broken[{n}, {there}] = step")
 
 
 def _parameters(name: str, names: tuple[str, ...], source: str) -> str:

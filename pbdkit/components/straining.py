@@ -1,0 +1,135 @@
+"""Bonds that break by their strain, suddenly or little by little (docs/fracture.md)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from pbdkit.components.fracture import Parting
+from pbdkit.interfaces import Bonds, Remembered, Slot, Vector, length, squared_length, where
+from pbdkit.interfaces.remembered import Drawn
+
+StrainLimit = Annotated[float, Field(gt=0.0, le=1e75)]
+Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
+def _factors(bonds: Bonds, scatter: float, generator: np.random.Generator) -> Any:
+    return 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
+
+
+class Strain(Parting):
+    """A bond breaks when its strain |r + d| / |r| - 1 exceeds `failure`, whatever its shell; bonds
+    that are pressed together never break.
+
+    With `scatter` s the failure strain of each bond is drawn from `failure` (1 ± s), uniformly, by
+    the experiment's seed.
+    """
+
+    type: Literal["strain"] = "strain"
+    failure: StrainLimit
+    scatter: Scatter = 0.0
+
+    def constants(self, slot: Slot) -> tuple[float, ...]:
+        """(|r|², failure strain of the bond), the latter remembered where it is scattered; or,
+        where all are alike, ((1 + failure)² |r|², 0), which is one multiplication less to round."""
+        rest = squared_length(slot.rest)
+        return (rest,) if self.scatter else ((1.0 + self.failure) ** 2 * rest, 0.0)
+
+    def bond_state(self) -> tuple[Remembered, ...]:
+        """`failure_strain` where it is not the same for all."""
+        return (_FAILURE_STRAIN,) if self.scatter else ()
+
+    def draw(self, bonds: Bonds, generator: np.random.Generator) -> Drawn:
+        """One number a bond."""
+        return {"failure_strain": self.failure * _factors(bonds, self.scatter, generator)}
+
+    @staticmethod
+    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+        """|r + d|² > (1 + failure)² |r|²."""
+        stretch = 1.0 + c[1]
+        return squared_length(Vector(r.x + d.x, r.y + d.y)) > c[0] * (stretch * stretch)
+
+    @staticmethod
+    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+        """The failure strain of the bond."""
+        return np.sqrt(c[0]) * (1.0 + c[1]) / length(r) - 1.0
+
+
+class Damage(Parting):
+    """A bond softens from strain `onset` on and is broken at strain `failure`.
+
+    Its damage is the largest so far of D = failure / (failure - onset) (1 - onset / ε), from 0 at
+    the onset to 1 at failure; it never heals, and compression does none. The rule sees the bond as
+    (1 - D) d + D lost, lost being the difference to the fictitious point: under the barycentre
+    the bond's pull (1 - D) ε falls along a straight line from the onset to zero at failure.
+
+    With `scatter` s both strains of each bond are multiplied by one number, drawn from 1 ± s,
+    uniformly, by the experiment's seed.
+    """
+
+    type: Literal["damage"] = "damage"
+    onset: StrainLimit
+    failure: StrainLimit
+    scatter: Scatter = 0.0
+
+    @model_validator(mode="after")
+    def _onset_comes_first(self) -> Self:
+        if self.onset >= self.failure:
+            text = (
+                f"onset {self.onset:g} is not below failure {self.failure:g}: nothing softens; "
+                "lower it, or take {type: strain}, which breaks at once"
+            )
+            raise PydanticCustomError("fault", "{text}", {"text": text, "key": "onset"})
+        return self
+
+    def constants(self, slot: Slot) -> tuple[float, ...]:
+        """|r|, then onset and failure unless each bond has its own."""
+        rest = float(length(slot.rest))
+        return (rest,) if self.scatter else (rest, self.onset, self.failure)
+
+    def bond_state(self) -> tuple[Remembered, ...]:
+        """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
+        return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
+
+    def draw(self, bonds: Bonds, generator: np.random.Generator) -> Drawn:
+        """One number a bond."""
+        if not self.scatter:
+            return {}
+        factors = _factors(bonds, self.scatter, generator)
+        return {"onset_strain": self.onset * factors, "failure_strain": self.failure * factors}
+
+    @staticmethod
+    def update(d: Vector, r: Vector, c: Any, p: Any) -> tuple[Any, ...]:
+        """The damage, where there is more than before."""
+        rest, onset, failure, damage = c
+        strain = length(Vector(r.x + d.x, r.y + d.y)) / rest - 1.0
+        softens = strain > onset
+        law = failure / (failure - onset) * (1.0 - onset / where(softens, strain, 1.0))
+        law = where(strain < failure, law, 1.0)
+        return (where(softens & (law > damage), law, damage),)
+
+    @staticmethod
+    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+        """D = 1."""
+        return c[3] >= 1.0
+
+    @staticmethod
+    def seen(d: Vector, lost: Vector, r: Vector, c: Any, p: Any) -> Vector:
+        """(1 - D) d + D lost."""
+        damage, kept = c[3], 1.0 - c[3]
+        return Vector(kept * d.x + damage * lost.x, kept * d.y + damage * lost.y)
+
+    @staticmethod
+    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+        """The failure strain of the bond."""
+        return c[2]
+
+
+_FAILURE_STRAIN = Remembered(
+    "failure_strain", "strain at which the bond breaks", "1", changes=False
+)
+_ONSET_STRAIN = Remembered("onset_strain", "strain at which the bond softens", "1", changes=False)
+_DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")

@@ -1,0 +1,43 @@
+"""The numbers that parts remember, as they declare them."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from pbdkit.errors import PluginError
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Remembered
+from pbdkit.registry.blame import blaming
+
+Declared = tuple[Remembered, ...]
+
+
+def bond_numbers(experiment: Experiment) -> Declared:
+    """What the fracture model remembers of each bond; nothing where bonds cannot break."""
+    if not experiment.fracture.can_break:
+        return ()
+    with blaming(experiment.fracture, "when asked what it remembers", "fracture"):
+        return tuple(experiment.fracture.bond_state())
+
+
+def particle_numbers(experiment: Experiment) -> Declared:
+    """What the rule remembers of each particle."""
+    with blaming(experiment.rule, "when asked what it remembers", "rule"):
+        return tuple(experiment.rule.particle_state())
+
+
+def remembered_names(experiment: Experiment) -> dict[str, str]:
+    """Each number's name with the field of the part that remembers it.
+
+    Raises PluginError for a name that is declared twice.
+    """
+    bonds, particles = bond_numbers(experiment), particle_numbers(experiment)
+    counts = Counter(number.name for number in (*bonds, *particles))
+    for name, count in counts.items():
+        if count > 1:
+            raise PluginError(
+                f"the number '{name}' is declared {count} times, by FractureModel "
+                f"'{experiment.fracture.type}' and FollowerRule '{experiment.rule.type}'; "
+                "each needs a name of its own"
+            )
+    return {n.name: "fracture" for n in bonds} | {n.name: "rule" for n in particles}

@@ -1,0 +1,199 @@
+"""``pbdkit explain``: what broke, when, at which strain against which limit, in which order."""
+
+import json
+
+import numpy as np
+import pytest
+from property_cases import pull_right
+from remembering_parts import Weakest
+
+import pbdkit
+from pbdkit.results.explaining import Explained
+from pbdkit.scene.scene import build_scene
+
+RATE = 0.03125
+LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+BAR = {
+    "name": "bar",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 2, "rows": 2},
+    "rule": {"type": "barycentre"},
+    "frame": {"type": "none"},
+    "fracture": {"type": "strain", "failure": 0.5},
+    "leaders": [
+        LEFT,
+        {"select": {"numbers": [3]},
+         "motion": {"type": "velocity", "velocity": [RATE, 0.0], "steps": 40}},
+        {"select": {"numbers": [4]},
+         "motion": {"type": "velocity", "velocity": [RATE / 2, 0.0], "steps": 20}},
+    ],
+    "steps": 40,
+}  # fmt: skip
+"""Four leaders: 1 and 2 held, 3 pulled to strain 1.25, 4 to 0.3125; 3-4 is turned and stretched."""
+SHEET = {
+    "frame": {"type": "mean"},
+    "body": {"type": "grid", "columns": 8, "rows": 6},
+    "leaders": [LEFT, pull_right(0.3, 0.1, 10)],
+    "fracture": {"type": "threshold", "thresholds": [1.6],
+                 "cracks": [[[3.5, -2.0], [3.5, 1.2]]]},
+}  # fmt: skip
+STRAIN = {"type": "strain", "failure": 0.6}
+
+
+@pytest.fixture
+def explain(call, tmp_path):
+    """The program's answer about a run of BAR with some changes."""
+
+    def answer(*arguments, **parts):
+        (tmp_path / "bar.json").write_text(json.dumps(BAR | parts))
+        assert (
+            call("run", str(tmp_path / "bar.json"), "-o", "bar.nc", "--force", "--quiet").code == 0
+        )
+        return call("explain", "bar.nc", *arguments)
+
+    return answer
+
+
+def test_a_broken_bond(explain):
+    answer = explain("--bond", "3", "1")
+    across = np.hypot(1.0, 17 * RATE / 2) - 1
+    assert answer.out.splitlines() == [
+        "bond 1-3: shell 1, rest length 1",
+        "broke in step 17 at strain 0.53125, number 1 of the 1 broken",
+        "fracture strain breaks it above 0.5",
+        "broken around it before: none",
+        "in the same step: none",
+        "after: none",
+        f"not broken around it: 2, the most strained 3-4: intact, strain {across:.6g} in step 17, "
+        f"breaks above 0.5 ({across / 0.5:.3g} of the way)",
+    ]
+
+
+def test_an_intact_bond(explain):
+    answer = explain("--bond", "2", "4")
+    across = np.hypot(1.0, 40 * RATE - 20 * RATE / 2) - 1
+    assert answer.out.splitlines() == [
+        "bond 2-4: shell 1, rest length 1",
+        "intact, strain 0.3125 in step 40, breaks above 0.5 (0.625 of the way)",
+        "longest of the recorded steps in step 20: strain 0.3125",
+        "broken around it: none",
+        f"not broken around it: 2, the most strained 3-4: intact, strain {across:.6g} in step 40, "
+        f"breaks above 0.5 ({across / 0.5:.3g} of the way)",
+    ]
+
+
+def test_what_happened_around_a_bond(explain):
+    """3-4 breaks in the end: after 1-3."""
+    answer = explain("--bond", "3", "4", fracture={"type": "strain", "failure": 0.3})
+    lines = answer.out.splitlines()
+    assert lines[1].endswith("number 3 of the 3 broken")
+    assert lines[3] == "broken around it before: 1-3 (step 10), 2-4 (step 20)"
+    assert lines[6] == "not broken around it: 0"
+
+
+def test_the_whole_run(explain):
+    answer = explain(fracture={"type": "strain", "failure": 0.3})
+    assert answer.out.splitlines()[:4] == [
+        "fracture strain: 3 of 4 bonds broke",
+        "first in step 10, last in step 37",
+        "order  step  bond           strain       breaks above",
+        "    1    10  1-3            0.3125       0.3",
+    ]
+    assert answer.out.splitlines()[-1].startswith("nearest to breaking: 1-2: intact, strain 0 in")
+
+
+def test_json_tells_the_same(explain):
+    found = json.loads(explain("--bond", "1", "3", "--json").out)
+    assert (found["fracture"], found["broken_in_all"]) == ("strain", 1)
+    assert found["bond"] == {
+        "bond": [1, 3], "shell": 1, "rest_length": 1.0, "state": "broken", "step": 17, "order": 1,
+        "strain_at_break": 17 * RATE, "breaks_above": 0.5, "strain": 1.25, "at_step": 40,
+    }  # fmt: skip
+    assert found["most_strained"] == {"step": 40, "strain": 1.25}
+    assert [(o["bond"], o["state"]) for o in found["around"]] == [
+        ([1, 2], "intact"),
+        ([3, 4], "intact"),
+    ]
+    whole = json.loads(explain("--json").out)
+    assert (whole["bonds"], whole["broken"], whole["broken_from_the_start"]) == (4, 1, 0)
+    assert whole["in_order"] == [found["bond"]]
+    assert whole["nearest"]["bond"] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--bond", "1", "4"], "bar.nc: no bond joins 1 and 4; the bonds of 1 are to 2, 3"),
+        (["--bond", "1", "5"], "bar.nc: there is no particle 5; they are numbered 1 to 4"),
+    ],
+)
+def test_a_bond_that_is_not_there(explain, arguments, message):
+    answer = explain(*arguments)
+    assert (answer.code, answer.out) == (2, "")
+    assert message in answer.err
+
+
+def test_a_run_without_bonds(explain):
+    answer = explain(fracture={"type": "none"})
+    assert answer.code == 2
+    assert "bar.nc: has no table of bonds: nothing could break in this run" in answer.err
+    answer = explain("--bond", "1", "3", fracture={"type": "none"}, diagnostics=[{"type": "pe1"}])
+    assert answer.out.splitlines()[1] == "cannot break, strain 1.25 in step 40"
+
+
+def explained(given, **more):
+    ds = pbdkit.run(given, progress=False, **more)
+    return ds, Explained(ds, build_scene(pbdkit.Experiment(**given)))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        SHEET,
+        SHEET | {"fracture": SHEET["fracture"] | {"frame_bonds": False}},
+        SHEET | {"fracture": {"type": "damage", "onset": 0.2, "failure": 0.7, "scatter": 0.3}},
+        SHEET | {"fracture": STRAIN, "diagnostics": [{"type": "displacement"}]},
+    ],
+    ids=["threshold", "spared", "damage", "strain"],
+)  # fmt: skip
+def test_who_broke_was_above_its_limit_and_who_did_not_never_was(parts):
+    ds, found = explained(BAR | parts)
+    standings = found.standings(np.arange(ds.sizes["bond"]))
+    broken = [s for s in standings if s.state == "broken"]
+    assert sorted(s.order for s in standings if s.order) == list(range(1, len(found.order) + 1))
+    assert len(broken) > 3
+    assert all(s.strain_at_break > s.breaks_above * (1 - 1e-12) for s in broken)
+    assert all(s.strain_at_break is None for s in standings if s.state != "broken")
+    for row in np.flatnonzero((found.steps < 0) & ~found.spared):
+        assert found.most_strained(row)[1] <= standings[row].breaks_above
+    spared = {s.state == "cannot break" for s in standings}
+    assert (True in spared) == (not parts["fracture"].get("frame_bonds", True))
+    cut = [s for s in standings if s.state == "broken from the start"]
+    assert bool(cut) == ("cracks" in parts["fracture"])
+
+
+def test_the_limit_of_a_threshold_is_its_length():
+    ds, found = explained(BAR | SHEET | {"lattice": {"type": "square", "a": 0.8}})
+    np.testing.assert_allclose(found.limits, 1.0, rtol=1e-15)
+    assert (ds.broken_strain.values[ds.broken_step.values > 0] > 1.0).all()
+
+
+def test_a_model_that_does_not_say_when_it_breaks():
+    given = BAR | SHEET | {"fracture": Weakest(spread=0.3)}
+    ds, found = explained(given, components=[Weakest])
+    row = int(found.order[0])
+    (standing,) = found.standings(np.array([row]))
+    assert standing.breaks_above is None
+    assert found.nearest() is None
+    assert standing.strain_at_break == float(ds.broken_strain[row]) > 0.5
+    remembered = found.remembered(row)
+    assert remembered["onset"] == float(ds.onset[row])
+    assert remembered["damage"] >= 1.0
+
+
+def test_a_file_that_was_changed_is_refused():
+    given = BAR | SHEET
+    ds = pbdkit.run(given, progress=False)
+    other = build_scene(pbdkit.Experiment(**given | {"neighbours": {"type": "chebyshev"}}))
+    with pytest.raises(pbdkit.ExperimentError, match="its bonds are not those of the experiment"):
+        Explained(ds, other)

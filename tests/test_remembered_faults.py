@@ -1,0 +1,207 @@
+"""What parts that remember may not do, and what is said of it."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+from property_cases import pull_right
+from remembering_parts import Tiring, Weakest
+
+import pbdkit
+from pbdkit import Remembered
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.choice import choose
+from pbdkit.stepping.state import initial_state
+
+LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+SHEET = {
+    "name": "sheet",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 5, "rows": 4},
+    "rule": {"type": "barycentre"},
+    "leaders": [LEFT, pull_right(0.3, 0.1, 5)],
+    "steps": 5,
+}
+
+
+class Plain(pbdkit.FractureModel):
+    """Breaks nothing; subclasses remember what they should not."""
+
+    type: str = "plain"
+
+    def constants(self, slot):
+        return ()
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x > 1e9
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return pbdkit.Vector(0.0, 0.0)
+
+
+class Keeping(Plain):
+    def bond_state(self):
+        return (Remembered("age", "age", "step"),)
+
+
+class Shortened(Keeping):
+    def draw(self, bonds, generator):
+        return {"age": np.zeros(3)}
+
+
+class Infinite(Keeping):
+    def draw(self, bonds, generator):
+        return {"age": np.full(len(bonds), np.inf)}
+
+
+class Misspelt(Keeping):
+    def draw(self, bonds, generator):
+        return {"agee": np.zeros(len(bonds))}
+
+
+class Twice(Keeping):
+    def bond_state(self):
+        return (Remembered("age", "age", "step"), Remembered("age", "age", "step"))
+
+
+class Taken(Keeping):
+    def bond_state(self):
+        return (Remembered("shell", "age", "step"),)
+
+
+class Worded(Keeping):
+    def bond_state(self):
+        return (Remembered("the age", "age", "step"),)
+
+
+class Typed(Keeping):
+    def bond_state(self):
+        return (Remembered("age", "age", "step", dtype="f4"),)
+
+
+class Generous(Keeping):
+    @staticmethod
+    def update(d, r, c, p):
+        return c[0] + 1, c[0]
+
+
+class Fractional(Keeping):
+    def bond_state(self):
+        return (Remembered("age", "age", "step", dtype="i4"),)
+
+    @staticmethod
+    def update(d, r, c, p):
+        return (c[0] + 0.5,)
+
+
+class Exploding(Keeping):
+    @staticmethod
+    def update(d, r, c, p):
+        return ((c[0] + 1.0) * 1e200,)
+
+
+class Writing(Keeping):
+    @staticmethod
+    def update(d, r, c, p):
+        c[0][...] = 1.0
+        return (c[0],)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (Shortened, r"'plain' draws 'age' with the shape \(3,\), finite: True; needed are"),
+        (Infinite, r"'plain' draws 'age' with the shape \(\d+,\), finite: False; needed are"),
+        (Misspelt, "'plain' draws 'agee', which it does not remember; did you mean 'age'?"),
+        (Twice, "the number 'age' is declared 2 times, by FractureModel 'plain' and FollowerRule"),
+        (Taken, "a part remembers 'shell' of each bond, and that name is taken in the dataset"),
+        (Worded, "'the age' is no name for a variable: letters, digits and _ only"),
+        (Typed, "'age' has the dtype 'f4', not f8, i1, i2, i4, i8"),
+        (Generous, "it returned 2 values, and it remembers 1 that change"),
+        (Fractional, "failed at step 1.*same_kind"),
+        (Writing, "failed at step 1.*read-only"),
+    ],
+)
+def test_a_part_that_does_not_keep_to_the_interface(model, message):
+    with pytest.raises(pbdkit.PluginError, match=f"(?s){message}"):
+        pbdkit.run(SHEET | {"fracture": model()}, progress=False)
+
+
+def test_a_number_that_leaves_all_bounds_ends_the_run():
+    with pytest.raises(pbdkit.DivergedError, match="age at step 2") as caught:
+        pbdkit.run(SHEET | {"fracture": Exploding()}, progress=False)
+    assert np.isfinite(caught.value.dataset.age).all()
+
+
+class Aged(pbdkit.Diagnostic):
+    type: Literal["aged"] = "aged"
+
+    def variables(self):
+        return (pbdkit.Variable("age", (), "oldest bond", "step"),)
+
+    def measure(self, now):
+        return (now.remembered("age").max(),)
+
+
+def test_a_diagnostic_measures_what_is_remembered_under_a_name_of_its_own():
+    with pytest.raises(pbdkit.ExperimentError, match="adds the variable 'age'; fracture does too"):
+        pbdkit.run(SHEET | {"fracture": Keeping(), "diagnostics": [Aged()]}, progress=False)
+    with pytest.raises(pbdkit.PluginError, match="no part remembers 'age'"):
+        pbdkit.run(SHEET | {"diagnostics": [Aged()]}, progress=False)
+
+
+class Odd(pbdkit.Diagnostic):
+    type: Literal["odd"] = "odd"
+    at_end = True
+    own_dimension = "odd"
+
+    def variables(self):
+        one, other = (pbdkit.Variable(n, ("odd",), n, "1") for n in ("one", "other"))
+        return one, other
+
+    def measure(self, now):
+        return np.zeros(3), np.zeros(4)
+
+
+def test_a_dimension_of_its_own_has_one_length():
+    with pytest.raises(pbdkit.PluginError, match=r"'other' has the shape \(4,\), not \(3,\)"):
+        pbdkit.run(SHEET | {"diagnostics": [Odd()]}, progress=False)
+
+
+def test_a_rule_that_remembers_has_no_equilibrium():
+    given = SHEET | {"rule": Tiring(), "solver": {"type": "equilibrium"}}
+    message = "the rule 'tiring' remembers, so that where the steps lead depends on all of them"
+    with pytest.raises(pbdkit.ExperimentError, match=message):
+        pbdkit.run(given, components=[Tiring], progress=False)
+
+
+def test_a_rule_that_remembers_is_stepped_by_numpy_and_it_says_why(monkeypatch):
+    monkeypatch.setattr("pbdkit.stepping.choice.PATIENCE_S", 0.0)
+    choice = choose(build_scene(pbdkit.Experiment(**SHEET | {"rule": Tiring()})))
+    reason = "slower than it could be: rule 'tiring' keeps a state of each particle"
+    assert (choice.engine, choice.reason) == ("numpy", reason)
+
+
+def test_nothing_is_kept_where_nothing_is_remembered():
+    whole = initial_state(build_scene(pbdkit.Experiment(**SHEET)))
+    assert (whole.broken_step, whole.broken_length) == (None, None)
+    assert whole.bond_values == whole.particle_values == ()
+    torn = {"type": "threshold", "thresholds": [2.0]}
+    state = initial_state(build_scene(pbdkit.Experiment(**SHEET | {"fracture": torn})))
+    assert state.bond_values == state.particle_values == ()
+
+
+def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch):
+    class Restless(Weakest):
+        type: Literal["restless"] = "restless"
+
+        @staticmethod
+        def update(d, r, c, p):
+            return c[2], c[3] + 1
+
+    monkeypatch.setattr("pbdkit.equilibrium.loading.MOST_SETTLINGS", 5)
+    given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
+    with pytest.raises(pbdkit.DivergedError, match="bonds still change after they settled 5 times"):
+        pbdkit.run(given, progress=False)
