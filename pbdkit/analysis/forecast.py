@@ -22,7 +22,8 @@ from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
 class Forecast:
     """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
     where it cannot tell or it would take too long; with memory, the period in steps of the slowest
-    mode that swings and by what it shrinks a step, None where nothing swings; warnings."""
+    mode that swings and by what it shrinks a step, None where nothing swings; whether what the
+    analysis found is exact, or linearised at the start; warnings."""
 
     particles: int
     followers: int
@@ -36,6 +37,7 @@ class Forecast:
     steps_to: dict[str, int | None]
     period: float | None
     decay: float | None
+    exact: bool
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -65,6 +67,7 @@ def forecast(scene: Scene) -> Forecast:
         steps_to=analysis.steps_to,
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
+        exact=analysis.exact,
         warnings=(*_doubts(scene), *exact, *waves),
     )
 

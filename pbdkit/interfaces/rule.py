@@ -53,7 +53,13 @@ class FollowerRule(Component):
     has no neighbour stays. A fictitious neighbour counts as present.
     """
 
+    linear: ClassVar[bool] = False
+    """Whether moves superpose: with the same neighbours the move is a constant and a part linear in
+    the displacements. What `check` predicts then holds for the whole run, not near its start
+    alone."""
     uses_reference: ClassVar[bool] = False
+    """Whether it counts where the particle stands: `here.X` is then given. Other rules move a
+    translated body in the same way, wherever it stands."""
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The numbers that `gather` and `apply` see as ``p.name``; by default the rule's own.
