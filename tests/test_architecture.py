@@ -19,6 +19,7 @@ ORDER = [
     "results",
     "running",
     "benching",
+    "testing",
     "cli",
 ]
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)

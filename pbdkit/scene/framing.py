@@ -36,18 +36,10 @@ class Frame:
 
 def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
     """The policy's map for this raster; None where the scene has no frame."""
-    rows = np.flatnonzero(raster.table_kind == FRAME)
-    if not len(rows):
+    frame = sites_of_frame(raster)
+    if frame is None:
         return None
-    inside = raster.site_of(raster.body_rows)
-    frame = RasterFrame(
-        raster,
-        rows,
-        raster.lattice.cell(),
-        raster.site_of(rows).astype(np.int32),
-        tuple(inside.min(axis=0).tolist()),
-        tuple(inside.max(axis=0).tolist()),
-    )
+    rows = frame.frame_rows
     follow = policy.follow(frame)
     _refuse_unfit(follow, len(rows), raster)
     alone = np.setdiff1d(np.arange(len(rows)), follow.point)
@@ -57,6 +49,22 @@ def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
             "and it would anchor the body"
         )
     return Frame(raster.place_of(rows), follow, raster.place_of(follow.body))
+
+
+def sites_of_frame(raster: Raster) -> RasterFrame | None:
+    """The frame points of a raster as a policy sees them; None where there are none."""
+    rows = np.flatnonzero(raster.table_kind == FRAME)
+    if not len(rows):
+        return None
+    inside = raster.site_of(raster.body_rows)
+    return RasterFrame(
+        raster,
+        rows,
+        raster.lattice.cell(),
+        raster.site_of(rows).astype(np.int32),
+        tuple(inside.min(axis=0).tolist()),
+        tuple(inside.max(axis=0).tolist()),
+    )
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:

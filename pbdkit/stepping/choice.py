@@ -35,7 +35,7 @@ def choose(scene: Scene) -> Choice:
     Raises ExperimentError where the compiled engine is asked for and cannot be had.
     """
     solver = scene.experiment.solver
-    obstacle = _obstacle(scene)
+    obstacle = obstacle(scene)
     if solver.engine == "compiled" and obstacle:
         raise scene.experiment.located(
             ExperimentError(f"the compiled engine cannot be had: {obstacle}", ("solver", "engine"))
@@ -71,7 +71,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
         return Stepper(scene), Choice("numpy", 1, reason)
 
 
-def _obstacle(scene: Scene) -> str:
+def obstacle(scene: Scene) -> str:
     """Why the compiled engine cannot step this scene; empty where it can."""
     if find_spec("numba") is None:
         return "numba is not installed: pip install 'pbdkit[fast]'"

@@ -1,0 +1,188 @@
+"""What is asked of whole steps that a component takes part in."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from pbdkit.errors import PluginError
+from pbdkit.interfaces import (
+    INTERFACES,
+    Diagnostic,
+    FollowerRule,
+    FractureModel,
+    FramePolicy,
+    Lattice,
+    NeighbourMetric,
+)
+from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import obstacle
+from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.stepper import Stepper
+from pbdkit.testing.properties.answers import REPEATABLE, differing
+from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.scenes import place_of
+from pbdkit.testing.states import advanced, displacements, spacing, state_with
+from pbdkit.testing.subject import Subject, scenes_with
+
+ALL = tuple(INTERFACES.values())
+STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
+ROUNDING = 1e-12
+"""As a share of the spacing; a few steps are some hundred roundings of 1e-16."""
+STEPS = 4
+
+
+@asked_of(*STEPPED, needs=REPEATABLE)
+def rests(subject: Subject) -> None:
+    """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
+    by 1e-17 has moved."""
+    quiet = [scene for scene in subject.scenes if not _warned(scene)]
+    if not quiet:
+        raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
+    for scene in quiet:
+        framed, engine, state = scene.frame is not None, Stepper(scene), initial_state(scene)
+        for _ in range(STEPS):
+            state = engine.advance(state)
+            where = f"in step {state.step} {place_of(scene.experiment)}"
+            if state.broken_step is not None and (state.broken_step > 0).any():
+                broken = int((state.broken_step > 0).sum())
+                raise PropertyError(f"{broken} bonds of a body at rest break {where}")
+            if framed and state.u.any():
+                moved = float(np.abs(state.u).max())
+                raise PropertyError(
+                    f"a body at rest moves by {moved:.3g} {where}: zero differences must give a "
+                    "move of exactly zero; let terms of opposite neighbours cancel one by one"
+                )
+
+
+def _warned(scene: Scene) -> bool:
+    return bool(scene.experiment.fracture.check(scene.neighbourhood.shells()))
+
+
+@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=REPEATABLE)
+def follows_translations(subject: Subject) -> None:
+    """A body that is translated as a whole moves as before, translated, to rounding; rules that
+    declare `uses_reference` and frames that say they `anchors` it need not."""
+    component = subject.component
+    if isinstance(component, FollowerRule) and component.uses_reference:
+        raise NotAskedError("it declares `uses_reference`: where a particle stands may count")
+    anchors = isinstance(component, FramePolicy) and component.anchors()
+    most = 0.0
+    for scene in subject.scenes:
+        u, size = displacements(scene, 1), spacing(scene)
+        shift = size * np.array([0.75, -1.5])
+        one, other = advanced(scene, u + shift, STEPS)[-1], advanced(scene, u, STEPS)[-1] + shift
+        most = max(most, float(np.abs(one - other).max()) / size)
+        if most > ROUNDING and not anchors:
+            remedy = {
+                FollowerRule: "use differences `d`, not `here.u`, or declare `uses_reference`",
+                FramePolicy: "let the weights of each point sum to 1, or answer `anchors`",
+            }.get(next(i for i in STEPPED if isinstance(component, i)), "")
+            raise PropertyError(
+                f"a translated body moves otherwise, by {most:.3g} of the spacing, "
+                f"{place_of(scene.experiment)}" + (f": {remedy}" if remedy else "")
+            )
+    if anchors and most <= ROUNDING:
+        raise PropertyError("it says that it `anchors` the body, and follows every translation")
+
+
+@asked_of(FollowerRule, FramePolicy, needs=REPEATABLE)
+def superposes(subject: Subject) -> None:
+    """Where a rule declares `linear`, and with every frame, the steps from two displacements
+    together are the steps from each, added, to rounding."""
+    component = subject.component
+    if isinstance(component, FollowerRule) and not component.linear:
+        raise NotAskedError("it does not declare `linear`")
+    for scene in subject.scenes:
+        one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
+        both, a, b, none = (
+            advanced(scene, u, STEPS)[-1] for u in (one + other, one, other, 0.0 * one)
+        )
+        off = float(np.abs((both - none) - (a - none) - (b - none)).max()) / spacing(scene)
+        if not off <= ROUNDING:
+            raise PropertyError(
+                f"displacements do not superpose, by {off:.3g} of the spacing, "
+                f"{place_of(scene.experiment)}: "
+                + ("do not declare `linear`" if isinstance(component, FollowerRule) else "")
+            )
+
+
+@asked_of(*ALL, needs=(*REPEATABLE, "survives-json"))
+def continues_where_it_stopped(subject: Subject) -> None:
+    """A run that is saved, read by a component made anew from its JSON and continued is the same to
+    the last bit as one that was never interrupted."""
+    component, kind = subject.component, type(subject.component)
+    anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
+    for n, (scene, again) in enumerate(
+        zip(subject.scenes, scenes_with(anew, subject.parts), strict=True)
+    ):
+        start = displacements(scene, n, share=0.4)
+        whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
+        saved = pickle.dumps(Stepper(scene).advance(state_with(scene, start), STEPS))
+        continued = Stepper(again).advance(pickle.loads(saved), STEPS)
+        _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
+        if isinstance(component, Diagnostic) and isinstance(anew, Diagnostic):
+            _compare_measured(component, scene, whole, anew, again, continued)
+
+
+def _compare_measured(
+    one: Diagnostic, scene: Scene, whole: State, other: Diagnostic, again: Scene, continued: State
+) -> None:
+    names = [variable.name for variable in one.variables()]
+    expected = one.measure(StateMoment(whole, Tables(scene)))
+    found = other.measure(StateMoment(continued, Tables(again)))
+    pairs = [
+        {n: np.array(v) for n, v in zip(names, values, strict=True)} for values in (expected, found)
+    ]
+    if names := differing(*pairs):
+        raise PropertyError(f"`{names[0]}` of a run continued at step {STEPS} is another one")
+
+
+@asked_of(*STEPPED, needs=REPEATABLE)
+def is_the_same_compiled(subject: Subject) -> None:
+    """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
+    compile is stepped by numpy, and says so."""
+    scene = subject.scene()
+    if reason := obstacle(scene):
+        raise NotAskedError(reason)
+    from pbdkit.stepping.compiled.stepper import CompiledStepper
+
+    try:
+        compiled: Engine = CompiledStepper(scene)
+    except PluginError as error:
+        text = str(error).splitlines()[0]
+        raise NotAskedError(f"numpy alone steps it, more slowly: {text}") from None
+    start = displacements(scene, 4, share=0.6)
+    state, expected = state_with(scene, start), state_with(scene, start)
+    for steps in (1, 2, STEPS):
+        state, expected = compiled.advance(state, steps), Stepper(scene).advance(expected, steps)
+        _refuse_difference(state, expected, "the compiled engine", scene)
+
+
+def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) -> None:
+    for field in fields(expected):
+        one, other = getattr(state, field.name), getattr(expected, field.name)
+        if not _identical(one, other):
+            raise PropertyError(
+                f"{whose} gives another `{field.name}`{_by(one, other)} at step {expected.step}, "
+                f"{place_of(scene.experiment)}"
+            )
+
+
+def _identical(one: Any, other: Any) -> bool:
+    if isinstance(one, (tuple, list)):
+        return len(one) == len(other) and all(map(_identical, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
+    return bool(one == other)
+
+
+def _by(one: Any, other: Any) -> str:
+    if not isinstance(one, np.ndarray) or np.shape(one) != np.shape(other):
+        return ""
+    return f", by {np.abs(one.astype(float) - other.astype(float)).max():.3g} at most,"
