@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector, where
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import EMPTY, positions
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -70,19 +71,33 @@ def _alike(
     scene: Scene, state: State, steps: dict[Slot, int], place: Indices
 ) -> tuple[Indices, Indices]:
     """(kind, place): which kind each place is of, and one place of each; those of a kind have the
-    same neighbours and the same broken bonds."""
-    code = np.zeros(len(place), np.int64)
-    bonds = _Bonds(scene, state)
+    same neighbours, the same shares of cells around them and the same broken bonds."""
+    code, bonds = np.zeros(len(place), np.int64), _Bonds(scene, state)
+    if scene.cells:
+        left = np.array([_shares_beside(scene, slot, place)[0] for slot in steps])
+        cut = (left != 1.0).any(axis=0)
+        code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
     for slot, step in steps.items():
         code = 2 * code + (scene.raster.kind.ravel()[place + step] == EMPTY)
         if bonds.any_broken:
             code = 2 * code + bonds.broken(slot, step, place)
     if len(code) and (code == code[0]).all():
         return np.zeros(len(place), np.intp), place[:1]
-    if len(steps) * (1 + bonds.any_broken) > 62:  # more than fits a number
+    # More than fits a number, leaving 20 bits for the cut cells around a particle.
+    if len(steps) * (1 + bonds.any_broken) > 42:
         return np.arange(len(place)), place
     _, first, kind = np.unique(code, return_index=True, return_inverse=True)
     return kind, place[first]
+
+
+def _shares_beside(scene: Scene, slot: Slot, place: Indices) -> tuple[Floats, Floats]:
+    """The shares of the cells to the left and the right of a slot at some flat places."""
+    assert scene.cells
+    found = []
+    for side in scene.cells.tiling.beside[slot]:
+        there = place + (slot_step(scene, side.first) if side.first else 0)
+        found.append(scene.cells.share[side.kind].ravel()[there])
+    return found[0], found[1]
 
 
 class _Bonds:
@@ -122,6 +137,11 @@ class _Followers:
         kind, u = scene.raster.kind.ravel(), state.u.reshape(2, -1)
         there = [kind[place + step] != EMPTY for step in steps.values()]
         self._present = [None if some.all() else some for some in there]
+        self._weights: dict[Slot, tuple[Any, ...]] = dict(scene.constants.weights)
+        if scene.cells:
+            for slot in self._slots:
+                sides = _shares_beside(scene, slot, place)
+                self._weights[slot] = (*self._weights[slot][: -len(WHOLE_CELLS)], *sides)
         self._u = Vector(*u[:, place].astype(float))
         self._d = {slot: Vector(*(u[:, place + n] - u[:, place])) for slot, n in steps.items()}
         self._broken = {
@@ -170,7 +190,7 @@ class _Followers:
             d = Vector(d.x + nudge.x, d.y + nudge.y)
         if slot in self._broken:
             d = self._bonds.seen(d, here, slot, self._broken[slot])
-        return self._rule.gather(d, slot.rest, self._constants.weights[slot], self._constants.rule)
+        return self._rule.gather(d, slot.rest, self._weights[slot], self._constants.rule)
 
     def _sum(self, contributions: dict[Slot, Contributions]) -> Contributions:
         return sum_over_slots(self._slots, self._present, contributions.__getitem__)

@@ -9,7 +9,17 @@ from pbdkit.registry.hooks import hookimpl
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
     """The built-in components of the six interfaces."""
-    from pbdkit.components import diagnostics, fracture, frames, lattices, neighbours, rules
+    from pbdkit.components import (
+        diagnostics,
+        elasticity,
+        fracture,
+        frames,
+        free_edges,
+        lattices,
+        neighbours,
+        rules,
+        springs,
+    )
 
     return [
         lattices.Square,
@@ -24,10 +34,14 @@ def pbdkit_components() -> list[type[Component]]:
         rules.MeanDisplacement,
         rules.DistanceWeighted,
         rules.MixedCoordinate,
+        elasticity.Elastic,
+        elasticity.Orthotropic,
+        springs.Springs,
         frames.MeanFrame,
         frames.FirstFrame,
         frames.MirrorFrame,
         frames.NoFrame,
+        free_edges.Natural,
         fracture.NoFracture,
         fracture.Threshold,
         diagnostics.PE1,

@@ -7,7 +7,7 @@ from pbdkit.interfaces.fracture import FractureModel
 from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
 from pbdkit.interfaces.neighbours import Nearness, NeighbourMetric, Slot
-from pbdkit.interfaces.rule import FollowerRule, Here, Setting
+from pbdkit.interfaces.rule import FollowerRule, Here, Setting, Stiffness
 
 INTERFACES: dict[str, type[Component]] = {
     "lattice": Lattice,
@@ -39,6 +39,7 @@ __all__ = [
     "Pair",
     "Setting",
     "Slot",
+    "Stiffness",
     "Variable",
     "Vector",
     "length",

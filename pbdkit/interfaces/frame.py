@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell, Index
+from pbdkit.interfaces.rule import FollowerRule
 
 Indices = NDArray[np.intp]
 
@@ -31,13 +33,14 @@ class FrameMap:
 
 class FrameSites(ABC):
     """The frame of a scene, as a policy sees it: the lattice's `cell`, the `site` index (i, j)
-    of every frame point in the order of the numbers, (point, 2), and the smallest and largest
-    site index of the body, `low` and `high`."""
+    of every frame point in the order of the numbers, (point, 2), the smallest and largest
+    site index of the body, `low` and `high`, and the `rule` of the followers."""
 
     cell: Cell
     site: NDArray[np.int32]
     low: Index
     high: Index
+    rule: FollowerRule
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
@@ -54,6 +57,13 @@ class FramePolicy(Component):
 
     To add a policy, write `depth` and `follow`. The map is linear and has no memory.
     """
+
+    weighs_cells: ClassVar[bool] = False
+    """Whether the body is made of the lattice's cells, each weighted by the share of it that lies
+    inside the outline; for rules that declare `uses_cells`. The corners of cut cells are then
+    particles of the body, on whichever side of the outline they lie."""
+    edges_are_free: ClassVar[bool] = False
+    """Whether edges are free of stress under a calibrated rule; where not, a warning says so."""
 
     @abstractmethod
     def depth(self, reach: int) -> int:

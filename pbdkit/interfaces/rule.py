@@ -24,6 +24,16 @@ class Here(NamedTuple):
     X: Vector
 
 
+class Stiffness(NamedTuple):
+    """Plane elasticity along the lattice's axes, over Young's modulus and thickness:
+    σ_x = xx ε_x + xy ε_y, σ_y = xy ε_x + yy ε_y, τ = shear · γ."""
+
+    xx: float
+    yy: float
+    xy: float
+    shear: float
+
+
 @dataclass(frozen=True)
 class Setting:
     """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
@@ -60,6 +70,11 @@ class FollowerRule(Component):
     uses_reference: ClassVar[bool] = False
     """Whether it counts where the particle stands: `here.X` is then given. Other rules move a
     translated body in the same way, wherever it stands."""
+    uses_cells: ClassVar[bool] = False
+    """Whether the rule works cell by cell of the lattice. The last two of `gather`'s w are then the
+    shares, 0 to 1, of the cells to the left and to the right of the bond, seen from j, that belong
+    to the body: both 1 inside, and everywhere unless the frame is one that weighs cells. A bond
+    across a cell has that cell on both sides."""
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The numbers that `gather` and `apply` see as ``p.name``; by default the rule's own.
@@ -68,9 +83,13 @@ class FollowerRule(Component):
         """
         return self.numeric_parameters()
 
-    def weights(self, slot: Slot) -> tuple[float, ...]:
+    def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
         """The constants of a slot that `gather` sees as ``w``; by default none."""
         return ()
+
+    def stiffness(self) -> Stiffness | None:
+        """The material whose linear elasticity the rule is, where it is calibrated to one."""
+        return None
 
     @staticmethod
     @abstractmethod
@@ -81,3 +100,9 @@ class FollowerRule(Component):
     @abstractmethod
     def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
         """The move of the follower (target - where it stands in m), elementwise."""
+
+    @staticmethod
+    def force(total: Any, p: Any) -> tuple[Any, Any]:
+        """The force of the neighbours on the particle over Young's modulus and thickness (lattice
+        units), from the sums; calibrated rules have it, and it vanishes in equilibrium."""
+        raise NotImplementedError("the rule is not calibrated to a material: it knows no forces")

@@ -11,6 +11,8 @@ from pbdkit.interfaces import Setting, Slot
 from pbdkit.registry.blame import blaming
 
 Constants = tuple[float, ...]
+WHOLE_CELLS = (1.0, 1.0)
+"""The shares of the cells on both sides of a bond, where no frame weighs cells."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     slots = [slot for own in setting.slots for slot in own]
     with blaming(experiment.rule, "when asked for its constants", "rule"):
         rule = _named(experiment.rule.parameters(setting))
-        weights = {slot: tuple(experiment.rule.weights(slot)) for slot in slots}
+        sides = WHOLE_CELLS if experiment.rule.uses_cells else ()
+        weights = {slot: (*experiment.rule.weights(slot, setting), *sides) for slot in slots}
     fracture = experiment.fracture
     with blaming(fracture, "when asked for its constants", "fracture"):
         parameters = _named(fracture.parameters())

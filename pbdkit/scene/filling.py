@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.body import Body, Box, Sites
+from pbdkit.experiment.body import Body, Box, Floats, Sites
 from pbdkit.interfaces import Cell, Lattice
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
@@ -56,10 +56,14 @@ def _belongs(body: Body, lattice: Lattice, i: Indices, j: Indices) -> Mask:
     cell = lattice.cell()
     x, y = positions(cell, *cells_of_sites(cell, i, j))
     x, y = x + lattice.origin[0], y + lattice.origin[1]
-    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(), np.abs(y).max())
-    tolerance = max(1e-9 * math.hypot(*cell.vectors[0]), rounding)
-    found: Mask = body.distance(Sites(i, j, x, y)) <= tolerance
+    found: Mask = body.distance(Sites(i, j, x, y)) <= rounding_of(cell, x, y)
     return found
+
+
+def rounding_of(cell: Cell, x: Floats, y: Floats) -> float:
+    """The distance up to which a point at (x, y) counts as on the outline."""
+    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(), np.abs(y).max())
+    return float(max(1e-9 * math.hypot(*cell.vectors[0]), rounding))
 
 
 def has_narrow_slot(body: Mask, layers: int) -> bool:

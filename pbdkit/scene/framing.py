@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import Cell, FollowerRule, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index, Offset
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
@@ -34,9 +34,9 @@ class Frame:
             plane[self.place] = np.bincount(self.map.point, values, len(self.place))
 
 
-def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
+def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Frame | None:
     """The policy's map for this raster; None where the scene has no frame."""
-    frame = sites_of_frame(raster)
+    frame = sites_of_frame(raster, rule)
     if frame is None:
         return None
     rows = frame.frame_rows
@@ -51,7 +51,7 @@ def build_frame(raster: Raster, policy: FramePolicy) -> Frame | None:
     return Frame(raster.place_of(rows), follow, raster.place_of(follow.body))
 
 
-def sites_of_frame(raster: Raster) -> RasterFrame | None:
+def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     """The frame points of a raster as a policy sees them; None where there are none."""
     rows = np.flatnonzero(raster.table_kind == FRAME)
     if not len(rows):
@@ -64,6 +64,7 @@ def sites_of_frame(raster: Raster) -> RasterFrame | None:
         raster.site_of(rows).astype(np.int32),
         tuple(inside.min(axis=0).tolist()),
         tuple(inside.max(axis=0).tolist()),
+        rule,
     )
 
 
@@ -93,6 +94,7 @@ class RasterFrame(FrameSites):
     site: NDArray[np.int32]
     low: Index
     high: Index
+    rule: FollowerRule
 
     def body_at(self, site: NDArray[np.int32]) -> Indices:
         """Looks the sites up on the raster."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.following import Followers, target
@@ -23,14 +24,23 @@ BLOCK_CELLS = 16384
 
 @dataclass(frozen=True)
 class _Part:
-    """What is constant on one block: its slots with presence, X where the rule wants
-    it, and where followers can move (None: everywhere)."""
+    """What is constant on one block: its slots with the rule's weights and presence, X where the
+    rule wants it, and where followers can move (None: everywhere)."""
 
     block: Block
     slots: tuple[Slot, ...]
+    weights: dict[Slot, tuple[Any, ...]]
     present: list[Present]
     X: Vector
     movable: Present
+
+
+def weights_on(scene: Scene, slot: Slot, block: Block) -> tuple[Any, ...]:
+    """The rule's w of a slot on a block; the shares of cells are arrays where they differ."""
+    weights = scene.constants.weights[slot]
+    if scene.cells is None:
+        return weights
+    return (*weights[: -len(WHOLE_CELLS)], *scene.cells.beside(slot, block))
 
 
 class SlotFollowers(Followers):
@@ -66,6 +76,7 @@ class SlotFollowers(Followers):
         return _Part(
             block,
             slots,
+            {slot: weights_on(self._scene, slot, block) for slot in slots},
             present,
             raster.reference_planes(block) if self._rule.uses_reference else Vector(None, None),
             None if movable.all() else movable,
@@ -74,13 +85,13 @@ class SlotFollowers(Followers):
     def _move(
         self, part: _Part, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None
     ) -> None:
-        u, weights = read_only(planes(m, part.block)), self._scene.constants.weights
+        u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
             if self._fracturing and broken_step is not None:
                 d = self._fracturing.seen(d, u, part.block, slot, broken_step)
-            return self._rule.gather(d, slot.rest, weights[slot], self._parameters)
+            return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
 
         total = sum_over_slots(part.slots, part.present, contribution)
         move = self._rule.apply(total, Here(u, part.X), self._parameters)

@@ -141,7 +141,7 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
 
 
 def _to_frame(policy: FramePolicy, scene: Scene, seed: int) -> list[Question]:
-    sites = sites_of_frame(scene.raster)
+    sites = sites_of_frame(scene.raster, scene.experiment.rule)
     if sites is None:
         return []
     point, body = sites.nearest()

@@ -37,7 +37,7 @@ class OwnElastic(pbdkit.FollowerRule):
     type: Literal["own-elastic"] = "own-elastic"
     poisson_ratio: float = 0.3
 
-    def weights(self, slot: pbdkit.Slot) -> tuple[float, ...]:
+    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> tuple[float, ...]:
         nu = self.poisson_ratio
         x, y = np.sign(slot.rest.x), np.sign(slot.rest.y)
         if x and y:

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pbdkit.interfaces import Cell, Slot
+from pbdkit.scene.cells import Side, Tiling
+from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import FOLLOWER
 
@@ -38,6 +40,7 @@ class Wanted:
     rule_parameters: tuple[str, ...]
     fracture_parameters: dict[str, float]
     weights: dict[Slot, tuple[float, ...]]
+    tiling: Tiling | None
 
 
 class Writer:
@@ -77,7 +80,7 @@ def _write_sweep(
 ) -> None:
     out.add(0, "", "", '@njit(error_model="numpy")')
     out.add(0, f"def sweep_{s}(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(2, "step, i0, i1, j0, j1, rule, solver, first):")
+    out.add(2, "share, step, i0, i1, j0, j1, rule, solver, first):")
     out.add(1, f"p = {_parameters('Rule', wanted.rule_parameters, 'rule')}")
     values = "".join(f"{_number(v, wanted)}, " for v in wanted.fracture_parameters.values())
     out.add(1, f"q = Fracture({values})")
@@ -87,6 +90,8 @@ def _write_sweep(
         for k, slot in enumerate(slots):
             m, n = slot.cell
             out.add(2, f"n{k}{c} = u{c}[{slot.target}, i + {m}, j0 + {n}:j1 + {n}]")
+    if wanted.tiling:
+        out.add(2, *_share_lines(s, slots, around, wanted.tiling))
     if wanted.some_missing:
         out.add(2, f"here = masks[{s}, i, j0:j1]")
     if wanted.fracture:
@@ -123,6 +128,10 @@ def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> It
         yield f"f = fictitious(u, {r}, q)"
         yield "d = Vector(f.x if is_lost else d.x, f.y if is_lost else d.y)"
     weights = "".join(f"{_number(w, wanted)}, " for w in wanted.weights[slot])
+    if wanted.tiling:
+        own = wanted.weights[slot][: -len(WHOLE_CELLS)]
+        sides = [f"{_share_name(slot, side, around)}[j], " for side in wanted.tiling.beside[slot]]
+        weights = "".join([*(f"{_number(w, wanted)}, " for w in own), *sides])
     names = ", ".join(f"c{n}" for n in range(wanted.contributions))
     yield f"{names}, = gather(d, {r}, ({weights}), p)"
     for n in range(wanted.contributions):
@@ -130,6 +139,22 @@ def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> It
         if wanted.some_missing:
             part = f"(c{n} if (here[j] >> {k}) & 1 else {_ZERO[wanted.single]})"
         yield f"t{n} = {part}" if k == 0 else f"t{n} = t{n} + {part}"
+
+
+def _share_name(slot: Slot, side: Side, around: Neighbourhood) -> str:
+    """The row of shares of the cells to one side of a slot."""
+    slots = around.slots[slot.source]
+    return f"s{side.kind}_{'own' if side.first is None else slots.index(side.first)}"
+
+
+def _share_lines(
+    s: int, slots: tuple[Slot, ...], around: Neighbourhood, tiling: Tiling
+) -> Iterator[str]:
+    """The rows of shares of all cells around the particles of a row, once each."""
+    sides = {_share_name(slot, side, around): side for slot in slots for side in tiling.beside[slot]}
+    for name, side in sides.items():
+        target, (m, n) = (side.first.target, side.first.cell) if side.first else (s, (0, 0))
+        yield f"{name} = share[{side.kind}, {target}, i + {m}, j0 + {n}:j1 + {n}]"
 
 
 def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -> None:
@@ -177,7 +202,7 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     flags = "parallel=True, " if wanted.parallel else ""
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
     out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(2, "step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,")
+    out.add(2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,")
     out.add(2, "points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
     body = Writer()
@@ -191,7 +216,7 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
         "for k in range(4):",
         f"{INDENT}box[k] += growth[k]",
     )
-    arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, limits, step"
+    arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, limits, share, step"
     for s in range(sublattices):
         body.add(
             0,

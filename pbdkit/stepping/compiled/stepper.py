@@ -79,7 +79,7 @@ class CompiledStepper(Engine):
             numba.set_num_threads(self.threads)
         self._run(
             u[0], u[1], new[0], new[1], self._masks, self._lost, self._spared,
-            self._scene.raster.kind, broken, c["limits"], state.step, count, self._reach.blocks,
+            self._scene.raster.kind, broken, c["limits"], c["share"], state.step, count, self._reach.blocks,
             self._reach.box, self._reach.growth, 4 * self.threads, places, values[0], values[1],
             kept[0], kept[1], c["points"], c["entries"], c["bodies"], c["weights"], c["rule"],
             c["solver"], c["first"],
@@ -118,6 +118,7 @@ class CompiledStepper(Engine):
             rule_parameters=constants.rule._fields,
             fracture_parameters=constants.fracture._asdict(),
             weights=constants.weights,
+            tiling=scene.cells.tiling if scene.cells else None,
         )
 
     def _constant_arguments(self) -> dict[str, Any]:
@@ -138,6 +139,7 @@ class CompiledStepper(Engine):
             entries = np.concatenate([[0], np.cumsum(counts)])
         return {
             "limits": limits,
+            "share": (scene.cells.share if scene.cells else np.empty((0,) * 4)).astype(number),
             "broken": np.empty((0, 0, 0), np.int32),
             "points": frame.place if frame else none,
             "entries": entries,

@@ -20,7 +20,7 @@ def takes_every_point_alone(subject: Subject) -> None:
     policy, asked = subject.component, False
     assert isinstance(policy, FramePolicy)
     for scene in subject.scenes:
-        frame = sites_of_frame(scene.raster)
+        frame = sites_of_frame(scene.raster, scene.experiment.rule)
         if frame is None:
             continue
         asked = True

@@ -1,0 +1,231 @@
+"""Rules that are linear elasticity: calibrated to a material, derived cell by cell."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import FollowerRule, Here, Setting, Slot, Stiffness, Vector, where
+
+Floats = NDArray[np.float64]
+
+CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
+"""Of a rectangular cell, counterclockwise, in units of its sides."""
+HOURGLASS = np.array([1.0, -1.0, 1.0, -1.0])
+"""The displacement of the corners that no mean strain knows."""
+
+
+class CellElastic(FollowerRule):
+    """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
+    cells on both sides of each bond, -K_jk of the cells' matrices.
+
+    A rectangle has the energy of its mean strain, and against hourglassing the shear stiffness
+    G (a/b + b/a)/4; a triangle is the linear one of finite elements. Inside the body of a square
+    lattice the isotropic weights are W_E = W_W = diag(3 - ν, 1 - 3ν)/(2(5 - 3ν)), W_N = W_S with
+    the entries exchanged, and (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] on the diagonals (s = ±1).
+    """
+
+    uses_cells: ClassVar[bool] = True
+
+    @abstractmethod
+    def modulus(self) -> float:
+        """What the ratios are multiplied with to be stiffnesses over Young's modulus."""
+
+    @abstractmethod
+    def ratios(self) -> Stiffness:
+        """The stiffness over `modulus`: finite for every material that the rule takes."""
+
+    def stiffness(self) -> Stiffness:
+        """Ratios times modulus."""
+        return Stiffness(*(self.modulus() * ratio for ratio in self.ratios()))
+
+    def parameters(self, setting: Setting) -> dict[str, float]:
+        """The modulus; ExperimentError where the lattice has no such cells."""
+        if not (_rectangle(setting) or _triangle(setting)):
+            raise ExperimentError(
+                f"'{self.type}' works on the square and the rectangular lattice with 8 neighbours "
+                "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
+                "lattice with 6 ({type: coordination, shells: 1})"
+            )
+        if _triangle(setting) and not _is_isotropic(self.ratios()):
+            raise ExperimentError(
+                f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
+            )
+        return {"modulus": self.modulus()}
+
+    def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
+        """(xx, xy, yy, t): the weight of the cell to the left is [[xx, xy + t], [xy - t, yy]], of
+        that to the right the transpose; a cell on both sides counts half on each."""
+        if sides := _rectangle(setting):
+            left, right = _beside(slot, rectangle_matrix(self.ratios(), *sides))
+        else:
+            left, right = (_in_triangle(slot, self.ratios(), turn) for turn in (1, -1))
+        symmetric, skew = (left + right) / 2, (left - right) / 2
+        return symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """W d, and the symmetric part of W."""
+        side_xx, side_xy, side_yy, skew, left, right = w
+        whole, turn = left + right, (left - right) * skew
+        xx, xy, yy = side_xx * whole, side_xy * whole, side_yy * whole
+        return xx * d.x + (xy + turn) * d.y, (xy - turn) * d.x + yy * d.y, xx, xy, yy
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
+        fx, fy, xx, xy, yy = total
+        det = xx * yy - xy * xy
+        some = det > 0.0
+        share = where(some, det, 1.0)
+        x, y = (yy * fx - xy * fy) / share, (xx * fy - xy * fx) / share
+        return where(some, x, 0.0), where(some, y, 0.0)
+
+    @staticmethod
+    def force(total: Any, p: Any) -> tuple[Any, Any]:
+        """Modulus · Σ W d."""
+        return p.modulus * total[0], p.modulus * total[1]
+
+
+class Elastic(CellElastic):
+    """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
+
+    On the square and rectangular lattice with 8 neighbours, on the hexagonal one with 6, where it is
+    linear triangles. At ν = -1 on the square lattice it is the barycentre of the 8 neighbours.
+    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal).
+    """
+
+    type: Literal["elastic"] = "elastic"
+    poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)]
+    plane: Literal["stress", "strain"] = "stress"
+
+    @model_validator(mode="after")
+    def _compressible(self) -> Elastic:
+        if self.plane == "strain" and self.poisson_ratio > 0.49:
+            raise ValueError("in plane strain poisson_ratio must be at most 0.49")
+        return self
+
+    def modulus(self) -> float:
+        """1/(1 - ν'²) in plane stress, in plane strain the same over 1 - ν²; ν' = ν/(1 - ν)."""
+        nu, effective = self.poisson_ratio, self._in_plane()
+        if nu == -1.0:
+            return math.nan  # no positive stiffness belongs to it
+        out_of_plane = 1 - nu * nu if self.plane == "strain" else 1.0
+        return 1 / (out_of_plane * (1 - effective * effective))
+
+    def ratios(self) -> Stiffness:
+        """1, 1, ν', (1 - ν')/2."""
+        nu = self._in_plane()
+        return Stiffness(1.0, 1.0, nu, (1 - nu) / 2)
+
+    def _in_plane(self) -> float:
+        nu = self.poisson_ratio
+        return nu / (1 - nu) if self.plane == "strain" else nu
+
+
+class Orthotropic(CellElastic):
+    """Orthotropic linear elasticity in plane stress along the axes of the square or rectangular
+    lattice with 8 neighbours.
+
+    `poisson_ratio` is ν_xy, the contraction along y under tension along x; `modulus_ratio` E_y/E_x;
+    `shear_ratio` G_xy/E_x. Young's modulus, where forces ask for it, is E_x.
+    """
+
+    type: Literal["orthotropic"] = "orthotropic"
+    poisson_ratio: Annotated[float, Field(gt=-10.0, lt=10.0)]
+    modulus_ratio: Annotated[float, Field(gt=0.0, le=1e6)]
+    shear_ratio: Annotated[float, Field(gt=0.0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _positive(self) -> Orthotropic:
+        if self.poisson_ratio**2 * self.modulus_ratio >= 1.0:
+            raise ValueError(
+                "no elastic material: poisson_ratio² · modulus_ratio must be below 1, and is "
+                f"{self.poisson_ratio**2 * self.modulus_ratio:g}"
+            )
+        return self
+
+    def modulus(self) -> float:
+        """1/(1 - ν_xy ν_yx)."""
+        return 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
+
+    def ratios(self) -> Stiffness:
+        """1, E_y/E_x, ν_xy E_y/E_x, and the shear ratio over the modulus."""
+        coupled = self.poisson_ratio * self.modulus_ratio
+        return Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / self.modulus())
+
+
+def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
+    """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
+    # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
+    signs = 2 * np.array(CORNERS) - 1.0
+    K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
+    stiffness = c.shear * (a / b + b / a) / 4
+    return K + stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+
+
+def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
+    """∫ Bᵀ C B over a cell of constant strain, gradient (corner, axis) of its shape functions."""
+    B = np.zeros((3, len(gradient), 2))
+    B[0, :, 0] = B[2, :, 1] = gradient[:, 0]
+    B[1, :, 1] = B[2, :, 0] = gradient[:, 1]
+    C = np.array([[c.xx, c.xy, 0.0], [c.xy, c.yy, 0.0], [0.0, 0.0, c.shear]])
+    K: Floats = area * np.einsum("ima,ij,jnb->manb", B, C, B)
+    return K
+
+
+def _beside(slot: Slot, K: Floats) -> tuple[Floats, Floats]:
+    """-K_jk in the cell to the left and the cell to the right of a slot, half of it in each where
+    both are one cell."""
+    x, y = int(np.sign(slot.rest.x)), int(np.sign(slot.rest.y))
+    ends = {corner: n for n, corner in enumerate(CORNERS)}
+    if x and y:
+        block = -K[ends[x < 0, y < 0], :, ends[x > 0, y > 0], :] / 2
+        return block, block
+    found = []
+    for towards in ((-y, x), (y, -x)):  # where the cell to the left and that to the right lie
+        start = tuple(int(step + side < 0) for step, side in zip((x, y), towards, strict=True))
+        found.append(-K[ends[start], :, ends[start[0] + x, start[1] + y], :])
+    return found[0], found[1]
+
+
+def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
+    """-K_jk in the equilateral triangle to the left (turn 1) or right (-1) of a slot."""
+    x, y = slot.rest
+    half, height = 0.5, turn * math.sqrt(0.75)
+    corners = np.array([[0.0, 0.0], [x, y], [half * x - height * y, height * x + half * y]])
+    gradient = np.linalg.inv(np.column_stack([np.ones(3), corners]))[1:].T
+    area = math.sqrt(0.75) * (x * x + y * y) / 2
+    block: Floats = -_of_mean_strain(c, gradient, area)[0, :, 1, :]
+    return block
+
+
+def _rectangle(setting: Setting) -> tuple[float, float] | None:
+    """The sides of the cells, where every site has the 8 neighbours of a rectangular lattice."""
+    a, b = setting.cell.vectors
+    if len(setting.cell.sites) > 1 or a.y != 0.0 or b.x != 0.0:
+        return None
+    around = {slot.cell for slot in setting.slots[0]}
+    ring = {(m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)} - {(0, 0)}
+    return (abs(a.x), abs(b.y)) if around == ring and len(setting.slots[0]) == 8 else None
+
+
+def _triangle(setting: Setting) -> bool:
+    """Whether every site has six neighbours at 60 degrees."""
+    for slots in setting.slots:
+        rests = [complex(*slot.rest) for slot in slots]
+        turned = [rest * complex(0.5, math.sqrt(0.75)) for rest in rests]
+        near = [min(abs(t - rest) for rest in rests) for t in turned]
+        if len(rests) != 6 or max(near) > 1e-9 * abs(rests[0]):
+            return False
+    return True
+
+
+def _is_isotropic(c: Stiffness) -> bool:
+    return c.xx == c.yy and math.isclose(c.xx, c.xy + 2 * c.shear, rel_tol=1e-12)

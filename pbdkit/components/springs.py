@@ -1,0 +1,69 @@
+"""A rule that is a net of springs: nonlinear, and exact under rotation."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import FollowerRule, Here, Setting, Slot, Stiffness, Vector, length, where
+
+EDGE_OF_SQUARE, DIAGONAL_OF_SQUARE, OF_TRIANGLE = 0.75, 0.375, math.sqrt(0.75)
+"""Stiffnesses of the springs over Young's modulus and thickness: isotropic with ν = 1/3."""
+
+
+class Springs(FollowerRule):
+    """Each neighbour proposes the place at its rest distance, on the line to where the particle
+    stands: x_k + l₀ (x_j - x_k)/|x_j - x_k|; the particle goes to the weighted mean.
+
+    Weights are equal on the hexagonal lattice with 6 neighbours, 2 : 1 for edges and diagonals on
+    the square one with 8, and half on free edges. For small strain it is elasticity in plane stress
+    with ν = 1/3; rotations are exact, and the springs' energy never rises with relaxation 1.
+    """
+
+    type: Literal["springs"] = "springs"
+
+    uses_cells: ClassVar[bool] = True
+
+    def stiffness(self) -> Stiffness:
+        """Plane stress with ν = 1/3, for small strain."""
+        return Stiffness(9 / 8, 9 / 8, 3 / 8, 3 / 8)
+
+    def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
+        """Half the spring's stiffness, for each of the cells beside it."""
+        rests = [math.hypot(*s.rest) for s in setting.slots[slot.source]]
+        edge = min(rests)
+        diagonals = sum(math.isclose(rest, edge * math.sqrt(2.0)) for rest in rests)
+        edges = sum(math.isclose(rest, edge) for rest in rests)
+        if (edges, diagonals) == (6, 0) and len(rests) == 6:
+            return (OF_TRIANGLE / 2,)
+        if (edges, diagonals) == (4, 4) and len(rests) == 8:
+            is_edge = math.isclose(math.hypot(*slot.rest), edge)
+            return ((EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2,)
+        raise ExperimentError(
+            "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
+            "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"
+        )
+
+    @staticmethod
+    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+        """(k e n, k) with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
+        half, left, right = w
+        stiffness = half * (left + right)
+        v, rest = Vector(r.x + d.x, r.y + d.y), length(r)
+        distance = length(v)
+        elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (distance + rest)
+        pull = stiffness * elongation / where(distance > 0.0, distance, 1.0)
+        return pull * v.x, pull * v.y, stiffness
+
+    @staticmethod
+    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """Σ k e n / Σ k; no move where there is no cell."""
+        x, y, stiffness = total
+        share = where(stiffness > 0.0, stiffness, 1.0)
+        return x / share, y / share
+
+    @staticmethod
+    def force(total: Any, p: Any) -> tuple[Any, Any]:
+        """Σ k e n."""
+        return total[0], total[1]

@@ -1,0 +1,152 @@
+"""Fills an outline with whole and cut cells: which share of each lies inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body, Sites
+from pbdkit.interfaces import Lattice
+from pbdkit.interfaces.lattice import Index
+from pbdkit.scene.cells import Cells, Corners, Tiling
+from pbdkit.scene.filling import rounding_of, window
+from pbdkit.scene.raster import Raster, cells_of_sites, positions
+from pbdkit.scene.rasterising import Mask
+
+Floats = NDArray[np.float64]
+
+FINE = 8
+"""Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
+SMALLEST = 1e-6
+"""Cells with a smaller share than this are left out."""
+
+
+@dataclass(frozen=True)
+class Filling:
+    """The sites of the body on a window whose first site index is `first`, (i, j), and the shares
+    of the cells by the site of their first corner, (kind, i, j)."""
+
+    body: Mask
+    first: Index
+    share: Floats
+
+    def on(self, raster: Raster, tiling: Tiling) -> Cells:
+        """The shares by place of a raster."""
+        out = np.zeros((len(self.share), *raster.shape))
+        rows = raster.body_rows
+        i, j = raster.site_of(rows).T
+        for kind, share in enumerate(self.share):
+            out[kind].ravel()[raster.place_of(rows)] = share[i - self.first[0], j - self.first[1]]
+        return Cells(tiling, out)
+
+
+def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
+    """The cells with a share inside the outline, and as body all their corners.
+
+    A body of given sites has the whole cells between them. Raises ExperimentError where there is
+    no cell.
+    """
+    cutter = _Cutter(body, lattice)
+    kinds = max(map(len, tiling.corners))
+    share = np.zeros((kinds, *cutter.shape))
+    corner = np.zeros(cutter.shape, bool)
+    for s, cells in enumerate(tiling.corners):
+        for kind, corners in enumerate(cells):
+            i, j, found = cutter.shares(s, corners)
+            share[kind, i, j] = found
+            for slot in corners:
+                m, n = (0, 0) if slot is None else slot.site
+                corner[i + m, j + n] = True
+    if not corner.any():
+        raise ExperimentError(
+            "holds no cell of the lattice; make it larger, or take a frame that does not weigh "
+            "cells",
+            ("body",),
+        )
+    rows, columns = (np.flatnonzero(corner.any(axis=axis)) for axis in (1, 0))
+    inside = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    first = (int(cutter.low[0] + rows[0]), int(cutter.low[1] + columns[0]))
+    return Filling(corner[inside], first, share[(slice(None), *inside)])
+
+
+class _Cutter:
+    """The signed distance at all sites of a window around the body, and within cells."""
+
+    def __init__(self, body: Body, lattice: Lattice) -> None:
+        self._body, self._lattice, self._cell = body, lattice, lattice.cell()
+        low, high = window(body, lattice)
+        margin = 2
+        self.low = (low[0] - margin, low[1] - margin)
+        self.shape = (high[0] - low[0] + 1 + 2 * margin, high[1] - low[1] + 1 + 2 * margin)
+        self._of_sites = any(box.in_sites for box in body.boxes())
+        i, j = np.indices(self.shape)
+        i, j = i + self.low[0], j + self.low[1]
+        self._sublattice, m, n = cells_of_sites(self._cell, i, j)
+        x, y = positions(self._cell, self._sublattice, m, n)
+        self._x, self._y = x + lattice.origin[0], y + lattice.origin[1]
+        self._tolerance = rounding_of(self._cell, self._x, self._y)
+        self._distance = self._signed(Sites(i, j, self._x, self._y))
+
+    def shares(
+        self, sublattice: int, corners: Corners
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+        """(i, j, share) of the cells with a share whose first corner, at place (i, j) of the
+        window, is of that sublattice."""
+        i, j = np.nonzero(self._sublattice[1:-1, 1:-1] == sublattice)
+        i, j = i + 1, j + 1
+        steps = [(0, 0) if slot is None else slot.site for slot in corners]
+        inside = np.array([(0 <= i + m) & (i + m < self.shape[0]) for m, _ in steps]).all(axis=0)
+        inside &= np.array([(0 <= j + n) & (j + n < self.shape[1]) for _, n in steps]).all(axis=0)
+        i, j = i[inside], j[inside]
+        at = [(i + m, j + n) for m, n in steps]
+        distance = np.array([self._distance[there] for there in at])
+        share = (distance <= 0).all(axis=0).astype(float)
+        if not self._of_sites:
+            x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
+            reach = np.hypot(x - x[0], y - y[0]).max()
+            cut = np.abs(distance).min(axis=0) <= 2 * reach
+            share[cut] = self._cut_shares(x[:, cut], y[:, cut])
+        some = share > SMALLEST
+        return i[some], j[some], share[some]
+
+    def _cut_shares(self, x: Floats, y: Floats) -> Floats:
+        """The share inside of cells with corners (corner, cell): the mean over its triangles, cut
+        into small ones."""
+        triangles = [(0, 1, 2)]
+        if len(x) == 4:
+            x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
+            triangles = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
+        shares = [self._share_of_triangle(x[list(t)], y[list(t)]) for t in triangles]
+        return np.mean(shares, axis=0)
+
+    def _share_of_triangle(self, x: Floats, y: Floats) -> Floats:
+        a, b = (n.ravel() for n in np.indices((FINE + 1, FINE + 1)))
+        points = np.stack([FINE - a - b, a, b]) / FINE
+        px, py = points.T @ x, points.T @ y
+        nowhere = np.zeros(px.shape, int)
+        distance = self._signed(Sites(nowhere, nowhere, px, py)).reshape(FINE + 1, FINE + 1, -1)
+        parts = []
+        for k in range(FINE):
+            for m in range(FINE - k):
+                parts.append(_negative_share(distance[k, m], distance[k + 1, m], distance[k, m + 1]))
+                if k + m < FINE - 1:
+                    corners = distance[k + 1, m + 1], distance[k + 1, m], distance[k, m + 1]
+                    parts.append(_negative_share(*corners))
+        return np.mean(parts, axis=0)
+
+    def _signed(self, at: Sites) -> Floats:
+        distance = self._body.distance(at)
+        return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+
+
+def _negative_share(a: Floats, b: Floats, c: Floats) -> Floats:
+    """The share of triangles in which a linear function, given at their corners, is negative."""
+    low, middle, high = np.sort([a, b, c], axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        one = low * low / ((low - middle) * (low - high))
+        two = 1.0 - high * high / ((high - low) * (high - middle))
+    share = np.where(middle >= 0.0, one, two)
+    return np.where(high <= 0.0, 1.0, np.where(low >= 0.0, 0.0, share))
