@@ -7,7 +7,7 @@ from itertools import product
 from typing import Any
 
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import INTERFACES, Component
+from pbdkit.interfaces import INTERFACES, Component, FramePolicy, Lattice, NeighbourMetric
 from pbdkit.registry.registry import interface_of
 
 LATTICES: dict[str, dict[str, Any]] = {
@@ -24,6 +24,9 @@ NEIGHBOURS: dict[str, dict[str, Any]] = {
 }
 PARTNERS = ({"type": "barycentre"}, {"type": "distance-weighted"})
 """The rules with which lattices and neighbours are tried: a linear one, and one that is not."""
+MEAN, NATURAL = {"type": "mean"}, {"type": "natural"}
+ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
+"""The rule with which frames are tried that weigh cells."""
 BODY = {"type": "grid", "columns": 6, "rows": 5}
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
@@ -32,26 +35,30 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     """Small experiments that a component takes part in; `parts` stand in for those tried.
 
     Rules, frames and fracture models meet each of the five lattices with each of four
-    neighbourhoods, lattices and neighbour metrics each of the other with two rules.
+    neighbourhoods, lattices and neighbour metrics each of the other with two rules; what works cell
+    by cell meets frames or rules that do.
     """
     field = next(f for f, i in INTERFACES.items() if i is interface_of(type(component)))
     given = dict(parts) | {field: component}
     if field == "diagnostics":
         given |= {field: [component], "fracture": parts.get("fracture", TEARING)}
-    rules = PARTNERS if field in ("lattice", "neighbours") else PARTNERS[:1]
-    tried = {
-        "lattice": [given["lattice"]] if "lattice" in given else list(LATTICES.values()),
-        "neighbours": [given["neighbours"]] if "neighbours" in given else _neighbours(field),
-        "rule": [given["rule"]] if "rule" in given else list(rules),
+    choices = {
+        "lattice": list(LATTICES.values()),
+        # The fracture model that diagnostics are tried with has one threshold, for one shell.
+        "neighbours": [n for n in NEIGHBOURS.values() if field != "diagnostics" or n["shells"] == 1],
+        "rule": _rules(component),
+        "frame": [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN],
     }
+    tried = [[given[name]] if name in given else values for name, values in choices.items()]
     base = {"name": "conformance", "body": BODY, "steps": 6}
-    for choice in product(*tried.values()):
-        yield Experiment(**base | given | dict(zip(tried, choice, strict=True)))
+    for choice in product(*tried):
+        yield Experiment(**base | given | dict(zip(choices, choice, strict=True)))
 
 
-def _neighbours(field: str) -> list[dict[str, Any]]:
-    # The fracture model that diagnostics are tried with has one threshold, for one shell.
-    return [n for n in NEIGHBOURS.values() if field != "diagnostics" or n["shells"] == 1]
+def _rules(component: Component) -> list[dict[str, Any]]:
+    if isinstance(component, FramePolicy) and component.weighs_cells:
+        return [ELASTIC]
+    return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 
 
 def place_of(experiment: Experiment) -> str:

@@ -27,14 +27,16 @@ def displacements(scene: Scene, seed: int, share: float = 0.2) -> Floats:
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """The state, at step 0 and at rest, whose body has displacements u, (body particle, axis); the
-    frame follows by its map."""
+    """The state whose body has displacements u, (body particle, axis), and stands still; the frame
+    follows by its map. It is that of step 1: what an engine knows of step 0 is the experiment's own
+    start."""
     state = initial_state(scene)
     raster, flat = scene.raster, state.u.reshape(2, -1)
     flat[:, raster.place_of(raster.body_rows)] = np.asarray(u).T
     if scene.frame:
         scene.frame.follow(flat, flat)
     state.previous[...] = state.u
+    state.step = 1
     return state
 
 

@@ -43,7 +43,7 @@ class Subject:
 
     def questions(self, n: int = 0) -> list[Question]:
         """What can be asked of the component directly, on its n-th scene and with seed n."""
-        return questions_of(self.component, self.scene(n), seed=n)
+        return questions_of(self.component, self.scene(n), seed=n % 1000)
 
 
 def scenes_with(component: Component, parts: Mapping[str, Any]) -> list[Scene]:
