@@ -68,7 +68,8 @@ class CellElastic(FollowerRule):
         else:
             left, right = (_in_triangle(slot, self.ratios(), turn) for turn in (1, -1))
         symmetric, skew = (left + right) / 2, (left - right) / 2
-        return symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
+        found = symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
+        return tuple(map(float, found))
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
