@@ -131,7 +131,9 @@ class _Cutter:
         parts = []
         for k in range(FINE):
             for m in range(FINE - k):
-                parts.append(_negative_share(distance[k, m], distance[k + 1, m], distance[k, m + 1]))
+                parts.append(
+                    _negative_share(distance[k, m], distance[k + 1, m], distance[k, m + 1])
+                )
                 if k + m < FINE - 1:
                     corners = distance[k + 1, m + 1], distance[k + 1, m], distance[k, m + 1]
                     parts.append(_negative_share(*corners))

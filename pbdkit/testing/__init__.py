@@ -11,6 +11,7 @@ components of a distribution. docs/extending/testing.md lists the properties.
 """
 
 from pbdkit.testing.conformance import conformance
+from pbdkit.testing.distributions import examine_all
 from pbdkit.testing.examining import Examination, examine
 from pbdkit.testing.examples import examples_of
 from pbdkit.testing.properties import PROPERTIES, properties_of
@@ -27,6 +28,7 @@ __all__ = [
     "Report",
     "conformance",
     "examine",
+    "examine_all",
     "examples_of",
     "properties_of",
 ]

@@ -32,7 +32,8 @@ TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
 def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator[Experiment]:
-    """Small experiments that a component takes part in; `parts` stand in for those tried.
+    """Small experiments that a component takes part in; `parts`, each one or a list of them, stand in
+    for those tried.
 
     Rules, frames and fracture models meet each of the five lattices with each of four
     neighbourhoods, lattices and neighbour metrics each of the other with two rules; what works cell
@@ -45,14 +46,21 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     choices = {
         "lattice": list(LATTICES.values()),
         # The fracture model that diagnostics are tried with has one threshold, for one shell.
-        "neighbours": [n for n in NEIGHBOURS.values() if field != "diagnostics" or n["shells"] == 1],
+        "neighbours": [
+            n for n in NEIGHBOURS.values() if field != "diagnostics" or n["shells"] == 1
+        ],
         "rule": _rules(component),
         "frame": [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN],
     }
-    tried = [[given[name]] if name in given else values for name, values in choices.items()]
+    tried = [alternatives(given[n]) if n in given else values for n, values in choices.items()]
     base = {"name": "conformance", "body": BODY, "steps": 6}
     for choice in product(*tried):
         yield Experiment(**base | given | dict(zip(choices, choice, strict=True)))
+
+
+def alternatives(part: Any) -> list[Any]:
+    """The parts to be tried one after the other."""
+    return list(part) if isinstance(part, (list, tuple)) else [part]
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:

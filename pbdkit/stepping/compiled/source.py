@@ -151,7 +151,9 @@ def _share_lines(
     s: int, slots: tuple[Slot, ...], around: Neighbourhood, tiling: Tiling
 ) -> Iterator[str]:
     """The rows of shares of all cells around the particles of a row, once each."""
-    sides = {_share_name(slot, side, around): side for slot in slots for side in tiling.beside[slot]}
+    sides = {
+        _share_name(slot, side, around): side for slot in slots for side in tiling.beside[slot]
+    }
     for name, side in sides.items():
         target, (m, n) = (side.first.target, side.first.cell) if side.first else (s, (0, 0))
         yield f"{name} = share[{side.kind}, {target}, i + {m}, j0 + {n}:j1 + {n}]"
@@ -202,7 +204,9 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     flags = "parallel=True, " if wanted.parallel else ""
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
     out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,")
+    out.add(
+        2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,"
+    )
     out.add(2, "points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
     body = Writer()

@@ -27,7 +27,9 @@ def has_a_sound_cell(subject: Subject) -> None:
     _refuse_equal(cell, "place", np.array([a, b]), lambda site: site.at)
     (pa, qa), (pb, qb) = cell.primitive
     if pa * qb == qa * pb:
-        raise PropertyError(f"the cell vectors are {cell.primitive} in the primitive basis: in line")
+        raise PropertyError(
+            f"the cell vectors are {cell.primitive} in the primitive basis: in line"
+        )
     _refuse_equal(cell, "primitive index", np.array(cell.primitive), lambda site: site.primitive)
 
 

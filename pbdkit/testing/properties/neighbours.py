@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, NeighbourMetric, Offset
+from pbdkit.interfaces import Cell, Lattice, NeighbourMetric, Offset
 from pbdkit.registry.registry import Registry
 from pbdkit.scene.neighbourhood import build_neighbourhood
 from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
-from pbdkit.testing.scenes import LATTICES
+from pbdkit.testing.scenes import LATTICES, alternatives
 from pbdkit.testing.subject import Subject
 
 Chosen = set[tuple[int, int, tuple[int, int]]]
@@ -91,15 +91,13 @@ def _metric(subject: Subject) -> NeighbourMetric:
 
 def _cells(subject: Subject) -> Iterator[tuple[str, Cell]]:
     """The lattices to try, by name, but for those that the metric refuses."""
-    from pbdkit.interfaces import Lattice
-
     registry, given = Registry(), subject.parts.get("lattice")
-    for name, part in {"given": given}.items() if given else LATTICES.items():
+    for part in alternatives(given) if given else LATTICES.values():
         lattice = part
         if not isinstance(part, Lattice):
             lattice = registry.find(Lattice, part["type"]).model_validate(part)
         assert isinstance(lattice, Lattice)
-        cell = lattice.cell()
+        name, cell = lattice.type, lattice.cell()
         try:
             for s in range(len(cell.sites)):
                 _metric(subject).shells_around(cell, s)
