@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.interfaces import (
     Component,
@@ -134,7 +133,11 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
 
     def fictitious(arrays: Arrays) -> Arrays:
         found = [model.fictitious(vector(arrays, "u"), slot.rest, p) for slot in slots]
-        return {f"{c} at slot {k}": v for k, lost in enumerate(found) for c, v in zip("xy", lost)}
+        return {
+            f"{c} at slot {k}": v
+            for k, lost in enumerate(found)
+            for c, v in zip("xy", lost, strict=True)
+        }
 
     wide = differences(scene, seed, share=2.0)
     return [Question("breaks", wide, breaks), Question("fictitious", here, fictitious)]

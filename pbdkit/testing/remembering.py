@@ -53,8 +53,7 @@ def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
         if isinstance(value, types.FunctionType):
             if not value.__module__.startswith(("pbdkit.", "numpy")):
                 yield f"attributes of {value.__name__}", vars(value)
-                for inner, found in inspect.getclosurevars(value).globals.items():
-                    yield inner, found
+                yield from inspect.getclosurevars(value).globals.items()
         else:
             yield name, value
 

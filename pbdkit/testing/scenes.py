@@ -32,8 +32,8 @@ TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
 def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator[Experiment]:
-    """Small experiments that a component takes part in; `parts`, each one or a list of them, stand in
-    for those tried.
+    """Small experiments that a component takes part in; `parts`, each one or a list of them, stand
+    in for those tried.
 
     Rules, frames and fracture models meet each of the five lattices with each of four
     neighbourhoods, lattices and neighbour metrics each of the other with two rules; what works cell

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -27,21 +28,19 @@ def has_a_sound_cell(subject: Subject) -> None:
     _refuse_equal(cell, "place", np.array([a, b]), lambda site: site.at)
     (pa, qa), (pb, qb) = cell.primitive
     if pa * qb == qa * pb:
-        raise PropertyError(
-            f"the cell vectors are {cell.primitive} in the primitive basis: in line"
-        )
+        raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
     _refuse_equal(cell, "primitive index", np.array(cell.primitive), lambda site: site.primitive)
 
 
-def _refuse_equal(cell: Cell, what: str, steps: np.ndarray, of: object) -> None:
+def _refuse_equal(
+    cell: Cell, what: str, steps: np.ndarray, of: Callable[[BasisSite], tuple[float, float]]
+) -> None:
     """Raises where two sites have the same value up to whole steps of the cell."""
-    value = of if callable(of) else None
-    assert value is not None
     for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        apart = np.linalg.solve(steps.T, np.subtract(value(other), value(one)).astype(float))
+        apart = np.linalg.solve(steps.T, np.subtract(of(other), of(one)).astype(float))
         if np.abs(apart - np.round(apart)).max() < 1e-9:
             raise PropertyError(
-                f"basis sites {m} and {n} have the same {what} {tuple(value(one))}, up to whole "
+                f"basis sites {m} and {n} have the same {what} {tuple(of(one))}, up to whole "
                 "cells: they must differ"
             )
 
