@@ -1,0 +1,131 @@
+"""The conformance suite: the built-in components pass it, and it finds and names every fault."""
+
+import json
+
+import pytest
+from faulty import others, rules
+
+import pbdkit
+from pbdkit.components import pbdkit_components
+from pbdkit.interfaces import INTERFACES
+from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of
+
+test_built_in_components_conform = conformance(*pbdkit_components())
+
+SOUND = [rules.Sound(), others.Following(), others.Strain(), others.Extent()]
+
+FAULTS = [
+    (rules.WritesInput, "changes-no-input", "`gather` writes into `d0.x`"),
+    (rules.CountsPlaces, "takes-particles-in-any-order", "another answer where it stands"),
+    (rules.SumsInOrder, "takes-particles-in-any-order", "order in which neighbours are summed"),
+    (rules.Doubles, "keeps-single-precision", "`apply` returns float64 for float32"),
+    (rules.LooksAround, "is-local", "another answer alone than among others"),
+    (rules.NeedsArrays, "is-local", "fails with plain numbers in the place of arrays"),
+    (rules.Remembers, "remembers-nothing", "keeps `SEEN` from call to call"),
+    (rules.Counts, "remembers-nothing", "keeps `Counts.calls` from call to call"),
+    (rules.Throws, "answers-the-same", "otherwise the second time"),
+    (rules.Drifts, "rests", "a body at rest moves by 1e-09 in step 1 on the square lattice"),
+    (rules.DriftsByRounding, "rests", "a body at rest moves by"),
+    (rules.Divides, "is-finite", "where all neighbours meet in the particle"),
+    (rules.Square, "returns-a-value-a-particle", "returns the shape (2, 4, 3)"),
+    (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 3, now 4 values"),
+    (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
+    (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
+    (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
+    (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
+    (rules.Raises, "changes-no-input", "has no attribute 'strength'"),
+    (rules.Undescribed, "is-documented", "the parameter `strength` has no description"),
+    (rules.Undocumented, "is-documented", "Undocumented has no docstring"),
+    (rules.AnyName, "names-itself", 'declare it as `type: Literal["any-name"] = "any-name"`'),
+    (rules.CapitalName, "names-itself", "the type 'CapitalName' is not in lower case"),
+    (rules.Thawed, "is-frozen", "`type` can be set"),
+    (rules.Unhashable, "is-frozen", "take tuples for lists and named fields for dicts"),
+    (rules.Lenient, "refuses-unknown-keys", "it takes any key"),
+    (rules.Forgets, "survives-json", "`strength` is 2.0, and 1.0 after JSON"),
+    (rules.homeless, "survives-pickling", "define the class at the top of a module"),
+    (rules.Chooses, "takes-part", "name the parts that go with it"),
+    (others.Twins, "has-a-sound-cell", "basis sites 0 and 1 have the same place (0.0, 0.0)"),
+    (others.Flat, "has-a-sound-cell", "span no area"),
+    (others.Rooted, "keeps-its-cell-wherever-it-lies", "leave `self.origin` out of `cell`"),
+    (others.OneSided, "is-mutual", "'one-sided' is not mutual"),
+    (others.Approximate, "takes-offsets-of-the-cell", "is none of the cell's"),
+    (others.Favours, "takes-sublattices-in-any-order", "where the sites are listed backwards"),
+    (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
+    (others.Alternates, "takes-every-point-alone", "follows somebody else where fewer points"),
+    (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),
+    (others.SaysItAnchors, "follows-translations", "and follows every translation"),
+    (others.WritesSites, "changes-no-input", "`follow` writes into `site`"),
+    (others.Lopsided, "is-seen-alike-from-both-ends", "otherwise for (-d, -r) than for (d, r)"),
+    (others.Directed, "is-seen-alike-from-both-ends", "take lengths and shells, not directions"),
+    (others.DeniesBreaking, "breaks-as-declared", "and `breaks` says yes"),
+    (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
+    (others.Measures, "returns-a-value-a-particle", "`breaks` returns float64: compare"),
+    (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
+    (others.OneShort, "measures-what-it-declares", "'extent' has the shape (73,), not (74,)"),
+    (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
+    (others.FromFirstRow, "takes-rows-in-any-order", "ask `now.rows(numbers)`"),
+    (others.KeepsLargest, "remembers-nothing", "keeps `KeepsLargest.largest` from call to call"),
+]
+
+
+def made(faulty):
+    return faulty(strength=2.0) if faulty is rules.Forgets else faulty()
+
+
+@pytest.mark.parametrize("component", SOUND, ids=lambda c: c.type)
+def test_the_faulty_ones_are_sound_but_for_their_fault(component):
+    report = examine(component)
+    assert report.holds, str(report)
+
+
+@pytest.mark.parametrize(("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", ""))
+def test_every_fault_is_found_and_named(faulty, name, words):
+    report = examine(made(faulty))
+    assert [outcome.property for outcome in report.failed] == [name], str(report)
+    assert words in report.failed[0].reason
+
+
+def test_every_property_finds_a_fault():
+    assert {p.name for p in PROPERTIES} == {name for _, name, _ in FAULTS}
+
+
+def test_every_property_says_what_it_asks_and_of_whom():
+    for asked in PROPERTIES:
+        assert len(asked.asks) > 30, asked.name
+        assert asked.interfaces
+        assert set(asked.interfaces) <= set(INTERFACES.values())
+
+
+def test_nothing_is_excused():
+    """Every property of an interface is held, failed or skipped with a reason, for everybody."""
+    for component in pbdkit_components():
+        asked = [p.name for p in PROPERTIES if issubclass(component, p.interfaces)]
+        report = examine(examples_of(component)[0])
+        assert [outcome.property for outcome in report.outcomes] == asked
+        assert all(outcome.reason for outcome in report.skipped)
+        assert len(report.skipped) <= 2
+
+
+def test_a_report_tells_what_ran_and_why_not():
+    text = str(examine(rules.Sound()))
+    assert text.startswith("FollowerRule sound: 19 properties ran, 0 failed; 1 skipped: it does not")
+    assert "  held     rests" in text
+
+
+def test_after_a_fault_nothing_is_judged_that_means_nothing():
+    report = examine(rules.WritesInput())
+    assert {o.reason for o in report.skipped} == {"not judged while changes-no-input fails"}
+
+
+def test_examples_come_from_defaults_and_from_fields():
+    assert [e.K for e in examples_of(pbdkit_components()[11])] == [-0.004, -0.004]
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ("pbdkit.FollowerRule.__doc__", "x"),
+    ],
+)
+def test_placeholder(field, words):
+    assert field
