@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from pbdkit import Experiment, Here, Vector, load
 from pbdkit.components import pbdkit_components
+from pbdkit.components.elasticity import Elastic
 from pbdkit.components.fracture import NoFracture, Threshold
 from pbdkit.components.lattices import Hexagonal
 from pbdkit.components.neighbours import Coordination
@@ -19,6 +20,7 @@ from pbdkit.components.rules import (
     MeanDisplacement,
     MixedCoordinate,
 )
+from pbdkit.components.springs import Springs
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
 from pbdkit.scene.neighbourhood import build_neighbourhood
@@ -32,6 +34,8 @@ REQUIRED = {
     "numbers": [3, 1],
     "radius": 1.5,
     "poisson_ratio": 0.3,
+    "modulus_ratio": 0.5,
+    "shear_ratio": 0.4,
     "length": 0.1,
 }
 
@@ -49,7 +53,14 @@ every_component = pytest.mark.parametrize(
 every_experiment = pytest.mark.parametrize("name", shipped_names())
 every_rule = pytest.mark.parametrize(
     "rule",
-    [Barycentre(), MeanDisplacement(), DistanceWeighted(), MixedCoordinate(K=0.3)],
+    [
+        Barycentre(),
+        MeanDisplacement(),
+        DistanceWeighted(),
+        MixedCoordinate(K=0.3),
+        Elastic(poisson_ratio=0.3),
+        Springs(),
+    ],
     ids=lambda r: r.type,
 )
 
@@ -100,21 +111,23 @@ def read_only(rng):
     return Vector(*arrays)
 
 
-def parameters_of(rule):
+def constants_of(rule):
     cell = Hexagonal(a=1.0).cell()
     slots = build_neighbourhood(cell, Coordination()).slots
     setting = Setting(cell, slots, Vector(0.0, 0.0), Vector(4.0, 3.0))
-    return slots[0][0], SimpleNamespace(**rule.parameters(setting))
+    cells = (1.0, 0.5) if rule.uses_cells else ()
+    w = (*rule.weights(slots[0][0], setting), *cells)
+    return slots[0][0], w, SimpleNamespace(**rule.parameters(setting))
 
 
 @every_rule
 def test_rules_change_none_of_their_inputs_and_give_the_same_twice(rule):
     rng = np.random.default_rng(0)
-    slot, p = parameters_of(rule)
+    slot, w, p = constants_of(rule)
     d, here = read_only(rng), Here(read_only(rng), read_only(rng))
 
     def target():
-        total = tuple(np.array(part) for part in rule.gather(d, slot.rest, rule.weights(slot), p))
+        total = tuple(np.array(part) for part in rule.gather(d, slot.rest, w, p))
         for part in total:
             part.flags.writeable = False
         return np.array(rule.apply(total, here, p))
@@ -125,9 +138,8 @@ def test_rules_change_none_of_their_inputs_and_give_the_same_twice(rule):
 @every_rule
 def test_rules_are_elementwise(rule):
     rng = np.random.default_rng(0)
-    slot, p = parameters_of(rule)
+    slot, w, p = constants_of(rule)
     d, u, X = read_only(rng), read_only(rng), read_only(rng)
-    w = rule.weights(slot)
     whole = np.array(rule.apply(rule.gather(d, slot.rest, w, p), Here(u, X), p))
 
     def at(v, place):
@@ -141,10 +153,10 @@ def test_rules_are_elementwise(rule):
 
 @every_rule
 def test_zero_differences_of_opposite_pairs_mean_rest(rule):
-    slot, p = parameters_of(rule)
+    slot, w, p = constants_of(rule)
     zero, r = Vector(0.0, 0.0), slot.rest
     ends = (r, Vector(-r.x, -r.y))
-    parts = [rule.gather(zero, end, rule.weights(slot), p) for end in ends]
+    parts = [rule.gather(zero, end, w, p) for end in ends]
     total = tuple(a + b for a, b in zip(*parts, strict=True))
     assert tuple(rule.apply(total, Here(zero, Vector(3.0, 3.0)), p)) == (0.0, 0.0)
 

@@ -98,8 +98,8 @@ class CellElastic(FollowerRule):
 class Elastic(CellElastic):
     """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
 
-    On the square and rectangular lattice with 8 neighbours, on the hexagonal one with 6, where it is
-    linear triangles. At ν = -1 on the square lattice it is the barycentre of the 8 neighbours.
+    On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
+    it is linear triangles. At ν = -1 on the square lattice it is the barycentre of all neighbours.
     Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal).
     """
 
@@ -179,7 +179,8 @@ def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     signs = 2 * np.array(CORNERS) - 1.0
     K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
-    return K + stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+    K += stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+    return K
 
 
 def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
@@ -198,11 +199,11 @@ def _beside(slot: Slot, K: Floats) -> tuple[Floats, Floats]:
     x, y = int(np.sign(slot.rest.x)), int(np.sign(slot.rest.y))
     ends = {corner: n for n, corner in enumerate(CORNERS)}
     if x and y:
-        block = -K[ends[x < 0, y < 0], :, ends[x > 0, y > 0], :] / 2
+        block: Floats = -K[ends[int(x < 0), int(y < 0)], :, ends[int(x > 0), int(y > 0)], :] / 2
         return block, block
     found = []
     for towards in ((-y, x), (y, -x)):  # where the cell to the left and that to the right lie
-        start = tuple(int(step + side < 0) for step, side in zip((x, y), towards, strict=True))
+        start = int(x + towards[0] < 0), int(y + towards[1] < 0)
         found.append(-K[ends[start], :, ends[start[0] + x, start[1] + y], :])
     return found[0], found[1]
 

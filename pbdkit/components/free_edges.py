@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FrameMap, FramePolicy, FrameSites
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import Block
 
 Floats = NDArray[np.float64]
+Share = NDArray[np.floating[Any]] | float
 Corners = tuple[Slot | None, ...]
 """The corners of a cell as slots of its first one, which is None itself; counterclockwise."""
 
@@ -42,6 +44,8 @@ class Tiling:
 def tiling_of(neighbourhood: Neighbourhood) -> Tiling:
     """The cells of lattices whose sites have 8 neighbours around quadrilaterals, or 6 around
     triangles; ExperimentError for others."""
+    sectors: tuple[tuple[int, int | None], ...]
+    corners: tuple[tuple[Corners, ...], ...]
     around = [_ring(slots) for slots in neighbourhood.slots]
     if all(map(_is_ring_of_triangles, around)):
         corners = tuple(((None, s[0], s[1]), (None, s[1], s[2])) for s in around)
@@ -55,7 +59,7 @@ def tiling_of(neighbourhood: Neighbourhood) -> Tiling:
             "the cells between these neighbours are not known: take 8 neighbours around "
             "quadrilaterals ({type: chebyshev, shells: 1}) or the 6 of the hexagonal lattice"
         )
-    beside = {}
+    beside: dict[Slot, tuple[Side, Side]] = {}
     for slots in around:
         sides = [Side(kind, None if n is None else slots[n]) for kind, n in sectors]
         beside |= {slot: (sides[n], sides[n - 1]) for n, slot in enumerate(slots)}
@@ -96,13 +100,16 @@ class Cells:
     tiling: Tiling
     share: Floats
 
-    def beside(self, slot: Slot, block: Block) -> tuple[Floats | float, Floats | float]:
+    def beside(self, slot: Slot, block: Block, precision: str) -> tuple[Share, Share]:
         """The shares to the left and the right of a slot on a block; 1 where all are whole."""
-        left, right = (self._seen(side, block) for side in self.tiling.beside[slot])
+        left, right = (self._seen(side, block, precision) for side in self.tiling.beside[slot])
         return left, right
 
-    def _seen(self, side: Side, block: Block) -> Floats | float:
+    def _seen(self, side: Side, block: Block, precision: str) -> Share:
         there = block if side.first is None else block.seen_through(side.first)
         share = self.share[(side.kind, *there.slices())]
+        if (share == 1.0).all():
+            return 1.0
+        share = share.astype(precision)
         share.flags.writeable = False
-        return 1.0 if (share == 1.0).all() else share
+        return share

@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
-SMALLEST = 1e-6
-"""Cells with a smaller share than this are left out."""
+SMALLEST = 0.02
+"""Cells with a smaller share than this are left out: corners that hang on a sliver of the body move
+as little else does, and say little about it."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,11 @@ class _Cutter:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         """(i, j, share) of the cells with a share whose first corner, at place (i, j) of the
         window, is of that sublattice."""
-        i, j = np.nonzero(self._sublattice[1:-1, 1:-1] == sublattice)
-        i, j = i + 1, j + 1
         steps = [(0, 0) if slot is None else slot.site for slot in corners]
-        inside = np.array([(0 <= i + m) & (i + m < self.shape[0]) for m, _ in steps]).all(axis=0)
-        inside &= np.array([(0 <= j + n) & (j + n < self.shape[1]) for _, n in steps]).all(axis=0)
-        i, j = i[inside], j[inside]
+        low, high = np.min(steps, axis=0), np.max(steps, axis=0)
+        ends = np.array(self.shape) - high
+        near = self._sublattice[-low[0] : ends[0], -low[1] : ends[1]] == sublattice
+        i, j = (n - lowest for n, lowest in zip(np.nonzero(near), low, strict=True))
         at = [(i + m, j + n) for m, n in steps]
         distance = np.array([self._distance[there] for there in at])
         share = (distance <= 0).all(axis=0).astype(float)
@@ -120,7 +120,8 @@ class _Cutter:
             x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
             triangles = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
         shares = [self._share_of_triangle(x[list(t)], y[list(t)]) for t in triangles]
-        return np.mean(shares, axis=0)
+        share: Floats = np.mean(shares, axis=0)
+        return share
 
     def _share_of_triangle(self, x: Floats, y: Floats) -> Floats:
         a, b = (n.ravel() for n in np.indices((FINE + 1, FINE + 1)))
@@ -128,16 +129,15 @@ class _Cutter:
         px, py = points.T @ x, points.T @ y
         nowhere = np.zeros(px.shape, int)
         distance = self._signed(Sites(nowhere, nowhere, px, py)).reshape(FINE + 1, FINE + 1, -1)
-        parts = []
+        parts: list[Floats] = []
         for k in range(FINE):
             for m in range(FINE - k):
-                parts.append(
-                    _negative_share(distance[k, m], distance[k + 1, m], distance[k, m + 1])
-                )
+                one, other = distance[k + 1, m], distance[k, m + 1]
+                parts.append(_negative_share(distance[k, m], one, other))
                 if k + m < FINE - 1:
-                    corners = distance[k + 1, m + 1], distance[k + 1, m], distance[k, m + 1]
-                    parts.append(_negative_share(*corners))
-        return np.mean(parts, axis=0)
+                    parts.append(_negative_share(distance[k + 1, m + 1], one, other))
+        share: Floats = np.mean(parts, axis=0)
+        return share
 
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)

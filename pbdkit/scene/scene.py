@@ -29,7 +29,8 @@ class Scene:
     """An experiment on its lattice.
 
     `constants` are what the elementwise functions are called with; `frame` is None without one,
-    `cells` where no frame weighs them; `leading` are the leader groups; `warnings` are for the user.
+    `cells` where no frame weighs them; `leading` are the leader groups; `warnings` are for the
+    user.
     """
 
     experiment: Experiment

@@ -40,7 +40,10 @@ def weights_on(scene: Scene, slot: Slot, block: Block) -> tuple[Any, ...]:
     weights = scene.constants.weights[slot]
     if scene.cells is None:
         return weights
-    return (*weights[: -len(WHOLE_CELLS)], *scene.cells.beside(slot, block))
+    return (
+        *weights[: -len(WHOLE_CELLS)],
+        *scene.cells.beside(slot, block, scene.experiment.solver.precision),
+    )
 
 
 class SlotFollowers(Followers):

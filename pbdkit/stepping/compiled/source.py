@@ -7,51 +7,10 @@ are literals too: they decide what is to be computed at all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
-from pbdkit.interfaces import Cell, Slot
-from pbdkit.scene.cells import Side, Tiling
-from pbdkit.scene.constants import WHOLE_CELLS
+from pbdkit.interfaces import Cell
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import FOLLOWER
-
-INDENT = "    "
-_ZERO = {False: "float64(0.0)", True: "float32(0.0)"}
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What of the general step a scene uses; the kernel holds that and nothing else."""
-
-    contributions: int
-    fracture: bool
-    some_bonds_last: bool
-    some_missing: bool
-    reference: bool
-    relaxed: bool
-    memory: bool
-    frame: bool
-    frame_matrices: bool
-    lag: bool
-    limits: int
-    parallel: bool
-    single: bool
-    rule_parameters: tuple[str, ...]
-    fracture_parameters: dict[str, float]
-    weights: dict[Slot, tuple[float, ...]]
-    tiling: Tiling | None
-
-
-class Writer:
-    """Collects lines at a depth of indentation."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def add(self, depth: int, *lines: str) -> None:
-        """Adds lines at that depth."""
-        self.lines += [INDENT * depth + line for line in lines]
+from pbdkit.stepping.compiled.sweep import write_sweep
+from pbdkit.stepping.compiled.wanted import INDENT, Wanted, Writer, number
 
 
 def write_kernel(cell: Cell, neighbourhood: Neighbourhood, wanted: Wanted) -> str:
@@ -61,153 +20,17 @@ def write_kernel(cell: Cell, neighbourhood: Neighbourhood, wanted: Wanted) -> st
     for name, names in (("Rule", wanted.rule_parameters), ("Fracture", wanted.fracture_parameters)):
         out.add(0, f'{name} = namedtuple("{name}", {list(names)!r})')
     for s, slots in enumerate(neighbourhood.slots):
-        _write_sweep(out, s, slots, cell, neighbourhood, wanted)
+        write_sweep(out, s, slots, cell, neighbourhood, wanted)
     _write_run(out, len(neighbourhood.slots), wanted)
     return "\n".join(out.lines) + "\n"
-
-
-def _number(value: float, wanted: Wanted) -> str:
-    return f"float32({float(value)!r})" if wanted.single else repr(float(value))
-
-
-def _parameters(name: str, names: tuple[str, ...], source: str) -> str:
-    values = "".join(f"{source}[{n}], " for n in range(len(names)))
-    return f"{name}({values})"
-
-
-def _write_sweep(
-    out: Writer, s: int, slots: tuple[Slot, ...], cell: Cell, around: Neighbourhood, wanted: Wanted
-) -> None:
-    out.add(0, "", "", '@njit(error_model="numpy")')
-    out.add(0, f"def sweep_{s}(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(2, "share, step, i0, i1, j0, j1, rule, solver, first):")
-    out.add(1, f"p = {_parameters('Rule', wanted.rule_parameters, 'rule')}")
-    values = "".join(f"{_number(v, wanted)}, " for v in wanted.fracture_parameters.values())
-    out.add(1, f"q = Fracture({values})")
-    out.add(1, "for i in range(i0, i1):")
-    for c in "xy":
-        out.add(2, f"h{c} = u{c}[{s}, i, j0:j1]", f"o{c} = v{c}[{s}, i, j0:j1]")
-        for k, slot in enumerate(slots):
-            m, n = slot.cell
-            out.add(2, f"n{k}{c} = u{c}[{slot.target}, i + {m}, j0 + {n}:j1 + {n}]")
-    if wanted.tiling:
-        out.add(2, *_share_lines(s, slots, around, wanted.tiling))
-    if wanted.some_missing:
-        out.add(2, f"here = masks[{s}, i, j0:j1]")
-    if wanted.fracture:
-        out.add(2, f"gone = lost[{s}, i, j0:j1]")
-        if wanted.some_bonds_last:
-            out.add(2, f"lasts = spared[{s}, i, j0:j1]")
-        out.add(2, "changed = 0")
-    out.add(2, "for j in range(j1 - j0):")
-    out.add(3, "x, y = hx[j], hy[j]", "u = Vector(x, y)")
-    if wanted.fracture:
-        out.add(3, "bits = int64(gone[j])", "now = bits")
-    for k, slot in enumerate(slots):
-        out.add(3, *_slot_lines(k, slot, around, wanted))
-    _write_target(out, s, cell, len(slots), wanted)
-    if wanted.fracture:
-        _write_events(out, s, slots, around)
-
-
-def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> Iterator[str]:
-    """The contributions of one neighbour."""
-    r = "Vector({}, {})".format(*(_number(value, wanted) for value in slot.rest))
-    yield f"d = Vector(n{k}x[j] - x, n{k}y[j] - y)"
-    if wanted.fracture:
-        positive = any(plane.slot == slot for plane in around.planes)
-        # A bond is judged as its positive end sees it, so that both ends agree to the last bit.
-        seen, sign = ("d", 1.0) if positive else ("Vector(-d.x, -d.y)", -1.0)
-        rest = "Vector({}, {})".format(*(_number(sign * value, wanted) for value in slot.rest))
-        limits = "".join(f"limits[{slot.source}, {k}, {n}], " for n in range(wanted.limits))
-        yield f"breaks_now = 1 if breaks({seen}, {rest}, ({limits}), q) else 0"
-        if wanted.some_bonds_last:
-            yield f"breaks_now = breaks_now & ~(int64(lasts[j]) >> {k}) & 1"
-        yield f"is_lost = ((bits >> {k}) & 1) | breaks_now"
-        yield f"now = now | (is_lost << {k})"
-        yield f"f = fictitious(u, {r}, q)"
-        yield "d = Vector(f.x if is_lost else d.x, f.y if is_lost else d.y)"
-    weights = "".join(f"{_number(w, wanted)}, " for w in wanted.weights[slot])
-    if wanted.tiling:
-        own = wanted.weights[slot][: -len(WHOLE_CELLS)]
-        sides = [f"{_share_name(slot, side, around)}[j], " for side in wanted.tiling.beside[slot]]
-        weights = "".join([*(f"{_number(w, wanted)}, " for w in own), *sides])
-    names = ", ".join(f"c{n}" for n in range(wanted.contributions))
-    yield f"{names}, = gather(d, {r}, ({weights}), p)"
-    for n in range(wanted.contributions):
-        part = f"c{n}"
-        if wanted.some_missing:
-            part = f"(c{n} if (here[j] >> {k}) & 1 else {_ZERO[wanted.single]})"
-        yield f"t{n} = {part}" if k == 0 else f"t{n} = t{n} + {part}"
-
-
-def _share_name(slot: Slot, side: Side, around: Neighbourhood) -> str:
-    """The row of shares of the cells to one side of a slot."""
-    slots = around.slots[slot.source]
-    return f"s{side.kind}_{'own' if side.first is None else slots.index(side.first)}"
-
-
-def _share_lines(
-    s: int, slots: tuple[Slot, ...], around: Neighbourhood, tiling: Tiling
-) -> Iterator[str]:
-    """The rows of shares of all cells around the particles of a row, once each."""
-    sides = {
-        _share_name(slot, side, around): side for slot in slots for side in tiling.beside[slot]
-    }
-    for name, side in sides.items():
-        target, (m, n) = (side.first.target, side.first.cell) if side.first else (s, (0, 0))
-        yield f"{name} = share[{side.kind}, {target}, i + {m}, j0 + {n}:j1 + {n}]"
-
-
-def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -> None:
-    zero = _number(0.0, wanted)
-    if wanted.reference:
-        a, b = cell.vectors
-        for c, *numbers in zip("XY", cell.sites[s].at, a, b, strict=False):
-            at, along, across = map(float, numbers)
-            out.add(
-                3, f"{c} = {at!r} + ((i + first[0]) * {along!r} + (j + j0 + first[1]) * {across!r})"
-            )
-    X = "Vector(X, Y)" if wanted.reference else f"Vector({zero}, {zero})"
-    totals = "".join(f"t{n}, " for n in range(wanted.contributions))
-    out.add(3, f"mx, my = apply(({totals}), Here(u, {X}), p)")
-    for c in "xy":
-        move = f"solver[0] * m{c}" if wanted.relaxed else f"m{c}"
-        line = f"{c}2 = {c} + {move}"
-        out.add(3, line)
-        if wanted.memory:
-            out.add(3, f"{c}2 = {c}2 + solver[1] * ({c} - o{c}[j])")
-        if wanted.some_missing:
-            out.add(3, f"{c}2 = {c}2 if (here[j] >> {slots}) & 1 else {c}")
-        out.add(3, f"o{c}[j] = {c}2")
-
-
-def _write_events(out: Writer, s: int, slots: tuple[Slot, ...], around: Neighbourhood) -> None:
-    """Keeps the lost bonds of the row, and notes the step of those that broke just now: rare."""
-    out.add(3, "changed = changed | (now ^ bits)", "gone[j] = now")
-    out.add(2, "if changed:")
-    out.add(3, "for j in range(j0, j1):", f"{INDENT}now = int64(lost[{s}, i, j])")
-    for k, slot in enumerate(slots):
-        for n, plane in enumerate(around.planes):
-            if plane.slot == slot:
-                out.add(4, f"if (now >> {k}) & 1 and broken[{n}, i, j] < 0:")
-                out.add(5, f"broken[{n}, i, j] = step")
-            if plane.opposite == slot:
-                m, k2 = slot.cell
-                there = f"i + {m}, j + {k2}"
-                out.add(4, f"if (now >> {k}) & 1 and broken[{n}, {there}] < 0:")
-                out.add(5, f"if kind[{slot.target}, {there}] != {FOLLOWER}:")
-                out.add(6, f"broken[{n}, {there}] = step")
 
 
 def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
     flags = "parallel=True, " if wanted.parallel else ""
     out.add(0, "", "", f'@njit({flags}error_model="numpy", nogil=True, cache=True)')
     out.add(0, "def run(ux, uy, vx, vy, masks, lost, spared, kind, broken, limits,")
-    out.add(
-        2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y, kept_x, kept_y,"
-    )
-    out.add(2, "points, entries, bodies, weights, rule, solver, first):")
+    out.add(2, "share, step, count, blocks, box, growth, chunks, led, led_x, led_y,")
+    out.add(2, "kept_x, kept_y, points, entries, bodies, weights, rule, solver, first):")
     out.add(1, "for _ in range(count):", f"{INDENT}step += 1")
     body = Writer()
     body.add(
@@ -220,6 +43,21 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
         "for k in range(4):",
         f"{INDENT}box[k] += growth[k]",
     )
+    _write_sweeps(body, sublattices, wanted)
+    body.add(
+        0,
+        "for e in range(led.size):",
+        f"{INDENT}fvx[led[e]], fvy[led[e]] = led_x[e], led_y[e]",
+        "for e in range(led.size):",
+        f"{INDENT}fux[led[e]], fuy[led[e]] = kept_x[e], kept_y[e]",
+    )
+    if wanted.frame:
+        _write_frame(body, wanted)
+    body.add(0, "ux, uy, vx, vy = vx, vy, ux, uy")
+    out.add(2, *body.lines)
+
+
+def _write_sweeps(body: Writer, sublattices: int, wanted: Wanted) -> None:
     arguments = "ux, uy, vx, vy, masks, lost, spared, kind, broken, limits, share, step"
     for s in range(sublattices):
         body.add(
@@ -235,22 +73,11 @@ def _write_run(out: Writer, sublattices: int, wanted: Wanted) -> None:
             body.add(2, f"sweep_{s}({arguments}, a, b, {tail}")
         else:
             body.add(1, f"sweep_{s}({arguments}, i0, i1, {tail}")
-    body.add(
-        0,
-        "for e in range(led.size):",
-        f"{INDENT}fvx[led[e]], fvy[led[e]] = led_x[e], led_y[e]",
-        "for e in range(led.size):",
-        f"{INDENT}fux[led[e]], fuy[led[e]] = kept_x[e], kept_y[e]",
-    )
-    if wanted.frame:
-        _write_frame(body, wanted)
-    body.add(0, "ux, uy, vx, vy = vx, vy, ux, uy")
-    out.add(2, *body.lines)
 
 
 def _write_frame(body: Writer, wanted: Wanted) -> None:
     source = "fu" if wanted.lag else "fv"
-    zero = _number(0.0, wanted)
+    zero = number(0.0, wanted)
     body.add(0, "for f in range(points.size):", f"{INDENT}x, y = {zero}, {zero}")
     body.add(1, "for e in range(entries[f], entries[f + 1]):")
     body.add(2, f"bx, by = {source}x[bodies[e]], {source}y[bodies[e]]")

@@ -14,7 +14,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.bits import bits_for, lost_bits, presence_bits, spared_bits
 from pbdkit.stepping.compiled.kernels import load_kernel
 from pbdkit.stepping.compiled.reach import Reach
-from pbdkit.stepping.compiled.source import Wanted, write_kernel
+from pbdkit.stepping.compiled.source import write_kernel
+from pbdkit.stepping.compiled.wanted import Wanted
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
@@ -79,10 +80,10 @@ class CompiledStepper(Engine):
             numba.set_num_threads(self.threads)
         self._run(
             u[0], u[1], new[0], new[1], self._masks, self._lost, self._spared,
-            self._scene.raster.kind, broken, c["limits"], c["share"], state.step, count, self._reach.blocks,
-            self._reach.box, self._reach.growth, 4 * self.threads, places, values[0], values[1],
-            kept[0], kept[1], c["points"], c["entries"], c["bodies"], c["weights"], c["rule"],
-            c["solver"], c["first"],
+            self._scene.raster.kind, broken, c["limits"], c["share"], state.step, count,
+            self._reach.blocks, self._reach.box, self._reach.growth, 4 * self.threads, places,
+            values[0], values[1], kept[0], kept[1], c["points"], c["entries"], c["bodies"],
+            c["weights"], c["rule"], c["solver"], c["first"],
         )  # fmt: skip
 
     def _compile(self) -> None:

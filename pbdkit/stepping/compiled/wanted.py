@@ -1,0 +1,49 @@
+"""What a scene's kernel has to hold, and the lines it is written in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pbdkit.interfaces import Slot
+from pbdkit.scene.cells import Tiling
+
+INDENT = "    "
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What of the general step a scene uses; the kernel holds that and nothing else."""
+
+    contributions: int
+    fracture: bool
+    some_bonds_last: bool
+    some_missing: bool
+    reference: bool
+    relaxed: bool
+    memory: bool
+    frame: bool
+    frame_matrices: bool
+    lag: bool
+    limits: int
+    parallel: bool
+    single: bool
+    rule_parameters: tuple[str, ...]
+    fracture_parameters: dict[str, float]
+    weights: dict[Slot, tuple[float, ...]]
+    tiling: Tiling | None
+
+
+class Writer:
+    """Collects lines at a depth of indentation."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def add(self, depth: int, *lines: str) -> None:
+        """Adds lines at that depth."""
+        self.lines += [INDENT * depth + line for line in lines]
+
+
+def number(value: float, wanted: Wanted) -> str:
+    """A literal in the scene's precision."""
+    return f"float32({float(value)!r})" if wanted.single else repr(float(value))
