@@ -12,6 +12,8 @@ from pbdkit.testing.property import NotAskedError, Property, PropertyError
 from pbdkit.testing.report import Outcome, Report
 from pbdkit.testing.subject import Subject
 
+NOT_JUDGED = "not judged while"
+
 
 class Examination:
     """One component and how its properties come out; each is judged once, when first asked for."""
@@ -39,8 +41,12 @@ class Examination:
 
     def _judge(self, asked: Property) -> Outcome:
         for name in asked.needs:
-            if name in self._by_name and self.outcome(name).state == "failed":
-                return Outcome(asked.name, "skipped", f"not judged while {name} fails")
+            if name in self._by_name:
+                needed = self.outcome(name)
+                if needed.state == "failed":
+                    return Outcome(asked.name, "skipped", f"{NOT_JUDGED} {name} fails")
+                if needed.reason.startswith(NOT_JUDGED):
+                    return Outcome(asked.name, "skipped", needed.reason)
         try:
             asked.check(self._subject)
         except NotAskedError as reason:

@@ -4,7 +4,7 @@ can be compared and the arrays looked at afterwards."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,13 @@ class Question:
         with np.errstate(all="ignore"):
             found = self.ask({name: np.array(value) for name, value in self.inputs.items()})
         return {name: np.array(value) for name, value in found.items()}
+
+    def larger(self) -> Question:
+        """The same with all that is no index ten times as large."""
+        return replace(
+            self,
+            inputs={n: 10.0 * v if v.dtype.kind == "f" else v for n, v in self.inputs.items()},
+        )
 
 
 def questions_of(component: Component, scene: Scene, seed: int) -> list[Question]:
@@ -112,7 +119,10 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
         found = gathered(rule, scene, arrays)
         return {f"{n} of slot {k}": c for k, parts in enumerate(found) for n, c in enumerate(parts)}
 
-    totals = summed(gathered(rule, scene, {k: v.copy() for k, v in d.items()}))
+    contributions = gathered(rule, scene, {k: v.copy() for k, v in d.items()})
+    if len({len(parts) for parts in contributions}) > 1:
+        return [Question("gather", d, gather)]  # they cannot be summed, which is found elsewhere
+    totals = summed(contributions)
     named = {f"total[{n}]": np.broadcast_to(t, SHAPE).copy() for n, t in enumerate(totals)}
 
     def apply(arrays: Arrays) -> Arrays:

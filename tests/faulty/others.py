@@ -134,12 +134,12 @@ class SaysItAnchors(Following):
 
 
 class WritesSites(Following):
-    """Counts the sites anew, where they lie."""
+    """Counts the sites from 1, where they lie."""
 
     type: Literal["writes-sites"] = "writes-sites"
 
     def follow(self, frame):
-        frame.site[...] -= np.array(frame.low, frame.site.dtype)
+        frame.site[...] += 1
         return super().follow(frame)
 
 
@@ -177,7 +177,7 @@ class Directed(Strain):
     type: Literal["directed"] = "directed"
 
     def constants(self, slot):
-        return (4.0 + slot.rest.x,)
+        return (1e3 + slot.rest.x,)
 
 
 class DeniesBreaking(Strain):

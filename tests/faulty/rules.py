@@ -55,7 +55,7 @@ class SumsInOrder(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (1e8 + r.x) * d.x * 1e8, d.y, 1.0
+        return 1e8 * r.x + d.x, d.y, 1.0
 
 
 class Doubles(Sound):

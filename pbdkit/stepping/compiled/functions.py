@@ -104,7 +104,7 @@ def _names(function: Function) -> dict[str, Any]:
     while modules:
         module = modules.pop()
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
-            for name in names & set(vars(module)):
+            for name in names & set(dir(module)):  # pbdkit's own are loaded when first used
                 member = getattr(module, name)
                 found[f"{module.__name__}.{name}"] = member
                 modules += [member] if isinstance(member, types.ModuleType) else []

@@ -62,6 +62,7 @@ def remembers_nothing(subject: Subject) -> None:
         before = remembered(subject.component)
         answers = [question.answer() for _ in range(3)]
         other.answer()
+        question.larger().answer()
         later = question.answer()
         kept = changed(before, remembered(subject.component))
         steady = not differing(answers[1], answers[2])
@@ -83,7 +84,7 @@ def answers_the_same(subject: Subject) -> None:
             )
 
 
-@asked_of(*ALL, needs=REPEATABLE)
+@asked_of(*ALL, needs=(*REPEATABLE, "returns-a-value-a-particle"))
 def is_finite(subject: Subject) -> None:
     """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
     one NaN spreads over the body within a few steps."""

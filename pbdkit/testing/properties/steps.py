@@ -25,19 +25,22 @@ from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.stepper import Stepper
 from pbdkit.testing.properties.answers import REPEATABLE, differing
+from pbdkit.testing.properties.elementwise import ORDERLY
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
 from pbdkit.testing.scenes import place_of
-from pbdkit.testing.states import advanced, displacements, spacing, state_with
+from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
 from pbdkit.testing.subject import Subject, scenes_with
 
 ALL = tuple(INTERFACES.values())
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 ROUNDING = 1e-12
-"""As a share of the spacing; a few steps are some hundred roundings of 1e-16."""
+"""As a share of the largest displacement; a few steps are some hundred roundings of 1e-16."""
 STEPS = 4
+SOUND = (*ORDERLY, "takes-particles-in-any-order")
+"""What must hold before it means something to step with it."""
 
 
-@asked_of(*STEPPED, needs=REPEATABLE)
+@asked_of(*STEPPED, needs=(*SOUND, "finds-the-same-anew", "is-seen-alike-from-both-ends"))
 def rests(subject: Subject) -> None:
     """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
     by 1e-17 has moved."""
@@ -64,7 +67,7 @@ def _warned(scene: Scene) -> bool:
     return bool(scene.experiment.fracture.check(scene.neighbourhood.shells()))
 
 
-@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=REPEATABLE)
+@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=SOUND)
 def follows_translations(subject: Subject) -> None:
     """A body that is translated as a whole moves as before, translated, to rounding; rules that
     declare `uses_reference` and frames that say they `anchors` it need not."""
@@ -76,22 +79,22 @@ def follows_translations(subject: Subject) -> None:
     for scene in subject.scenes:
         u, size = displacements(scene, 1), spacing(scene)
         shift = size * np.array([0.75, -1.5])
-        one, other = advanced(scene, u + shift, STEPS)[-1], advanced(scene, u, STEPS)[-1] + shift
-        most = max(most, float(np.abs(one - other).max()) / size)
+        moved, there = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
+        most = max(most, _apart(there[-1], moved[-1], moved))
         if most > ROUNDING and not anchors:
             remedy = {
                 FollowerRule: "use differences `d`, not `here.u`, or declare `uses_reference`",
                 FramePolicy: "let the weights of each point sum to 1, or answer `anchors`",
             }.get(next(i for i in STEPPED if isinstance(component, i)), "")
             raise PropertyError(
-                f"a translated body moves otherwise, by {most:.3g} of the spacing, "
+                f"a translated body moves otherwise, by {most:.3g} of its displacement, "
                 f"{place_of(scene.experiment)}" + (f": {remedy}" if remedy else "")
             )
     if anchors and most <= ROUNDING:
         raise PropertyError("it says that it `anchors` the body, and follows every translation")
 
 
-@asked_of(FollowerRule, FramePolicy, needs=REPEATABLE)
+@asked_of(FollowerRule, FramePolicy, needs=SOUND)
 def superposes(subject: Subject) -> None:
     """Where a rule declares `linear`, and with every frame, the steps from two displacements
     together are the steps from each, added, to rounding."""
@@ -100,19 +103,23 @@ def superposes(subject: Subject) -> None:
         raise NotAskedError("it does not declare `linear`")
     for scene in subject.scenes:
         one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
-        both, a, b, none = (
-            advanced(scene, u, STEPS)[-1] for u in (one + other, one, other, 0.0 * one)
-        )
-        off = float(np.abs((both - none) - (a - none) - (b - none)).max()) / spacing(scene)
+        both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
+        off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
         if not off <= ROUNDING:
             raise PropertyError(
-                f"displacements do not superpose, by {off:.3g} of the spacing, "
+                f"displacements do not superpose, by {off:.3g} of the largest, "
                 f"{place_of(scene.experiment)}: "
                 + ("do not declare `linear`" if isinstance(component, FollowerRule) else "")
             )
 
 
-@asked_of(*ALL, needs=(*REPEATABLE, "survives-json"))
+def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
+    """How far two states are apart, as a share of the largest displacement there was: what grows
+    takes its roundings with it."""
+    return float(np.abs(one - other).max() / max(1e-300, np.abs(all_of_them).max()))
+
+
+@asked_of(*ALL, needs=(*SOUND, "survives-json"))
 def continues_where_it_stopped(subject: Subject) -> None:
     """A run that is saved, read by a component made anew from its JSON and continued is the same to
     the last bit as one that was never interrupted."""
@@ -143,7 +150,7 @@ def _compare_measured(
         raise PropertyError(f"`{names[0]}` of a run continued at step {STEPS} is another one")
 
 
-@asked_of(*STEPPED, needs=REPEATABLE)
+@asked_of(*STEPPED, needs=(*SOUND, "is-local", "continues-where-it-stopped"))
 def is_the_same_compiled(subject: Subject) -> None:
     """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
     compile is stepped by numpy, and says so."""
