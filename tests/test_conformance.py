@@ -1,12 +1,19 @@
 """The conformance suite: the built-in components pass it, and it finds and names every fault."""
 
 import json
+import re
+import subprocess
+import sys
+from typing import Literal
 
 import pytest
 from faulty import others, rules
+from faulty.kagome import Kagome, OnKagome
+from pydantic import Field
 
 import pbdkit
 from pbdkit.components import pbdkit_components
+from pbdkit.components.rules import MixedCoordinate
 from pbdkit.interfaces import INTERFACES
 from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of
 
@@ -78,7 +85,9 @@ def test_the_faulty_ones_are_sound_but_for_their_fault(component):
     assert report.holds, str(report)
 
 
-@pytest.mark.parametrize(("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", ""))
+@pytest.mark.parametrize(
+    ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
+)
 def test_every_fault_is_found_and_named(faulty, name, words):
     report = examine(made(faulty))
     assert [outcome.property for outcome in report.failed] == [name], str(report)
@@ -108,7 +117,9 @@ def test_nothing_is_excused():
 
 def test_a_report_tells_what_ran_and_why_not():
     text = str(examine(rules.Sound()))
-    assert text.startswith("FollowerRule sound: 19 properties ran, 0 failed; 1 skipped: it does not")
+    assert text.startswith(
+        "FollowerRule sound: 19 properties ran, 0 failed; 1 skipped: it does not"
+    )
     assert "  held     rests" in text
 
 
@@ -117,15 +128,117 @@ def test_after_a_fault_nothing_is_judged_that_means_nothing():
     assert {o.reason for o in report.skipped} == {"not judged while changes-no-input fails"}
 
 
+def test_pbdkits_own_words_compile():
+    """A function that says `pbdkit.where` is compiled as one that imports it."""
+    report = examine(others.Strain())
+    assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
+
+
 def test_examples_come_from_defaults_and_from_fields():
-    assert [e.K for e in examples_of(pbdkit_components()[11])] == [-0.004, -0.004]
+    made = examples_of(MixedCoordinate)
+    assert [(e.K, e.axis) for e in made] == [(-0.004, "x"), (-0.004, "y")]
 
 
 @pytest.mark.parametrize(
     ("field", "words"),
     [
-        ("pbdkit.FollowerRule.__doc__", "x"),
+        (Field(description="k"), "Needy.k has neither default nor example: write `k: ... = Field("),
+        (Field(1.0, examples=["a"]), "Needy refuses its examples {'k': 'a'}: k: Input should be"),
     ],
 )
-def test_placeholder(field, words):
-    assert field
+def test_a_class_without_usable_examples_is_told(field, words):
+    annotations = {"type": Literal["needy"], "k": float}
+    needy = type(
+        "Needy", (rules.Sound,), {"type": "needy", "k": field, "__annotations__": annotations}
+    )
+    with pytest.raises(pbdkit.PluginError, match=re.escape(words)):
+        examples_of(needy)
+    (report,) = examine_all([needy])
+    assert not report.holds
+    assert words in report.failed[0].reason
+
+
+def test_what_goes_with_its_own_lattice_alone_is_tried_on_that():
+    reports = list(examine_all([Kagome, OnKagome]))
+    assert [report.holds for report in reports] == [True, True], "\n".join(map(str, reports))
+    assert "takes-part" in [outcome.property for outcome in examine(OnKagome()).failed]
+    assert examine(OnKagome(), lattice=Kagome()).holds
+
+
+def test_without_a_component_there_is_nothing_to_conform():
+    with pytest.raises(ValueError, match="given no component"):
+        conformance()
+
+
+ONE_LINE = """
+from my_rules import Mine
+from pbdkit.testing import conformance
+
+test_conformance = conformance(Mine())
+"""
+SOURCE = """
+from typing import Literal
+import pbdkit
+
+class Mine(pbdkit.FollowerRule):
+    "Half of the mean displacement."
+    type: Literal["mine"] = "mine"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return SHARE * total[0] / total[2], total[1] / total[2]
+
+@pbdkit.hookimpl
+def pbdkit_components():
+    return [Mine]
+"""
+
+
+@pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
+def test_one_line_is_enough_for_pytest(tmp_path, share, code):
+    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "1e-9 + ")
+    (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
+    (tmp_path / "test_mine.py").write_text(ONE_LINE)
+    call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code, done.stdout
+    assert f"FollowerRule mine: 19 properties ran, {code} failed; 1 skipped" in done.stdout
+    assert "does not declare `linear`" in done.stdout
+    if code:
+        assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
+
+
+def test_plugins_check_tries_a_distribution(install, call):
+    install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
+    install("pbdkit-bad", SOURCE.replace("SHARE *", "1e-9 +").replace("mine", "bad"))
+    good = call("plugins", "check", "pbdkit_good")
+    assert good.code == 0
+    assert "FollowerRule mine: 19 properties ran, 0 failed; 1 skipped: it does not" in good.out
+    assert "all properties hold for 1 example of its components" in good.out
+    both = call("plugins", "check")
+    assert both.code == 3
+    assert "failed  rests: a body at rest moves by 1e-09" in both.out
+    assert "mine: 19 properties ran, 0 failed" in both.out
+
+
+def test_plugins_check_as_json_and_in_full(install, call):
+    install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
+    answer = json.loads(call("plugins", "check", "pbdkit-good", "--json").out)
+    assert answer["holds"] is True
+    assert {o["state"] for o in answer["reports"][0]["outcomes"]} == {"held", "skipped"}
+    assert "  held     rests" in call("plugins", "check", "pbdkit-good", "--verbose").out
+
+
+def test_plugins_check_tells_what_cannot_be_tried(install, call):
+    nothing = call("plugins", "check")
+    assert (nothing.code, "no plugin is installed" in nothing.err) == (3, True)
+    unknown = call("plugins", "check", "pbdkot")
+    assert (unknown.code, "did you mean 'pbdkit'?" in unknown.err) == (3, True)
+    install("pbdkit-torn", "import there_is_no_such_module")
+    torn = call("plugins", "check", "pbdkit-torn")
+    assert (torn.code, "pbdkit-torn 1.0 is broken: " in torn.err) == (3, True)
+    assert "hold" not in torn.out

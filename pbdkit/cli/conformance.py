@@ -46,7 +46,8 @@ def check(
     if as_json:
         click.echo(json.dumps({"holds": holds, "reports": rows}))
     elif holds:
-        click.echo(f"all properties hold for {len(rows)} components")
+        tried = "1 example" if len(rows) == 1 else f"{len(rows)} examples"
+        click.echo(f"all properties hold for {tried} of its components")
     context.exit(0 if holds else FAILED)
 
 
