@@ -11,6 +11,7 @@ ORDER = [
     "interfaces",
     "registry",
     "components",
+    "skeleton",
     "experiment",
     "scene",
     "stepping",

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -240,7 +242,10 @@ def test_plugins_list_has_a_row_a_plugin_and_a_row_a_component(install: Any, cal
     rows = json.loads(call("plugins", "list", "--json").out)
     assert {*rows[-1]} == {"interface", "type", "distribution", "version", "state", "reason"}
     assert {row["distribution"] for row in rows} == {"pbdkit", "pbdkit-sick"}
-    assert (rows[-1]["state"], rows[-1]["reason"]) == ("broken", "ImportError: sick")
+    assert (rows[-1]["state"], rows[-1]["reason"]) == (
+        "broken",
+        "ImportError: sick (pbdkit_sick.py, line 1)",
+    )
 
 
 def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> None:
@@ -248,3 +253,52 @@ def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> Non
     assert call("run", "a.yaml", "--set", "steps=5", "-o", "a.nc").code == 0
     assert call("plot", "a.nc", "--color", "pe1").code == 0
     assert left() == ["a.nc", "a.png", "a.yaml"]
+
+
+def completed(*words: str) -> list[str]:
+    """What the tabulator key offers after these words in bash."""
+    asked = {"_PBDKIT_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(["pbdkit", *words])}
+    environment = os.environ | asked | {"COMP_CWORD": str(len(words))}
+    command = [sys.executable, "-m", "pbdkit"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.splitlines()
+
+
+COMPLETED = {
+    "commands": (["plu"], ["plain,plugins"]),
+    "commands in a group": (["plugins", "n"], ["plain,new"]),
+    "shipped experiments": (["run", "paper/f2-"], ["plain,paper/f2-cusp", "plain,paper/f2-early", "plain,paper/f2-second-fracture"]),
+    "files are the shell's": (["run", "mine"], ["file,mine"]),
+    "options": (["run", "e.json", "--no"], ["plain,--no-plugins"]),
+    "choices": (["plugins", "new", "x", "--interface", "Fr"], ["plain,FramePolicy", "plain,FractureModel"]),
+    "nothing": (["nonsense", "x"], [""]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "offered"), COMPLETED.values(), ids=COMPLETED)
+def test_a_shell_completes(words: list[str], offered: list[str]) -> None:
+    assert completed(*words) == offered
+
+
+def test_the_shells_of_the_documentation_are_known() -> None:
+    text = (Path(pbdkit.__file__).parent.parent / "docs" / "experiments.md").read_text()
+    shells = re.findall(r"_PBDKIT_COMPLETE=(\w+) pbdkit", text)
+    assert shells == ["bash_source", "zsh_source", "fish_source"]
+    for shell in shells:
+        environment = os.environ | {"_PBDKIT_COMPLETE": shell}
+        command = [sys.executable, "-m", "pbdkit"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+        assert (done.returncode, "_pbdkit_completion" in done.stdout) == (0, True)
+
+
+def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def leave() -> None:
+        raise SystemExit(0)
+
+    monkeypatch.setattr("pbdkit.experiment.shipped.shipped_names", leave)
+    result = call("experiments")
+    assert (result.code, "a bug in pbdkit, please report it: SystemExit: 0" in result.err) == (
+        1,
+        True,
+    )

@@ -1,5 +1,4 @@
 """Plugins: whatever one of them does, the others load, and what is wrong is said."""
-# ruff: noqa: E501  (a row of a table is a line)
 
 from __future__ import annotations
 
@@ -9,66 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from plugin_sources import BROKEN, hook, rule
 
 import pbdkit
 from pbdkit.registry.registry import Registry
 
 Install = Callable[..., None]
-
-
-def rule(kind: str, extra: str = "") -> str:
-    """The source of a plugin with the rule of that type: mean displacement, times `strength`."""
-    return f'''
-from typing import Literal
-import pbdkit
-
-class Rule(pbdkit.FollowerRule):
-    type: Literal["{kind}"] = "{kind}"
-    strength: float = 1.0
-
-    @staticmethod
-    def gather(d, r, w, p):
-        return d.x, d.y, 1.0
-
-    @staticmethod
-    def apply(total, here, p):
-        dx, dy, n = total
-        return p.strength * dx / n, p.strength * dy / n
-
-@pbdkit.hookimpl
-def pbdkit_components():
-    return [Rule]
-{extra}'''
-
-
-def hook(body: str) -> str:
-    return f"import pbdkit\n@pbdkit.hookimpl\ndef pbdkit_components():\n    {body}\n"
-
-
-TYPELESS = hook("return [Rule]") + (
-    "class Rule(pbdkit.FollowerRule):\n"
-    "    @staticmethod\n    def gather(d, r, w, p): return (1.0,)\n"
-    "    @staticmethod\n    def apply(total, here, p): return 0.0, 0.0\n"
-)
-ABSTRACT = hook("return [Rule]") + (
-    "class Rule(pbdkit.FollowerRule):\n    type: str = 'half'\n"
-    "    @staticmethod\n    def gather(d, r, w, p): return (1.0,)\n"
-)
-BROKEN = {
-    "import error": ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
-    "syntax error": ("def (", "SyntaxError: invalid syntax (pbdkit_broken.py, line 1)"),
-    "exit": ("raise SystemExit(3)", "SystemExit: 3"),
-    "any error": ("1 / 0", "ZeroDivisionError: division by zero"),
-    "no hook": ("", "TypeError: its module implements no hook `pbdkit_components`"),
-    "misspelt hook": (hook("return []").replace("components", "component"), "PluginValidationError: "),
-    "hook with an argument": (hook("return []").replace("()", "(x)", 1), "PluginValidationError: "),
-    "error in the hook": (hook("return {}[1]"), "KeyError: 1"),
-    "no list": (hook("return 3"), "TypeError: "),
-    "a class for a list": (hook("return pbdkit.FollowerRule"), "TypeError: "),
-    "no component": (hook("return [int]"), "TypeError: <class 'int'> is no class of one of pbdkit's interfaces"),
-    "no type": (TYPELESS, "TypeError: Rule does not name its type: add `type: Literal["),
-    "abstract": (ABSTRACT, "TypeError: Rule lacks apply"),
-}  # fmt: skip
 
 
 @pytest.mark.parametrize(("source", "reason"), BROKEN.values(), ids=BROKEN)

@@ -18,6 +18,7 @@ from pbdkit.analysis.linearising import Response, respond, slot_step
 from pbdkit.analysis.matrices import Entries
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
@@ -136,7 +137,7 @@ class _Assembly:
             own = place if self._scene.raster.shape[0] == 1 else place[place // cells == s]
             own = own[self._has_neighbours(s, own)]
             if len(own):
-                self._add(own, respond(self._scene, self._state, s, own))
+                self._add(own, self._response(s, own))
                 if memory:
                     self._now.add_scaled_identity(self._unknown[own], memory)
                     self._before.add_scaled_identity(self._unknown[own], -memory)
@@ -148,6 +149,17 @@ class _Assembly:
             self._led,
             self._source.ravel(),
         )
+
+    def _response(self, sublattice: int, place: Indices) -> Response:
+        """The rule's answer; PluginError where its functions fail, or are not finite at rest."""
+        with blaming(self._scene.experiment.rule, "when linearised"):
+            response = respond(self._scene, self._state, sublattice, place)
+            values = [response.move, response.own, *response.neighbours.values()]
+            if response.move.shape[-1] != 2:
+                raise ValueError(f"its move has {response.move.shape[-1]} components, not 2")
+            if not self._state.u.any() and not all(np.isfinite(v).all() for v in values):
+                raise ValueError("its move at rest, or a derivative of it, is not finite")
+        return response
 
     def _has_neighbours(self, sublattice: int, place: Indices) -> NDArray[np.bool_]:
         """Particles with no neighbour stay, whatever the rule makes of nothing."""

@@ -52,7 +52,7 @@ def wave_bound(scene: Scene) -> Bound | None:
         return None
     try:
         eigenvalues = _eigenvalues(_symbols(scene)).ravel()
-    except Exception:  # a prediction never stops a run; the run itself names the rule at fault
+    except (Exception, SystemExit):  # a prediction stops no run; the run names the rule at fault
         return None
     if not np.isfinite(eigenvalues).all():
         return None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from importlib import import_module
 from typing import Any
 
 import click
+
+from pbdkit.cli.options import with_no_plugins
 
 COMMANDS = {
     "run": "run",
@@ -20,6 +23,8 @@ COMMANDS = {
     "schema": "schema",
 }
 """Every command with the module of pbdkit.cli in which it stands."""
+COMPLETING = "_PBDKIT_COMPLETE"
+"""The variable by which a shell asks how a line goes on."""
 
 
 class Commands(click.Group):
@@ -32,13 +37,16 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """The command of that name, or a usage error with the nearest right one."""
         if name not in COMMANDS:
+            if ctx.resilient_parsing:  # a shell asks how to go on
+                return None
             from pbdkit.interfaces.naming import did_you_mean
 
             ctx.fail(f"there is no command '{name}'{did_you_mean(name, COMMANDS)}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
-        return command
+        return with_no_plugins(command)
 
 
+@with_no_plugins
 @click.group(
     cls=Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -68,14 +76,16 @@ def main(arguments: list[str] | None = None) -> None:
         code = _failed("interrupted", 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
+        if isinstance(error, SystemExit) and COMPLETING in os.environ:
+            raise
         if debug:
             traceback.print_exc()
         code = _report(error)
     sys.exit(code or 0)
 
 
-def _report(error: Exception) -> int:
+def _report(error: BaseException) -> int:
     from pbdkit import errors
 
     codes = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -37,7 +36,7 @@ def check(
     for plugin in _asked_for(distributions):
         if plugin.state not in ("ok", "conflict"):
             holds = False
-            click.echo(f"{_label(plugin)} is {plugin.state}: {plugin.reason}", err=True)
+            click.echo(f"{plugin} is {plugin.state}: {plugin.reason}", err=True)
         for report in examine_all(plugin.components):
             holds = holds and report.holds
             rows.append({"distribution": plugin.distribution} | asdict(report))
@@ -58,6 +57,7 @@ def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
     """
     from pbdkit.errors import PluginError
     from pbdkit.interfaces.naming import did_you_mean
+    from pbdkit.registry.discovery import canonical
     from pbdkit.registry.registry import Registry
 
     plugins = Registry().plugins
@@ -69,7 +69,7 @@ def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
         return plugins[1:]
     found = []
     for name in distributions:
-        own = [p for p in plugins if _canonical(p.distribution) == _canonical(name)]
+        own = [p for p in plugins if canonical(p.distribution) == canonical(name)]
         if not own:
             hint = did_you_mean(name, [p.distribution for p in plugins])
             raise PluginError(f"'{name}' is not installed, or is no plugin{hint}")
@@ -83,11 +83,3 @@ def _told(report: Report, verbose: bool) -> str:
     faults = [f"  failed  {outcome.property}: {outcome.reason}" for outcome in report.failed]
     return "\n".join([report.summary(), *faults])
 
-
-def _label(plugin: Plugin) -> str:
-    return f"{plugin.distribution} {plugin.version}".strip()
-
-
-def _canonical(name: str) -> str:
-    """The name of a distribution in the one spelling that installers compare."""
-    return re.sub(r"[-_.]+", "-", name).lower()

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Union
 
-from pydantic import BeforeValidator, ValidationInfo
+from pydantic import BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.interfaces import Component
+from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.registry.blame import blame
 from pbdkit.registry.registry import Registry
 
 Finder = Callable[[str], type[Component]]
@@ -24,7 +25,14 @@ def open_part(interface: type[Component]) -> BeforeValidator:
 
     def build(value: Any, info: ValidationInfo) -> Any:
         registry: Registry = (info.context or {}).get("registry") or Registry()
-        return _build(value, interface, lambda name: registry.find(interface, name), info)
+        part = _build(value, interface, lambda name: registry.find(interface, name), info)
+        try:
+            part.model_dump_json()
+        except (Exception, SystemExit) as error:
+            raise _blame(
+                type(part), "when written as JSON, as datasets keep it", error, info
+            ) from error
+        return part
 
     return BeforeValidator(build)
 
@@ -62,7 +70,20 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     except PluginError as error:
         raise PluginError(str(error), (info.field_name or "", "type")) from None
     parameters = {k: v for k, v in value.items() if k != "type"}
-    return part.model_validate(parameters, context=info.context)
+    try:
+        return part.model_validate(parameters, context=info.context)
+    except (ValidationError, PbdkitError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        if not issubclass(part, tuple(INTERFACES.values())):
+            raise
+        raise _blame(part, "when given its parameters", error, info) from error
+
+
+def _blame(
+    part: type[Component], when: str, error: BaseException, info: ValidationInfo
+) -> PluginError:
+    return PluginError(str(blame(part, when, error)), (info.field_name or "",))
 
 
 def fault(text: str, **where: Any) -> PydanticCustomError:

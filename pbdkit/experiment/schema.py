@@ -17,7 +17,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
     """What an experiment file may hold; without `installed`, of the built-in components alone."""
     offered = {
-        field: list(registry.components(interface, installed=installed).values())
+        field: registry.spellings(interface, installed=installed)
         for field, interface in INTERFACES.items()
     }
     models: list[type[BaseModel]] = [
@@ -29,6 +29,9 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
     top = definitions.pop(names[Experiment, "validation"]["$ref"].split("/")[-1])
     for field, components in offered.items():
         choice = {"oneOf": [dict(names[c, "validation"]) for c in components]}
+        for component, spellings in components.items():
+            described = names[component, "validation"]["$ref"].rsplit("/", 1)[-1]
+            _close(definitions[described]["properties"]["type"], spellings)
         part = top["properties"][field]
         if field == "diagnostics":
             part["items"] = choice
@@ -42,6 +45,13 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
         **{k: v for k, v in top.items() if k != "title"},
         "$defs": {name: definitions[name] for name in sorted(used)},
     }
+
+
+def _close(kind: dict[str, Any], names: list[str]) -> None:
+    """`type` is one of these names."""
+    kind.pop("const", None)
+    kind |= {"const": names[0]} if len(names) == 1 else {"enum": names}
+    kind["default"] = names[0]
 
 
 def _reachable(schema: Any, definitions: dict[str, Any]) -> set[str]:

@@ -7,24 +7,36 @@ from contextlib import contextmanager
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.interfaces import Component
-from pbdkit.registry.registry import interface_of
+from pbdkit.registry.checking import interface_of
+from pbdkit.registry.discovery import BUILTIN, installed_points
+from pbdkit.registry.wording import worded
 
 
-def blame(component: Component, when: str, error: Exception) -> PluginError:
+def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
     """The error to raise where a component's own code has failed."""
-    what = f"{interface_of(type(component)).__name__} '{component.type}' failed {when}"
-    return PluginError(f"{what}: {type(error).__name__}: {error}")
+    package = component.__module__.split(".")[0]
+    whose = f"{interface_of(component).__name__} '{component.type_name()}'{_origin(package)}"
+    return PluginError(f"{whose} failed {when}: {worded(error, package)}")
 
 
 @contextmanager
 def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
-    """What a component's own code raises becomes a PluginError with its interface and type; what
-    it refuses with an ExperimentError is about its `field` of the experiment."""
+    """What a component's own code raises becomes a PluginError with its interface, type and
+    distribution; what it refuses with an ExperimentError is about its `field` of the experiment."""
     try:
         yield
     except ExperimentError as error:
         raise ExperimentError(str(error), (*field, *error.where)) from None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
-    except Exception as error:
-        raise blame(component, when, error) from error
+    except (Exception, SystemExit) as error:
+        raise blame(type(component), when, error) from error
+
+
+def _origin(package: str) -> str:
+    """`` of pbdkit-x 0.3``, where a distribution's entry point leads to that package."""
+    if package != BUILTIN:
+        for point in installed_points():
+            if point.package == package:
+                return f" of {point.distribution} {point.version}".rstrip()
+    return ""

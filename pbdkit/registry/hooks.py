@@ -1,4 +1,4 @@
-"""The one hook of pbdkit, and its marker."""
+"""The one hook of pbdkit, its marker, and the version of what plugins hold on to."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ if TYPE_CHECKING:
 
 GROUP = "pbdkit"
 """The entry-point group of plugins, and the project name of their hook markers."""
+
+API = 1
+"""The version of the hook and the six interfaces. A plugin may declare the one that it was written
+for as `pbdkit_api`, in the module or on the object that its entry point names."""
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.stepping.state import Floats
 
+REAL = "fiub"
+"""The kinds of numpy's types that are numbers a particle can move by."""
+
 
 class Followers(ABC):
     """The followers of a scene, and how they find their neighbours."""
@@ -25,12 +28,14 @@ class Followers(ABC):
 def target(here: Any, move: Any, before: Any, solver: Stepping | Equilibrium) -> Any:
     """u + relaxation · move + memory · (u - before), elementwise for one component.
 
-    Raises ValueError where the move is not one value a particle.
+    Raises ValueError where the move is not one real number a particle.
     """
     if np.shape(move) not in ((), np.shape(here)):
         raise ValueError(
             f"it returned the shape {np.shape(move)} for particles of shape {np.shape(here)}: "
             "it is not elementwise"
         )
+    if not isinstance(move, float) and np.asarray(move).dtype.kind not in REAL:
+        raise ValueError(f"it returned values of {np.asarray(move).dtype}, not real numbers")
     there = here + (move if solver.relaxation == 1.0 else solver.relaxation * move)
     return there + solver.memory * (here - before) if solver.memory != 0.0 else there

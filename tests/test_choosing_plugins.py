@@ -1,0 +1,205 @@
+"""Which plugins are loaded and which of two is meant is the user's choice, never that of an order;
+what is not needed is not imported."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import jsonschema
+import pytest
+from plugin_sources import hook, listed, rule
+
+import pbdkit
+from pbdkit.cli import program
+from pbdkit.experiment.schema import experiment_schema
+from pbdkit.registry.discovery import DISABLE, installed_points
+from pbdkit.registry.registry import Registry
+
+Install = Callable[..., None]
+Call = Callable[..., Any]
+
+HEALTHY = "--set=rule={type: zz-healthy}"
+
+
+@pytest.fixture
+def healthy(install: Install) -> None:
+    install("zz-healthy", rule("zz-healthy"), "2.1")
+
+
+@pytest.fixture
+def twins(install: Install) -> None:
+    install("pbdkit-one", rule("twin"), "0.1")
+    install("pbdkit-two", rule("twin"), "0.2")
+    install("pbdkit-thief", rule("barycentre"))
+
+
+@pytest.mark.usefixtures("twins")
+def test_a_clash_names_both_distributions_and_the_way_out(call: Call) -> None:
+    found = listed(call)
+    assert found["pbdkit-one"]["reason"] == (
+        "'twin' is offered by pbdkit-two 0.2 too; write 'pbdkit-one:twin'"
+    )
+    assert found["pbdkit-two"]["reason"] == (
+        "'twin' is offered by pbdkit-one 0.1 too; write 'pbdkit-two:twin'"
+    )
+    assert found["pbdkit-thief"]["reason"] == (
+        "'barycentre' is the name of a built-in FollowerRule; "
+        "write 'pbdkit-thief:barycentre', or give it another type"
+    )
+    assert {row["state"] for row in found.values()} == {"ok", "conflict"}
+    assert call("run", "e.json", "--set=rule={type: twin}").code == 2
+    assert call("run", "e.json", "--set=rule={type: 'PBDKIT_Two:twin'}").code == 0
+
+
+@pytest.mark.usefixtures("twins")
+def test_a_thief_chosen_by_name_stays_chosen(tensile: dict[str, Any]) -> None:
+    ds = pbdkit.run(tensile | {"rule": {"type": "pbdkit-thief:barycentre"}}, progress=False)
+    assert json.loads(ds.attrs["experiment"])["rule"]["type"] == "pbdkit-thief:barycentre"
+    assert "pbdkit-thief" in json.loads(ds.attrs["plugins"])
+
+
+@pytest.mark.usefixtures("twins")
+@pytest.mark.parametrize("name", ["pbdkit-one:twin", "pbdkit-two:twin", "pbdkit-thief:barycentre"])
+def test_the_schema_takes_the_names_that_the_program_takes(
+    tensile: dict[str, Any], name: str
+) -> None:
+    schema = experiment_schema(Registry())
+    given = tensile | {"rule": {"type": name}}
+    jsonschema.validate(given, schema)
+    pbdkit.Experiment(**given)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(tensile | {"rule": {"type": "twin"}}, schema)
+
+
+def test_two_entry_points_of_one_distribution(install: Install, tmp_path: Path) -> None:
+    install("pbdkit-one", rule("twin"))
+    install("pbdkit-two", rule("twin"))
+    site = tmp_path / "site"
+    (site / "pbdkit_two-1.0.dist-info" / "entry_points.txt").unlink()
+    points = site / "pbdkit_one-1.0.dist-info" / "entry_points.txt"
+    points.write_text("[pbdkit]\na = pbdkit_one\nb = pbdkit_one\n")
+    assert Registry().find(pbdkit.FollowerRule, "twin").__module__ == "pbdkit_one"
+    points.write_text("[pbdkit]\na = pbdkit_one\nb = pbdkit_two\n")
+    for name in ("twin", "pbdkit-one:twin"):
+        with pytest.raises(pbdkit.PluginError, match="it offers two classes with the type 'twin'"):
+            Registry().find(pbdkit.FollowerRule, name)
+
+
+def test_two_distributions_with_one_entry_point_name(install: Install, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        install(f"pbdkit-{name}", rule(name))
+        points = tmp_path / "site" / f"pbdkit_{name}-1.0.dist-info" / "entry_points.txt"
+        points.write_text(f"[pbdkit]\nsame = pbdkit_{name}\n")
+    assert [(p.distribution, p.state) for p in Registry().installed] == [
+        ("pbdkit-one", "ok"),
+        ("pbdkit-two", "ok"),
+    ]
+
+
+def test_a_distribution_asked_for_by_name_is_imported_alone(install: Install, call: Call) -> None:
+    install("pbdkit-loud", "open('imported', 'w').close()")
+    install("zz-healthy", rule("zz-healthy"))
+    assert call("run", "e.json", "--set=rule={type: 'zz-healthy:zz-healthy'}").code == 0
+    assert not Path("imported").exists()
+    again = pbdkit.rerun(pbdkit.open("tensile.nc"), progress=False)
+    assert json.loads(again.attrs["plugins"])["zz-healthy"] == "1.0"
+    assert not Path("imported").exists()
+
+
+@pytest.mark.parametrize("names", ["pbdkit-loud", "other, PBDKIT_Loud", "*"])
+def test_a_disabled_plugin_is_not_imported(
+    install: Install, call: Call, monkeypatch: pytest.MonkeyPatch, names: str
+) -> None:
+    install("pbdkit-loud", "open('imported', 'w').close()\n" + rule("loud"), "0.3")
+    monkeypatch.setenv(DISABLE, names)
+    row = listed(call)["pbdkit-loud"]
+    assert (row["state"], row["version"], DISABLE in row["reason"]) == ("disabled", "0.3", True)
+    result = call("run", "e.json", "--set=rule={type: loud}")
+    assert result.code == 3
+    assert "'loud' comes from pbdkit-loud 0.3, which is disabled: " in result.err
+    assert not Path("imported").exists()
+
+
+@pytest.mark.usefixtures("twins")
+def test_disabling_one_of_two_settles_a_clash(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DISABLE, "pbdkit-one")
+    assert call("run", "e.json", "--set=rule={type: twin}").code == 0
+
+
+@pytest.mark.usefixtures("twins")
+def test_a_misspelt_name_to_disable_is_said(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DISABLE, "pbdkit-tow")
+    expected = "warning: PBDKIT_DISABLE_PLUGINS names 'pbdkit-tow', which is not installed; "
+    assert call("plugins", "list").err == f"{expected}did you mean 'pbdkit-two'?\n"
+
+
+def commands(command: click.Command, *names: str) -> Iterator[tuple[str, ...]]:
+    """Every command below, by its words."""
+    if not isinstance(command, click.Group):
+        yield names
+        return
+    with click.Context(command) as context:
+        for name in command.list_commands(context):
+            inner = command.get_command(context, name)
+            assert inner is not None
+            yield from commands(inner, *names, name)
+
+
+def test_every_command_can_go_without_plugins(call: Call) -> None:
+    found = list(commands(program))
+    assert ("plugins", "list") in found
+    assert [name for name in found if "--no-plugins" not in call(*name, "--help").out] == []
+
+
+@pytest.mark.usefixtures("healthy")
+@pytest.mark.parametrize(
+    "words",
+    [("plugins", "list", "--json", "--no-plugins"), ("--no-plugins", "plugins", "list", "--json")],
+)
+def test_without_plugins_all_are_disabled_for_that_call(call: Call, words: Any) -> None:
+    rows = json.loads(call(*words).out)
+    (row,) = [row for row in rows if row["distribution"] == "zz-healthy"]
+    assert row["state"] == "disabled"
+    assert row["reason"] == "no plugin is wanted (--no-plugins or PBDKIT_DISABLE_PLUGINS=*)"
+    assert call("check", "e.json", HEALTHY, "--no-plugins").code == 3
+    assert (DISABLE in os.environ, call("check", "e.json", HEALTHY).code) == (False, 0)
+
+
+SEEN = """
+import sys
+from pbdkit.cli import main
+from pbdkit.registry import discovery
+def refuse(): raise AssertionError("the installed distributions were looked through")
+discovery.distributions = refuse
+try:
+    main(sys.argv[1:])
+except SystemExit as end:
+    assert not end.code, end.code
+print([name for name in sys.modules if name.startswith("pbdkit_unused")])
+"""
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_of_fifty_plugins_that_no_part_needs_none_is_looked_at(
+    install: Install, call: Call, command: str
+) -> None:
+    for n in range(50):
+        install(f"pbdkit-unused-{n}", "raise ImportError")
+    assert len(installed_points()) == 50
+    words = [sys.executable, "-c", SEEN, command, "e.json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.endswith("\n[]\n")
+
+
+def test_order_is_by_name_whatever_the_path_says(install: Install) -> None:
+    for name in ("c", "a", "b"):
+        install(f"pbdkit-{name}", hook("return []"))
+    assert [p.distribution for p in Registry().installed] == ["pbdkit-a", "pbdkit-b", "pbdkit-c"]

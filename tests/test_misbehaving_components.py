@@ -1,0 +1,140 @@
+"""A component that loads and then fails is named with its distribution and version; it is never a
+bug of pbdkit, and never the user's."""
+# ruff: noqa: E501  (a row of a table is a line)
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from plugin_sources import rule
+
+Install = Callable[..., None]
+Call = Callable[..., Any]
+
+ODD = "--set=rule={type: odd}"
+WHO = "FollowerRule 'odd' of pbdkit-odd 0.3 failed "
+GATHER, APPLY = "return d.x, d.y, 1.0", "return p.strength * dx / n, p.strength * dy / n"
+
+
+def method(body: str) -> tuple[str, str]:
+    """A replacement that adds a method to the rule."""
+    return "    @staticmethod\n    def gather", f"    {body}\n    @staticmethod\n    def gather"
+
+
+WRONG = {
+    "gather raises": (GATHER, "raise KeyError('g')", "KeyError: 'g' (pbdkit_odd.py, line 11)"),
+    "gather exits": (GATHER, "raise SystemExit(4)", "SystemExit: 4 (pbdkit_odd.py, line 11)"),
+    "gather gives one": (GATHER, "return d.x", "ValueError: "),
+    "gather varies": (GATHER, "return (d.x, d.y, 1.0) if r.x > 0 else (d.x, d.y)", "ValueError: "),
+    "apply gives nothing": (APPLY, "return None", "TypeError: "),
+    "apply gives three": (APPLY, "return dx, dx, dx", "ValueError: "),
+    "apply gives text": (APPLY, "return 'ab'", ""),
+    "unknown parameter": ("p.strength * dx", "p.strenth * dx", "AttributeError: 'Parameters' object has no attribute 'strenth' (pbdkit_odd.py, line 16)"),
+    "constants are none": (*method("def weights(self, slot, setting): return None"), "TypeError: "),
+    "parameters are none": (*method("def parameters(self, setting): return None"), "TypeError: "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "reason"), WRONG.values(), ids=WRONG)
+def test_run_and_check_name_the_rule_that_fails(
+    install: Install, call: Call, old: str, new: str, reason: str
+) -> None:
+    source = rule("odd")
+    assert old in source
+    install("pbdkit-odd", source.replace(old, new), "0.3")
+    for command in ("run", "check"):
+        result = call(command, "e.json", ODD)
+        assert result.code == 3
+        assert result.err.startswith(f"pbdkit: {WHO}")
+        assert reason in result.err
+    assert not Path("tensile.nc").exists()
+
+
+NOT_REAL = {
+    "a shape of its own": (GATHER, "return d.x[..., 0], d.y[..., 0], 1.0", "ValueError: it returned the shape (4,) for particles of shape (4, 3): it is not elementwise"),
+    "complex numbers": (APPLY, "return dx * 1j, dy", "ValueError: it returned values of complex128, not real numbers"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "reason"), NOT_REAL.values(), ids=NOT_REAL)
+def test_what_is_no_move_is_caught_in_the_step(
+    install: Install, call: Call, old: str, new: str, reason: str
+) -> None:
+    install("pbdkit-odd", rule("odd").replace(old, new), "0.3")
+    result = call("run", "e.json", ODD)
+    assert (result.code, f"{WHO}at step 1: {reason}" in result.err) == (3, True)
+
+
+def test_a_move_that_is_not_finite(install: Install, call: Call) -> None:
+    source = rule("odd").replace(APPLY, "return dx * float('nan'), dy")
+    install("pbdkit-odd", source, "0.3")
+    result = call("check", "e.json", ODD)
+    reason = "ValueError: its move at rest, or a derivative of it, is not finite"
+    assert (result.code, f"{WHO}when linearised: {reason}" in result.err) == (3, True)
+    result = call("run", "e.json", ODD)
+    assert (result.code, "found at step 1, left all bounds under rule 'odd'" in result.err) == (
+        4,
+        True,
+    )
+
+
+def test_a_default_that_does_not_fit_is_the_plugins_fault(install: Install, call: Call) -> None:
+    source = rule("odd").replace("strength: float = 1.0", "strength: float = 'x'")
+    install("pbdkit-odd", source, "0.3")
+    result = call("run", "e.json", ODD)
+    assert result.code == 3
+    assert result.err.endswith(
+        "'odd' comes from pbdkit-odd 0.3, which is broken: TypeError: the default of Rule.strength "
+        "does not fit: Input should be a valid number, got 'x'\n"
+    )
+
+
+REFUSING = "@__import__('pydantic').field_validator('strength')\n    def v(cls, x): raise ValueError('too strong')"
+NOBODYS_FAULT = {
+    "no default": ("strength: float", "rule.strength: is missing"),
+    "refused by its own validator": (f"strength: float = 1.0\n    {REFUSING}", "rule.strength: too strong"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("new", "message"), NOBODYS_FAULT.values(), ids=NOBODYS_FAULT)
+def test_what_a_component_refuses_is_about_the_experiment(
+    install: Install, call: Call, new: str, message: str
+) -> None:
+    install("pbdkit-odd", rule("odd").replace("strength: float = 1.0", new), "0.3")
+    result = call("run", "e.json", ODD)
+    expected = f"pbdkit: --set rule={{type: odd}}: {message}\n"
+    assert (result.code, result.err) == (2, expected)
+
+
+RAISING = {
+    "when it is built": "def model_post_init(self, context): raise OSError('here')",
+    "when it is written": (
+        "@__import__('pydantic').field_serializer('strength')\n"
+        "    def written(self, value): raise OSError('here')"
+    ),
+    "when it is asked": "def parameters(self, setting): raise SystemExit('here')",
+}
+
+
+@pytest.mark.parametrize("body", RAISING.values(), ids=RAISING)
+def test_a_component_that_raises_is_no_bug_of_ours(install: Install, call: Call, body: str) -> None:
+    source = rule("raising").replace("strength: float = 1.0", f"strength: float = 1.0\n    {body}")
+    install("pbdkit-raising", source, "0.3")
+    result = call("run", "e.json", "--set=rule={type: raising}")
+    assert (result.code, Path("tensile.nc").exists()) == (3, False)
+    assert "FollowerRule 'raising' of pbdkit-raising 0.3 failed when " in result.err
+    assert ": here" in result.err
+    assert call("schema").code == 0
+
+
+def test_a_diagnostic_that_cannot_tell_its_variables_leaves_the_schema_open(
+    probing: Callable[..., None], call: Call
+) -> None:
+    probing(dims="1 / 0")
+    described = json.loads(call("schema", "dataset").out)
+    assert "probe" not in described["properties"]["data_vars"]["properties"]
+    assert "pe1" in described["properties"]["data_vars"]["properties"]

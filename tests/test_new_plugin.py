@@ -1,0 +1,218 @@
+"""`pbdkit plugins new`: the project installs, passes its tests and runs as it stands."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import runpy
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from plugin_sources import listed
+
+import pbdkit
+from pbdkit.cli.plugins import INTERFACES as OFFERED
+from pbdkit.experiment.schema import experiment_schema
+from pbdkit.experiment.source import read_file
+from pbdkit.interfaces import INTERFACES
+from pbdkit.registry.registry import Registry
+
+Install = Callable[..., None]
+Call = Callable[..., Any]
+New = Callable[..., Path]
+
+
+@pytest.fixture
+def new(call: Call, install: Install) -> New:
+    """``new("pbdkit-mine", "Lattice")``: the folder of a project that is as good as installed."""
+
+    def make(name: str, interface: str) -> Path:
+        result = call("plugins", "new", name, "--interface", interface)
+        assert (result.code, result.err) == (0, "")
+        (point,) = tomllib.loads(Path(name, "pyproject.toml").read_text())["project"][
+            "entry-points"
+        ]["pbdkit"].values()
+        install(name, Path(name, f"{point}.py").read_text(), "0.1.0")
+        return Path(name)
+
+    return make
+
+
+def test_every_open_interface_is_offered() -> None:
+    assert sorted(OFFERED) == sorted(i.__name__ for i in INTERFACES.values())
+
+
+@pytest.mark.parametrize("interface", OFFERED)
+def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> None:
+    folder = new("pbdkit-brand-new", interface)
+    assert listed(call)["pbdkit-brand-new"]["state"] == "ok"
+    result = call("run", str(folder / "example.yaml"), "--json")
+    assert (result.code, result.err, json.loads(result.out)["status"]) == (0, "", "complete")
+    assert json.loads(call("check", str(folder / "example.yaml"), "--json").out)["warnings"] == []
+    tests = runpy.run_path(str(folder / "tests" / "test_example.py"))
+    tests["test_the_example_runs_with_this_plugin"]()
+
+
+@pytest.mark.parametrize("interface", OFFERED)
+def test_the_project_conforms(new: New, interface: str) -> None:
+    testing = pytest.importorskip("pbdkit.testing")
+    new("pbdkit-brand-new", interface)
+    kind = next(i for i in INTERFACES.values() if i.__name__ == interface)
+    (report,) = (testing.examine(c) for c in [Registry().find(kind, "brand-new")()])
+    assert report.holds, str(report)
+
+
+@pytest.mark.parametrize("interface", OFFERED)
+def test_the_example_is_known_to_editors(new: New, interface: str) -> None:
+    folder = new("pbdkit-brand-new", interface)
+    source = read_file(folder / "example.yaml")
+    jsonschema.validate(json.loads(json.dumps(source.data)), experiment_schema(Registry()))
+    assert (folder / "example.yaml").read_text().startswith("# yaml-language-server: $schema=")
+
+
+def test_the_project_is_in_style(call: Call) -> None:
+    for interface in OFFERED:
+        assert call("plugins", "new", f"my-{interface}", "--interface", interface).code == 0
+    rules = ["--isolated", "--line-length=100"]
+    for words in (["check", "--select=E,F,W,I,B,UP,RUF"], ["format", "--check"]):
+        command = [sys.executable, "-m", "ruff", *words, *rules, "."]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, done.stdout)
+
+
+def test_the_rule_is_short(call: Call) -> None:
+    assert call("plugins", "new", "pbdkit-mine").code == 0
+    tree = ast.parse(Path("pbdkit-mine/pbdkit_mine.py").read_text())
+    (rule,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    functions = [node for node in rule.body if isinstance(node, ast.FunctionDef)]
+    assert [function.name for function in functions] == ["gather", "apply"]
+    assert sum(len(ast.unparse(function.body).splitlines()) for function in functions) <= 5
+
+
+OWN = ("return r.x + d.x, r.y + d.y, 1.0", "return d.x, d.y, 1.0")
+"""The one line in which the mean displacement differs from the barycentre."""
+
+
+@pytest.mark.parametrize(("edited", "same"), [((), "barycentre"), (OWN, "mean-displacement")])
+def test_the_rule_is_the_barycentre_and_one_line_makes_it_another(
+    new: New, call: Call, edited: tuple[str, ...], same: str
+) -> None:
+    module = new("pbdkit-mine", "FollowerRule") / "pbdkit_mine.py"
+    text = module.read_text().replace(*edited) if edited else module.read_text()
+    assert (text == module.read_text()) == (not edited)
+    names: dict[str, Any] = {}
+    exec(compile(text.replace('"mine"', '"edited"'), "edited.py", "exec", dont_inherit=True), names)
+    runs = [
+        pbdkit.run(
+            pbdkit.load("paper/c", settings=[f"rule={{type: {kind}}}"], components=[names["Mine"]]),
+            progress=False,
+        )
+        for kind in ("edited", same)
+    ]
+    moved = [run.position - run.reference for run in runs]
+    assert float(abs(moved[1]).max()) > 0.1
+    assert float(abs(moved[0] - moved[1]).max()) < 1e-12
+
+
+def test_three_commands_lead_to_the_first_run(tmp_path: Path) -> None:
+    """The three that the first one prints; installed beside the other packages."""
+    pytest.importorskip("hatchling")
+    site = tmp_path / "site"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *sys.path])}
+
+    def call(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", *words],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    said = call("pbdkit", "plugins", "new", "pbdkit-mine").splitlines()
+    assert said[1:] == ["  pip install -e ./pbdkit-mine", "  pbdkit run pbdkit-mine/example.yaml"]
+    offline = ["--no-build-isolation", "--no-deps", "--no-index", "--target", "site"]
+    call(*said[1].split(), *offline)
+    (link,) = site.glob("*.pth")
+    editable = link.read_text().strip()
+    environment["PYTHONPATH"] += os.pathsep + editable  # a .pth counts in site-packages only
+    assert editable == str(tmp_path / "pbdkit-mine")
+    assert "complete: " in call(*said[2].split())
+    assert " passed" in call("pytest", "-p", "no:cacheprovider", "pbdkit-mine")
+
+
+REFUSED = {
+    "pbdkit-": "'pbdkit-' is no name for a distribution: it begins with a letter, ends with",
+    "my rule": "'my rule' is no name for a distribution: ",
+    "../mine": "'../mine' is no name for a distribution: ",
+    "pbdkit": "there is a module pbdkit already; try pbdkit-my-pbdkit",
+    "json": "there is a module json already; try pbdkit-my-json",
+    "numpy": "there is a module numpy already; try pbdkit-my-numpy",
+    "if": "there is a module if already; try pbdkit-my-if",
+    "pbdkit-2d": "'pbdkit-2d' makes no name for a class; try pbdkit-my-2d",
+    "literal": "'literal' makes no name for a class; try pbdkit-my-literal",
+    "pbdkit-none": "'pbdkit-none' makes no name for a class; try pbdkit-my-none",
+    "pbdkit-barycentre": "'barycentre' is a built-in FollowerRule; try pbdkit-my-barycentre",
+}
+
+
+@pytest.mark.parametrize(("name", "message"), REFUSED.items())
+def test_names_that_cannot_be_had(call: Call, name: str, message: str) -> None:
+    result = call("plugins", "new", name)
+    assert (result.code, result.err.startswith(f"pbdkit: {message}")) == (2, True)
+    assert [path.name for path in Path().iterdir()] == ["e.json"]
+
+
+def test_one_spelling_of_the_name_counts(call: Call) -> None:
+    assert call("plugins", "new", "PBDkit_My.Rule").code == 0
+    assert "class MyRule(" in Path("pbdkit-my-rule/pbdkit_my_rule.py").read_text()
+
+
+def test_what_is_there_is_left_as_it_is(call: Call) -> None:
+    Path("pbdkit-mine").mkdir()
+    result = call("plugins", "new", "pbdkit-mine")
+    message = "pbdkit: pbdkit-mine: exists and is left as it is; take another name or --dir\n"
+    assert (result.code, result.err) == (2, message)
+    assert list(Path("pbdkit-mine").iterdir()) == []
+
+
+def test_another_folder(call: Call, tmp_path: Path) -> None:
+    result = call("plugins", "new", "pbdkit-mine", "--dir", str(tmp_path))
+    assert f"  pip install -e {tmp_path / 'pbdkit-mine'}\n" in result.out
+    assert (tmp_path / "pbdkit-mine" / "README.md").exists()
+    assert call("plugins", "new", "pbdkit-mine", "--dir", "nowhere").code == 2
+
+
+def test_half_a_project_does_not_stay(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = Path.write_text
+
+    def full(self: Path, text: str, *encoding: Any) -> int:
+        if self.name == "example.yaml":
+            raise OSError(28, "No space left on device")
+        return written(self, text, *encoding)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    result = call("plugins", "new", "pbdkit-mine")
+    message = "pbdkit: pbdkit-mine: cannot be written: No space left on device\n"
+    assert (result.code, result.err, Path("pbdkit-mine").exists()) == (6, message, False)
+
+
+def test_a_folder_that_is_closed(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(self: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", closed)
+    result = call("plugins", "new", "pbdkit-mine")
+    assert (result.code, result.err) == (
+        6,
+        "pbdkit: pbdkit-mine: cannot be made: Permission denied\n",
+    )
