@@ -82,4 +82,3 @@ def _told(report: Report, verbose: bool) -> str:
         return str(report)
     faults = [f"  failed  {outcome.property}: {outcome.reason}" for outcome in report.failed]
     return "\n".join([report.summary(), *faults])
-

@@ -8,7 +8,7 @@ from typing import Any
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import INTERFACES, Component, FramePolicy, Lattice, NeighbourMetric
-from pbdkit.registry.registry import interface_of
+from pbdkit.registry.checking import interface_of
 
 LATTICES: dict[str, dict[str, Any]] = {
     "square": {"type": "square", "a": 1.0},
