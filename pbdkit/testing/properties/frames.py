@@ -15,8 +15,7 @@ from pbdkit.testing.subject import Subject
 
 @asked_of(FramePolicy, needs=REPEATABLE)
 def takes_every_point_alone(subject: Subject) -> None:
-    """Whom a frame point follows does not depend on which other points there are, nor on their
-    order."""
+    """Whom a frame point follows does not depend on which other points there are."""
     policy, asked = subject.component, False
     assert isinstance(policy, FramePolicy)
     for scene in subject.scenes:

@@ -71,12 +71,9 @@ def _warned(scene: Scene) -> bool:
 def follows_translations(subject: Subject) -> None:
     """A body that is translated as a whole moves as before, translated, to rounding; rules that
     declare `uses_reference` and frames that say they `anchors` it need not."""
-    component = subject.component
-    if isinstance(component, FollowerRule) and component.uses_reference:
-        raise NotAskedError("it declares `uses_reference`: where a particle stands may count")
+    component, most = subject.component, 0.0
     anchors = isinstance(component, FramePolicy) and component.anchors()
-    most = 0.0
-    for scene in subject.scenes:
+    for scene in _free(subject):
         u, size = displacements(scene, 1), spacing(scene)
         shift = size * np.array([0.75, -1.5])
         moved, there = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
@@ -94,14 +91,32 @@ def follows_translations(subject: Subject) -> None:
         raise PropertyError("it says that it `anchors` the body, and follows every translation")
 
 
+def _free(subject: Subject) -> list[Scene]:
+    """The scenes in which nothing else counts where particles stand; NotAskedError without any."""
+    parts = [(scene, scene.experiment) for scene in subject.scenes]
+    free = [
+        scene
+        for scene, e in parts
+        if not e.rule.uses_reference and (e.frame is subject.component or not e.frame.anchors())
+    ]
+    if not free:
+        whose = "it" if isinstance(subject.component, FollowerRule) else "the rule"
+        raise NotAskedError(
+            f"{whose} declares `uses_reference`, or a frame anchors: where a body lies may count"
+        )
+    return free
+
+
 @asked_of(FollowerRule, FramePolicy, needs=SOUND)
 def superposes(subject: Subject) -> None:
     """Where a rule declares `linear`, and with every frame, the steps from two displacements
     together are the steps from each, added, to rounding."""
     component = subject.component
-    if isinstance(component, FollowerRule) and not component.linear:
-        raise NotAskedError("it does not declare `linear`")
-    for scene in subject.scenes:
+    scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
+    if not scenes:
+        whose = "it" if isinstance(component, FollowerRule) else "the rule"
+        raise NotAskedError(f"{whose} does not declare `linear`")
+    for scene in scenes:
         one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
         both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
         off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
