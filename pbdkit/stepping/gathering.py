@@ -66,7 +66,8 @@ class GatheringFollowers(Followers):
         both = both[np.isin(both[:, 0], self._body)]
         j, k = both.T
         rank, rest = self._of_slots(j, k)
-        order = np.lexsort((k, rank, j))
+        # One key for (j, slot, k) sorts faster than three.
+        order = np.argsort((j * (len(self._rest[0]) + 1) + rank) * len(self._place) + k)
         return j[order], k[order], rest[:, order]
 
     def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
