@@ -9,10 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pbdkit.api import analyse, identify, load, rerun, run
     from pbdkit.errors import (
         DivergedError,
         ExperimentError,
         PbdkitError,
+        PbdkitWarning,
         PluginError,
         StorageError,
     )
@@ -45,11 +47,11 @@ if TYPE_CHECKING:
     )
     from pbdkit.registry.hooks import hookimpl
     from pbdkit.results.accessor import open
-    from pbdkit.running import analyse, load, rerun, run
 
 _HOME = {
     "pbdkit.errors": (
-        "DivergedError", "ExperimentError", "PbdkitError", "PluginError", "StorageError",
+        "DivergedError", "ExperimentError", "PbdkitError", "PbdkitWarning", "PluginError",
+        "StorageError",
     ),
     "pbdkit.experiment.model": ("Experiment",),
     "pbdkit.interfaces": (
@@ -60,7 +62,7 @@ _HOME = {
     ),
     "pbdkit.registry.hooks": ("hookimpl",),
     "pbdkit.results.accessor": ("open",),
-    "pbdkit.running": ("analyse", "load", "rerun", "run"),
+    "pbdkit.api": ("analyse", "identify", "load", "rerun", "run"),
 }  # fmt: skip
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 

@@ -52,6 +52,10 @@ class StorageError(PbdkitError):
     """A result could not be written or read; nothing that existed before was touched."""
 
 
+class PbdkitWarning(UserWarning):
+    """A run went through, and its result deserves a doubt; the text says which, and the remedy."""
+
+
 def dotted(where: Sequence[Any]) -> str:
     """The path of a field as users write it: ``leaders.1.select``."""
     return ".".join(str(part) for part in where)

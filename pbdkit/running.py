@@ -1,117 +1,46 @@
-"""Runs experiments: from a file, a dict or an object to a dataset in memory or in a file."""
+"""The run of a scene into a sink: step by step, or straight to equilibrium."""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from pbdkit.analysis.analysis import Analysis
-from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
-from pbdkit.errors import DivergedError, ExperimentError
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import with_setting
-from pbdkit.experiment.shipped import read_experiment
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium
-from pbdkit.experiment.source import Source
-from pbdkit.interfaces import Component
-from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
 from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.guard import Guard
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
-    import xarray
+    from pbdkit.equilibrium.settling import Settling
 
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
-Components = Iterable[type[Component]]
 _STRAIGHT = Choice("equilibrium", 1, "asked for")
 
 
 @dataclass(frozen=True)
 class Report:
-    """How a run went, for those who look at its cost."""
+    """How a run went, for those who look at its cost, and what is to be said of its end."""
 
     outcome: Outcome
     particles: int
     wall_s: float
     choice: Choice
+    warnings: tuple[str, ...] = ()
 
     @property
     def ns_per_particle_step(self) -> float:
         """Wall time of stepping and recording together."""
         return self.wall_s * 1e9 / (self.particles * max(1, self.outcome.steps))
-
-
-def load(
-    name: str | Path, *, components: Components = (), settings: Iterable[str] = ()
-) -> Experiment:
-    """The experiment in a YAML file, or the shipped one of that name, e.g. "paper/a".
-
-    `settings` are changes such as "rule.K=-0.002"; `components` are classes from Python that the
-    experiment may name besides the installed ones. Raises ExperimentError and PluginError.
-    """
-    source = read_experiment(str(name))
-    for setting in settings:
-        source = with_setting(source, setting, Experiment.defaults())
-    return Experiment.build(source, components)
-
-
-def run(
-    experiment: Experiment | Mapping[str, Any] | str | Path,
-    *,
-    components: Components = (),
-    progress: bool = True,
-) -> xarray.Dataset:
-    """Runs an experiment and returns its dataset; nothing is written.
-
-    `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
-    ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
-    DivergedError, with what was recorded before, when the run leaves the finite numbers.
-    """
-    sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
-    refuse_too_much_output(scene)
-    report = run_into(sink, scene, progress=progress)
-    dataset = sink.dataset()
-    if report.outcome.status in ("diverged", "unconverged"):
-        raise DivergedError(report.outcome.stop_reason, dataset)
-    return dataset
-
-
-def analyse(
-    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
-) -> Analysis:
-    """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
-    and the step operator as a sparse matrix (``.operator``)."""
-    return Analysis(build_scene(_experiment(experiment, components)))
-
-
-def rerun(
-    dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
-) -> xarray.Dataset:
-    """The same run again, bit for bit, from the experiment that the dataset carries."""
-    if "experiment" not in dataset.attrs:
-        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
-    try:
-        experiment = Experiment.build(source, components)
-    except ExperimentError as error:
-        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
-        if given is None or components:
-            raise
-        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
-    return run(experiment, progress=progress)
 
 
 def run_into(
@@ -135,7 +64,8 @@ def run_into(
     except BaseException:
         sink.abandon()
         raise
-    return Report(outcome, scene.raster.count, time.perf_counter() - begun, choice)
+    wall_s = time.perf_counter() - begun
+    return Report(outcome, scene.raster.count, wall_s, choice, recorder.warnings)
 
 
 def _go_straight(scene: Scene, recorder: Recorder) -> Outcome:
@@ -165,33 +95,57 @@ def _step_through(
 ) -> Outcome:
     steps, state = scene.experiment.steps, initial_state(scene)
     patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
-    outcome, guard = Outcome("complete", "all steps done", steps), Guard(scene, state)
+    outcome, guard = None, Guard(scene, state)
+    settling = _settling(scene, state)
     try:
         recorder.observe(state)
-        while state.step < steps and not stopping():
+        while state.step < steps and not outcome and not stopping():
             wanted = recorder.next_after(state.step)
             reached = min(wanted, guard.next_look, state.step + patience)
+            if settling:
+                reached = min(reached, settling.next_look)
             state = engine.advance(state, reached - state.step)
             if reached == guard.next_look or recorder.records(reached):
                 guard.look(state)
             recorder.observe(state)
             show(state.step)
+            if settling and reached == settling.next_look:
+                outcome = _settled(settling, state)
         if state.step < steps:
             recorder.observe_last(state)
-            outcome = Outcome("interrupted", f"stopped after step {state.step}", state.step)
+            stopped = f"stopped after step {state.step}"
+            outcome = outcome or Outcome("interrupted", stopped, state.step)
     except FloatingPointError as error:
         reason = f"{error} left all bounds under rule '{scene.experiment.rule.type}'"
+        if recorder.last_recorded < state.step - 1:
+            reason += _keep(recorder, guard.last_good(engine, state.step, patience, stopping))
         outcome = Outcome("diverged", reason, state.step)
+    unsettled = f", not settled: {settling.obstacle}" if settling else ""
+    outcome = outcome or Outcome("complete", f"all steps done{unsettled}", steps)
     recorder.finish(state, outcome)
     return outcome
 
 
-def _experiment(
-    given: Experiment | Mapping[str, Any] | str | Path, components: Components
-) -> Experiment:
-    if isinstance(given, Experiment):
-        Registry(components)  # what is handed over is checked, needed or not
-        return given
-    if isinstance(given, Mapping):
-        return Experiment.build(Source(data=dict(given)), components)
-    return load(given, components=components)
+def _keep(recorder: Recorder, good: State | None) -> str:
+    """Records the last good state of a run that diverged, and says so."""
+    if good is None or good.step <= recorder.last_recorded:
+        return ""
+    try:
+        recorder.observe_last(good)
+    except FloatingPointError:  # of a diagnostic; nothing of that step is kept
+        return ""
+    return f"; kept is step {good.step}, the last no larger than the body and its leaders' ways"
+
+
+def _settling(scene: Scene, start: State) -> Settling | None:
+    asked = scene.experiment.solver.settle
+    if asked is None:
+        return None
+    from pbdkit.equilibrium.settling import Settling  # only where it is asked for
+
+    return Settling(scene, asked, start)
+
+
+def _settled(settling: Settling, state: State) -> Outcome | None:
+    found = settling.look(state)
+    return Outcome("settled", str(found), state.step, found.as_dict()) if found else None

@@ -219,3 +219,42 @@ def experiments(draw, leaders=any_leaders, fracturing=at_random, body=bodies, st
         "diagnostics": DIAGNOSTICS,
         "solver": solver,
     }
+
+
+AROUND_SQUARES = {"neighbours": {"type": "chebyshev", "shells": 1}}
+ELASTIC = [{"type": "elastic", "poisson_ratio": nu} for nu in (-1.0, -0.2, 0.3)]
+ELASTIC.append({"type": "elastic", "poisson_ratio": 0.25, "plane": "strain"})
+SPRINGS = {"type": "springs"}
+GRADIENT = {"type": "strain-gradient", "poisson_ratio": 0.2, "length": 0.4}
+ORTHOTROPIC = {
+    "type": "orthotropic",
+    "poisson_ratio": 0.3,
+    "modulus_ratio": 0.5,
+    "shear_ratio": 0.2,
+}
+
+
+@st.composite
+def calibrated_experiments(draw):
+    """Rules of elasticity, where they go: cut cells, frames with and without free edges, fracture;
+    the strain gradient with the natural frame and nothing that breaks."""
+    kind = draw(one_of(["square", "rectangular", "hexagonal"]))
+    lattice = {"type": kind, "a": 1.0} | ({"b": 1.3} if kind == "rectangular" else {})
+    rules = {"square": [*ELASTIC, SPRINGS, ORTHOTROPIC, GRADIENT], "hexagonal": [*ELASTIC, SPRINGS]}
+    rule = draw(one_of(rules.get(kind, [*ELASTIC, ORTHOTROPIC])))
+    changed = {"lattice": lattice, "rule": rule, "frame": {"type": "natural"}}
+    changed |= {"neighbours": {"type": "coordination", "shells": 1}}
+    if kind != "hexagonal":
+        changed |= AROUND_SQUARES
+    near = changed["neighbours"]
+    experiment = draw(experiments(leaders=st.one_of(any_leaders, pulled_apart())))
+    whole = experiment["body"]["type"] == "grid" and kind != "hexagonal"
+    free = ["natural", "traction-free"] if whole else ["natural"]
+    experiment |= changed | {"fracture": {"type": "none"}}
+    if rule is GRADIENT:
+        experiment["solver"] = {"type": "stepping", "relaxation": 0.3}
+    else:
+        experiment["frame"] = {"type": draw(one_of([*free, *free, "mean", "none"]))}
+        if draw(st.booleans()):
+            experiment["fracture"] = draw(thresholds(lattice, near))
+    return experiment

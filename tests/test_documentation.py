@@ -39,7 +39,7 @@ def test_python_runs(page, code):
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
 def test_experiments_run(page, code):
     experiment = pbdkit.Experiment.build(read_text(code, page.name))
-    assert pbdkit.run(experiment, progress=False).attrs["status"] == "complete"
+    assert pbdkit.run(experiment, progress=False).attrs["status"] in ("complete", "settled")
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("console"))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
-from scene_strategies import experiments, pulled_apart
+from scene_strategies import calibrated_experiments, experiments, pulled_apart
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -72,12 +72,18 @@ def test_the_kernels_logic_on_torn_scenes(experiment):
     compare_interpreted(experiment)
 
 
+@thoroughly
+@given(calibrated_experiments())
+def test_the_kernels_logic_on_calibrated_scenes(experiment):
+    compare_interpreted(experiment)
+
+
 def compare_interpreted(experiment):
     """The kernel's source run by Python itself: compiling each scene would take seconds."""
     try:
         scene = build_scene(pbdkit.Experiment(**experiment | {"steps": 10}))
         assume(not experiment["neighbours"].get("reevaluate"))
-        assume(max(map(len, scene.neighbourhood.slots)) <= 31)
+        assume(max(map(len, scene.neighbourhood.slots)) <= 31 and scene.inner is None)
         with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
             patch.setattr(numba.config, "DISABLE_JIT", 1)
             assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 2, 3, 4))
@@ -85,6 +91,19 @@ def compare_interpreted(experiment):
         assume(False)
 
 
+ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
+CUT = {
+    lattice: {
+        "lattice": {"type": lattice, "a": 1.0},
+        "neighbours": {"type": kind, "shells": 1},
+        "rule": ELASTIC,
+        "frame": {"type": "natural"},
+        "body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]},
+        "initial": {"type": "noise", "amplitude": 0.1},
+        "leaders": [],
+    }
+    for lattice, kind in (("square", "chebyshev"), ("hexagonal", "coordination"))
+}
 COMPONENTS = {
     **{f"rule {name}": {"rule": rule} for name, rule in RULES.items()},
     **{f"lattice {name}": {"lattice": part} for name, part in LATTICES.items()},
@@ -102,6 +121,7 @@ COMPONENTS = {
         "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}, "until": 2}],
     },
     "noise": {"initial": {"type": "noise", "amplitude": 0.1}},
+    **{f"natural frame, {name}": parts for name, parts in CUT.items()},
     "disc": {"body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]}, "leaders": []},
 }
 

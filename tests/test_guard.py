@@ -1,10 +1,17 @@
 """A run that leaves all bounds is stopped soon, and what was recorded before is kept."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.stepping.guard import EVERY
+from pbdkit.results.memory import MemorySink
+from pbdkit.running import run_into
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping import guard
+from pbdkit.stepping.guard import EVERY, Guard
+from pbdkit.stepping.state import initial_state
 
 BLOWN = {
     "name": "blown",
@@ -84,3 +91,83 @@ def test_groups_that_contradict_each_other_from_where_they_stand_are_refused():
     leaders[0]["motion"] = turn | {"centre": [1.0, 0.0]}  # where number 10 stands: it does not move
     ds = pbdkit.run(BLOWN | {"initial": start, "leaders": leaders, "steps": 5}, progress=False)
     assert ds.attrs["status"] == "complete"
+
+
+def diverged(**parts):
+    with pytest.raises(pbdkit.DivergedError) as caught:
+        pbdkit.run(BLOWN | parts, progress=False)
+    return caught.value.dataset
+
+
+@pytest.mark.parametrize("engine", ["numpy", "compiled"])
+@pytest.mark.parametrize(
+    ("growth", "kept_every"), [(1.5, 5000), (1.05, 100)], ids=["from the start", "from a copy"]
+)
+def test_the_last_good_state_of_a_run_that_diverges_is_kept(
+    engine, growth, kept_every, monkeypatch
+):
+    """From the start again where the guard has copied no state yet."""
+    begun = []
+    monkeypatch.setattr(guard, "KEPT_EVERY", kept_every)
+    monkeypatch.setattr(guard, "initial_state", lambda s: begun.append(s) or initial_state(s))
+    crack = [[2.5, -1.0], [2.5, 1.5]]
+    parts = {
+        "initial": {"type": "noise", "amplitude": 1e-9},
+        "fracture": {"type": "threshold", "thresholds": [1e12], "cracks": [crack]},
+        "diagnostics": [{"type": "displacement"}, {"type": "pe2"}, {"type": "broken"}],
+    }
+    relaxation = 0.5 * (1 + growth) * pbdkit.analyse(BLOWN | parts).largest_stable_relaxation
+    parts["solver"] = {"type": "stepping", "relaxation": relaxation, "engine": engine}
+    sparse = diverged(record={"every": 5000}, **parts)
+    last = int(sparse.time[-1])
+    assert last > (200 if kept_every == 100 else 20)  # a second copy goes over the first
+    assert len(begun) == (kept_every > last)
+    assert sparse.stop_reason.endswith(
+        f"kept is step {last}, the last no larger than the body and its leaders' ways"
+    )
+    every = diverged(record={"at": [0, last, last + 1]}, **parts).sel(time=slice(0, last + 1))
+    for name in ("position", "u", "pe2", "broken_bonds"):
+        assert np.array_equal(sparse[name][-1], every[name][1]), name
+    sizes = abs(every.u).max(axis=(1, 2))
+    assert sizes[1] <= 7 + 1 + 0.1 + 1e-9 < sizes[2]  # the body, a spacing, the way, the noise
+    # The bonds across the crack; what tears at 1e12 on the way out of all bounds is no result.
+    assert sparse.broken_bonds[-1] == (sparse.broken_step >= 0).sum() > 0
+    assert (sparse.broken_step <= 0).all()
+
+
+def test_nothing_is_stepped_again_where_every_step_is_recorded(monkeypatch):
+    def again(*_):
+        raise AssertionError("stepped again")
+
+    monkeypatch.setattr(Guard, "last_good", again)
+    ds = diverged(solver={"type": "stepping", "relaxation": 1.5}, record={"every": 1})
+    assert int(ds.time[-1]) > 0
+    assert "kept is" not in ds.stop_reason
+
+
+def test_who_stops_the_run_while_the_last_good_state_is_looked_for_keeps_what_was_recorded():
+    given = BLOWN | {"solver": {"type": "stepping", "relaxation": 1.5}, "record": {"every": 5000}}
+    calls = iter(range(10**6))
+    sink = MemorySink()
+    scene = build_scene(pbdkit.Experiment(**given))
+    # Two calls of a hundred steps at most blow up; from the third on somebody wants to stop.
+    report = run_into(sink, scene, progress=False, stopping=lambda: next(calls) >= 2)
+    assert report.outcome.status == "diverged"
+    assert sink.dataset().time.values.tolist() == [0]
+
+
+class Vanishing(pbdkit.Diagnostic):
+    type: Literal["vanishing"] = "vanishing"
+
+    def variables(self):
+        return (pbdkit.Variable("vanishing", (), "a number at the start alone", "1"),)
+
+    def measure(self, now):
+        return (np.inf if now.step else 0.0,)
+
+
+def test_a_state_whose_diagnostic_is_not_finite_is_not_kept():
+    solver = {"type": "stepping", "relaxation": 1.5}
+    ds = diverged(diagnostics=[Vanishing()], solver=solver, record={"every": 5000})
+    assert ds.time.values.tolist() == [0]
+    assert "kept is" not in ds.stop_reason

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from property_cases import (
     BOTH_ENDS_HELD,
     LATTICES,
+    LINEAR_RULES,
     RULES,
     advanced,
     body_sites,
@@ -239,3 +240,20 @@ def test_nothing_is_claimed_of_frames_that_lag():
     analysis = pbdkit.analyse(sheet(frame="lag"))
     assert analysis.stable_at(1.0, 0.5) is None
     assert analysis.swing(1.0, 0.5) is None
+
+
+@pytest.mark.parametrize("frame", ["mean", "first", "lag", {"type": "none"}], ids=str)
+@pytest.mark.parametrize("neighbours", ["coordination-1", "chebyshev-1"])
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_what_turns_without_memory_is_gone_before_it_is_seen(lattice, neighbours, frame):
+    """Frames that lag or lean make some eigenvalues complex; all of them are looked at."""
+    found = [
+        pbdkit.analyse(
+            sheet(8, 8, rule=rule, lattice=lattice, neighbours=neighbours, frame=frame)
+        ).spectrum.eigenvalues
+        for rule in LINEAR_RULES
+    ]
+    every = np.concatenate(found)
+    period = 2 * np.pi / np.abs(np.angle(every[np.abs(every.imag) > 1e-6]))
+    kept = np.abs(every[np.abs(every.imag) > 1e-6]) ** period
+    assert kept[period > 2.5].max(initial=0.0) < 0.021

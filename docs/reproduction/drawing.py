@@ -28,13 +28,13 @@ MEANINGS = {"pe1": "PE1", "pe2": "PE2", "pe1_intact": "PE1, intact bonds", "u": 
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
 
 
-def save(figure: Figure, name: str) -> str:
+def save(figure: Figure, name: str, folder: Path = FOLDER) -> str:
     """Writes a PNG with a palette, without date and software, so that a rerun changes nothing."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.06)
     image = Image.open(buffer).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    image.save(FOLDER / name, optimize=True)
+    image.save(folder / name, optimize=True)
     return name
 
 

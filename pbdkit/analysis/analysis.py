@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.analysis.lagging import Lag, lag_of
 from pbdkit.analysis.matrices import Entries, connected
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.analysis.region import (
@@ -20,6 +21,7 @@ from pbdkit.analysis.region import (
     swings_below,
 )
 from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
+from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.scene import Scene
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
@@ -77,16 +79,9 @@ class Analysis:
         """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
         no memory left."""
         now, before = self.operator.entries_now, self.operator.entries_before
-        every, share = np.arange(now.shape[0]), 1.0 / self.scene.experiment.solver.relaxation
-        rule = Entries(
-            np.concatenate([now.rows, before.rows, every]),
-            np.concatenate([now.columns, before.columns, every]),
-            np.concatenate(
-                [share * now.values, share * before.values, np.full(len(every), 1.0 - share)]
-            ),
-            now.shape,
-        )
-        return rule.matrix()
+        share, every = 1.0 / self.scene.experiment.solver.relaxation, np.arange(now.shape[0])
+        rest = Entries(every, every, np.full(len(every), 1.0 - share), now.shape)
+        return rest.plus(now.plus(before), share).matrix()
 
     @property
     def spectral_radius(self) -> float | None:
@@ -152,18 +147,30 @@ class Analysis:
         return {t: math.ceil(math.log(float(t)) / math.log(radius)) for t in TOLERANCES}
 
     @cached_property
+    def trailing(self) -> Lag | None:
+        """How far the body trails its equilibrium in the fastest steps of its leaders.
+
+        None where no leader moves steadily, steps do not settle or are not made, or it would cost
+        too much."""
+        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        if straight or not self._within_reach or not self.stable:
+            return None
+        return lag_of(self.scene)
+
+    @property
+    def lag(self) -> float | None:
+        """By how much the follower farthest behind trails its equilibrium in the fastest steps of
+        the leaders, once that has become steady, in lattice units."""
+        return self.trailing.steady if self.trailing else None
+
+    @cached_property
     def parts_without_leader(self) -> list[Any]:
         """The numbers of the particles of each part that no leader reaches."""
         if not self._within_reach:
             return []
         operator = self.operator
-        now, before = operator.entries_now, operator.entries_before
-        graph = Entries(
-            np.concatenate([now.rows, before.rows]),
-            np.concatenate([now.columns, before.columns]),
-            np.ones(len(now.rows) + len(before.rows)),
-            now.shape,
-        )
+        both = operator.entries_now.plus(operator.entries_before)
+        graph = Entries(both.rows, both.columns, np.ones(len(both.rows)), both.shape)
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
         led[label[np.unique(operator.entries_led.rows)]] = True
@@ -198,4 +205,18 @@ class Analysis:
                 "solver.relaxation: a mode that changes its sign in every step never decays; take "
                 "a relaxation below 1"
             )
-        return found
+        return found + self._late()
+
+    def _late(self) -> list[str]:
+        """Whether the body is left behind its equilibrium by more than a bond."""
+        trailing, shells = self.trailing, self.scene.neighbourhood.shells()
+        bond = min(min(lengths) for lengths in shells)
+        if trailing is None or trailing.size <= bond:
+            return []
+        return [
+            f"leaders: in steps {trailing.first} to {trailing.last} the fastest moves by "
+            f"{trailing.speed:.4g} a step and leaves the body {trailing.size:.3g} behind its "
+            f"equilibrium, more than a bond ({bond:.3g}): its speed decides how far bonds stretch; "
+            f"move by less than {trailing.speed * bond / trailing.steady:.2g} a step, or take "
+            "solver: {type: equilibrium}"
+        ]

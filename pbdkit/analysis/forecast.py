@@ -22,8 +22,10 @@ from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
 class Forecast:
     """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
     where it cannot tell or it would take too long; with memory, the period in steps of the slowest
-    mode that swings and by what it shrinks a step, None where nothing swings; whether what the
-    analysis found is exact, or linearised at the start; warnings."""
+    mode that swings and by what it shrinks a step, None where nothing swings; by how much the body
+    trails its equilibrium in the leaders' fastest steps, in lattice units, once that is steady and
+    when these steps end, None where no leader moves steadily; whether what the analysis found is
+    exact, or linearised at the start; warnings."""
 
     particles: int
     followers: int
@@ -38,6 +40,8 @@ class Forecast:
     period: float | None
     decay: float | None
     exact: bool
+    lag: float | None
+    lag_reached: float | None
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -68,6 +72,8 @@ def forecast(scene: Scene) -> Forecast:
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
         exact=analysis.exact,
+        lag=analysis.lag,
+        lag_reached=analysis.trailing.reached if analysis.trailing else None,
         warnings=(*_doubts(scene), *exact, *waves),
     )
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector, where
 from pbdkit.interfaces.frame import Indices
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import EMPTY, positions
 from pbdkit.scene.scene import Scene
@@ -50,7 +51,21 @@ class Response:
 
 
 def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
-    """The response at a state of the followers at some flat places, all of one sublattice."""
+    """The response at a state of the followers at some flat places, all of one sublattice.
+
+    Raises PluginError where the rule's functions fail, or are not finite at rest.
+    """
+    with blaming(scene.experiment.rule, "when linearised"):
+        response = _respond(scene, state, sublattice, place)
+        values = [response.move, response.own, *response.neighbours.values()]
+        if response.move.shape[-1] != 2:
+            raise ValueError(f"its move has {response.move.shape[-1]} components, not 2")
+        if not state.u.any() and not all(np.isfinite(v).all() for v in values):
+            raise ValueError("its move at rest, or a derivative of it, is not finite")
+    return response
+
+
+def _respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
     slots = scene.neighbourhood.slots[sublattice]
     steps = {slot: slot_step(scene, slot) for slot in slots}
     kinds = np.arange(len(place))
@@ -65,6 +80,14 @@ def slot_step(scene: Scene, slot: Slot) -> int:
     """From a flat place of the raster to that of the neighbour at a slot."""
     _, m, n = scene.raster.shape
     return ((slot.target - slot.source) * m + slot.cell[0]) * n + slot.cell[1]
+
+
+def has_neighbours(scene: Scene, sublattice: int, place: Indices) -> Present:
+    """Which particles have any; others stay, whatever the rule makes of nothing."""
+    found = np.zeros(len(place), bool)
+    for slot in scene.neighbourhood.slots[sublattice]:
+        found |= scene.raster.kind.ravel()[place + slot_step(scene, slot)] != EMPTY
+    return found
 
 
 def _alike(

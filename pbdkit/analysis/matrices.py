@@ -23,6 +23,15 @@ class Entries:
     values: NDArray[np.float64]
     shape: tuple[int, int]
 
+    def plus(self, other: Entries, factor: float = 1.0) -> Entries:
+        """The sum with `factor` times a matrix of the same shape."""
+        return Entries(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.columns, other.columns]),
+            np.concatenate([self.values, factor * other.values]),
+            self.shape,
+        )
+
     def matrix(self) -> Any:
         """Dense up to DENSE rows, else sparse."""
         if self.shape[0] > DENSE:
@@ -48,9 +57,9 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         kind = "strong" if strongly else "weak"
         count, label = connected_components(matrix, connection=kind)
         return count, label
-    reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
     if not strongly:
-        reach |= reach.T
+        return _connected_either_way(matrix)
+    reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
     while True:
         further = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
         if (further == reach).all():
@@ -58,4 +67,21 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         reach = further
     first = np.argmax(reach & reach.T, axis=1)  # the lowest unknown of each group names it
     names, label = np.unique(first, return_inverse=True)
+    return len(names), label
+
+
+def _connected_either_way(matrix: NDArray[Any]) -> tuple[int, Indices]:
+    """Every unknown takes the lowest name of those that it is connected with, and that one's name,
+    until nothing changes."""
+    rows, columns = np.nonzero(matrix)
+    name = np.arange(len(matrix))
+    while True:
+        lower = name.copy()
+        np.minimum.at(lower, rows, name[columns])
+        np.minimum.at(lower, columns, name[rows])
+        lower = lower[lower]
+        if (lower == name).all():
+            break
+        name = lower
+    names, label = np.unique(name, return_inverse=True)
     return len(names), label

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import Couplings
-from pbdkit.analysis.linearising import Response, respond, slot_step
+from pbdkit.analysis.linearising import Response, has_neighbours, respond
 from pbdkit.analysis.matrices import Entries
+from pbdkit.analysis.nesting import moves_and_couplings
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
-from pbdkit.registry.blame import blaming
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
@@ -36,7 +36,8 @@ class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
     `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
-    2n + 1 its y, and the same for leaders. The couplings hold the same by particle.
+    2n + 1 its y, and the same for leaders. The couplings hold the same by particle; of those with
+    leaders, `couplings_shown` is the share that frame points show.
     """
 
     followers: Indices
@@ -44,6 +45,7 @@ class StepOperator:
     couplings_now: Couplings
     couplings_before: Couplings
     couplings_led: Couplings
+    couplings_shown: Couplings
     source: Floats
 
     @cached_property
@@ -125,7 +127,7 @@ class _Assembly:
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
         self._now, self._before = Couplings((free, free)), Couplings((free, free))
-        self._led = Couplings((free, led))
+        self._led, self._shown = Couplings((free, led)), Couplings((free, led))
         self._source = np.zeros((free, 2))
 
     def operator(self) -> StepOperator:
@@ -135,9 +137,12 @@ class _Assembly:
         cells = self._kind.size // self._scene.raster.shape[0]
         for s in range(self._scene.raster.shape[0]):
             own = place if self._scene.raster.shape[0] == 1 else place[place // cells == s]
-            own = own[self._has_neighbours(s, own)]
+            own = own[has_neighbours(self._scene, s, own)]
             if len(own):
-                self._add(own, self._response(s, own))
+                if self._scene.inner:
+                    self._add_nested(own)
+                else:
+                    self._add(own, respond(self._scene, self._state, s, own))
                 if memory:
                     self._now.add_scaled_identity(self._unknown[own], memory)
                     self._before.add_scaled_identity(self._unknown[own], -memory)
@@ -147,26 +152,9 @@ class _Assembly:
             self._now,
             self._before,
             self._led,
+            self._shown,
             self._source.ravel(),
         )
-
-    def _response(self, sublattice: int, place: Indices) -> Response:
-        """The rule's answer; PluginError where its functions fail, or are not finite at rest."""
-        with blaming(self._scene.experiment.rule, "when linearised"):
-            response = respond(self._scene, self._state, sublattice, place)
-            values = [response.move, response.own, *response.neighbours.values()]
-            if response.move.shape[-1] != 2:
-                raise ValueError(f"its move has {response.move.shape[-1]} components, not 2")
-            if not self._state.u.any() and not all(np.isfinite(v).all() for v in values):
-                raise ValueError("its move at rest, or a derivative of it, is not finite")
-        return response
-
-    def _has_neighbours(self, sublattice: int, place: Indices) -> NDArray[np.bool_]:
-        """Particles with no neighbour stay, whatever the rule makes of nothing."""
-        found = np.zeros(len(place), bool)
-        for slot in self._scene.neighbourhood.slots[sublattice]:
-            found |= self._kind[place + slot_step(self._scene, slot)] != EMPTY
-        return found
 
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
@@ -187,6 +175,16 @@ class _Assembly:
                 constant = constant - np.where(present, _times(weight, u[:, there].T), 0.0)
             self._see(rows, there, weight)
         self._source[rows] = constant
+
+    def _add_nested(self, place: Indices) -> None:
+        """The rows of followers whose rule works on the moves of another."""
+        relaxation, rows = self._scene.experiment.solver.relaxation, self._unknown[place]
+        moves, couplings = moves_and_couplings(self._scene, self._state, place)
+        everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
+        u = self._state.u.reshape(2, -1)[:, everybody].T.astype(float, copy=False)
+        self._source[rows] = relaxation * (moves - couplings.times(u))
+        for own, column, blocks in couplings.parts:
+            self._see(rows[own], everybody[column], relaxation * blocks)
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
@@ -210,7 +208,8 @@ class _Assembly:
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
-            for couplings, those in ((self._led, of_leader), (free, ~of_leader)):
+            sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
+            for couplings, those in sums:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
 
 

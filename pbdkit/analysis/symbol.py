@@ -8,14 +8,11 @@ its frame copies or mirrors.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pbdkit.analysis.derivatives import derivative
 from pbdkit.analysis.region import Complex, modes
-from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.analysis.stencil import linearised
 from pbdkit.scene.scene import Scene
 
 WAVES = 48
@@ -77,44 +74,17 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 def _symbols(scene: Scene) -> Complex:
     """(wave, 2S, 2S): the rule's step on plane waves, of which opposite ones answer alike."""
-    slots = scene.neighbourhood.slots
+    stencil = linearised(scene)
     angle = 2 * np.pi * np.arange(WAVES) / WAVES
     half = angle[: WAVES // 2 + 1]
     theta = np.stack(np.meshgrid(half, angle, indexing="ij"), axis=-1).reshape(-1, 2)
-    symbols = np.zeros((len(theta), 2 * len(slots), 2 * len(slots)), complex)
-    symbols += np.eye(2 * len(slots))
-    for s, own in enumerate(slots):
-        here = slice(2 * s, 2 * s + 2)
-        symbols[:, here, here] += _derivative(scene, own, None)
-        for slot in own:
-            there = slice(2 * slot.target, 2 * slot.target + 2)
-            phase = np.exp(1j * theta @ np.array(slot.cell, float))
-            symbols[:, here, there] += phase[:, None, None] * _derivative(scene, own, slot)
+    symbols = np.zeros((len(theta), 2 * len(stencil.own), 2 * len(stencil.own)), complex)
+    symbols += np.eye(2 * len(stencil.own))
+    for s, own in enumerate(stencil.own):
+        symbols[:, 2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += own
+    for slot, matrix in stencil.neighbours.items():
+        here = slice(2 * slot.source, 2 * slot.source + 2)
+        there = slice(2 * slot.target, 2 * slot.target + 2)
+        phase = np.exp(1j * theta @ np.array(slot.cell, float))
+        symbols[:, here, there] += phase[:, None, None] * matrix
     return symbols
-
-
-def _derivative(scene: Scene, slots: tuple[Slot, ...], of: Slot | None) -> NDArray[np.float64]:
-    """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are: (2, 2)."""
-    rule, constants = scene.experiment.rule, scene.constants
-    still = Vector(np.float64(0.0), np.float64(0.0))
-    columns = []
-    for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
-
-        def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
-            nudge = Vector(np.multiply(step, along.x), np.multiply(step, along.y))
-            back = Vector(-nudge.x, -nudge.y)
-            parts = [
-                rule.gather(
-                    back if of is None else nudge if slot is of else still,
-                    slot.rest,
-                    constants.weights[slot],
-                    constants.rule,
-                )
-                for slot in slots
-            ]
-            total = tuple(sum(part[1:], part[0]) for part in zip(*parts, strict=True))
-            here = Here(nudge if of is None else still, Vector(None, None))
-            return rule.apply(total, here, constants.rule)
-
-        columns.append(derivative(moved))
-    return np.array(columns).T

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.api import load
 from pbdkit.benching.method import REFERENCE, Measured, Method, NotMeasured
 from pbdkit.benching.resizing import resized
 from pbdkit.benching.worker import looks
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.running import load
 
 Row = Measured | NotMeasured
 Tell = Callable[[str], None]

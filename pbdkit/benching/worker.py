@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.api import load
 from pbdkit.errors import PbdkitError
 from pbdkit.experiment.model import Experiment
-from pbdkit.running import load
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.engine import Engine

@@ -15,6 +15,7 @@ from pbdkit.cli.options import with_no_plugins
 COMMANDS = {
     "run": "run",
     "check": "check",
+    "identify": "identify",
     "experiments": "experiments",
     "init": "experiments",
     "plot": "plot",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,14 +49,15 @@ def bench(
     settings: tuple[str, ...],
 ) -> None:
     """Measure speed against error: engines, precisions and threads, at one or several sizes."""
-    _refuse_unwritable(json_file, picture)
     from rich.console import Console
 
+    from pbdkit.api import load
     from pbdkit.benching.measuring import Bench
     from pbdkit.benching.method import methods
     from pbdkit.benching.report import LEGEND, reasons, table
-    from pbdkit.running import load
+    from pbdkit.cli.pictures import refuse_unwritable
 
+    refuse_unwritable(picture, json_file)
     loaded = load(experiment, settings=(*settings, *([f"steps={steps}"] if steps else ())))
     measured = Bench(experiment, settings, loaded.steps)
     rows = [row for size in sizes or (None,) for row in measured.measure(methods(), size, _tell)]
@@ -75,39 +75,22 @@ def _tell(what: str) -> None:
         click.echo(f"measuring {what}", err=True)
 
 
-def _refuse_unwritable(json_file: Path | None, picture: Path | None) -> None:
-    """Before minutes of measuring, not after."""
-    from pbdkit.cli.plot import FORMATS
-    from pbdkit.errors import ExperimentError, StorageError
-
-    if picture and picture.suffix not in FORMATS:
-        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
-    if picture and find_spec("matplotlib") is None:
-        raise ExperimentError("a picture needs matplotlib: pip install 'pbdkit[plot]'")
-    for path in (json_file, picture):
-        if path and path.is_dir():
-            raise ExperimentError(f"{path}: is a folder; name a file")
-        if path and not path.parent.is_dir():
-            raise StorageError(f"{path}: there is no folder {path.parent}")
-
-
 def _write(
     json_file: Path | None, picture: Path | None, name: str, bench: Bench, rows: list[Row]
 ) -> None:
     from pbdkit.benching.method import Measured
     from pbdkit.benching.picture import work_precision
     from pbdkit.benching.report import as_dict
+    from pbdkit.cli.pictures import save
     from pbdkit.errors import StorageError
 
-    for path in filter(None, (json_file, picture)):
+    if json_file:
+        text = json.dumps(as_dict(bench, rows), indent=1)
         try:
-            if path is json_file:
-                text = json.dumps(as_dict(bench, rows), indent=1)
-                path.write_text(text + "\n", encoding="utf-8")
-            else:
-                measured = [row for row in rows if isinstance(row, Measured)]
-                title = f"{name}, {bench.steps} steps"
-                work_precision(measured, title).savefig(path)
+            json_file.write_text(text + "\n", encoding="utf-8")
         except OSError as error:
-            raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
-        click.echo(f"{path} written")
+            raise StorageError(f"{json_file}: cannot be written: {error.strerror}") from None
+        click.echo(f"{json_file} written")
+    if picture:
+        measured = [row for row in rows if isinstance(row, Measured)]
+        save(picture, work_precision(measured, f"{name}, {bench.steps} steps"))

@@ -7,8 +7,6 @@ from typing import Any
 
 import click
 
-FORMATS = (".png", ".svg", ".pdf")
-
 
 @click.command()
 @click.argument("file", metavar="OUT.nc", type=click.Path(path_type=Path))
@@ -26,7 +24,8 @@ def plot(
     numbers: bool,
 ) -> None:
     """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
-    from pbdkit.errors import ExperimentError, StorageError
+    from pbdkit.cli.pictures import FORMATS, save
+    from pbdkit.errors import ExperimentError
     from pbdkit.results.accessor import open as open_result
     from pbdkit.results.picture import draw, figure
 
@@ -41,8 +40,4 @@ def plot(
             drawn: Any = figure(dataset, times, **look)
         else:
             drawn = draw(dataset, next(iter(times), None), **look).figure
-    try:
-        drawn.savefig(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
-    click.echo(f"{path} written")
+    save(path, drawn)

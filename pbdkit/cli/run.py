@@ -32,8 +32,9 @@ def run(
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.analysis.forecast import quick_warnings
+    from pbdkit.api import load
     from pbdkit.cli.stopping import asked_to_stop
-    from pbdkit.running import load, run_into
+    from pbdkit.running import run_into
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
@@ -51,18 +52,26 @@ def run(
     sink = OverlappingSink(NetcdfSink(path, replace=force, compression=loaded.record.compression))
     with asked_to_stop() as stopping:
         report = run_into(sink, scene, progress=not silent, stopping=stopping)
+    for warning in () if quiet else report.warnings:
+        click.echo(f"warning: {warning}", err=True)
     if as_json:
         click.echo(json.dumps(_figures(report, path)))
-    elif not quiet and report.outcome.status == "complete":
-        outcome = report.outcome
-        size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
-        click.echo(f"{outcome.status}: {size}, written to {path}")
-        if outcome.certificate:
-            click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
-            return 0
+    elif not quiet and report.outcome.status in ("complete", "settled"):
+        _say(report, path, settling=loaded.solver.settle is not None)
+    return _exit_code(report, path)
+
+
+def _say(report: Report, path: Path, *, settling: bool) -> None:
+    outcome = report.outcome
+    size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
+    click.echo(f"{outcome.status}: {size}, written to {path}")
+    if outcome.certificate:
+        click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
+    elif settling:
+        click.echo(outcome.stop_reason)
+    if report.choice.engine != "equilibrium":
         threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""
         click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
-    return _exit_code(report, path)
 
 
 def _refuse_existing(path: Path, force: bool) -> None:

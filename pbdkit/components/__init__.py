@@ -2,52 +2,31 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
 from pbdkit.interfaces import Component
 from pbdkit.registry.hooks import hookimpl
+
+COMPONENTS = {
+    "lattices": "Square Rectangular CentredRectangular Hexagonal Oblique",
+    "neighbours": "Coordination Chebyshev Euclidean",
+    "rules": "Barycentre MeanDisplacement DistanceWeighted MixedCoordinate",
+    "elasticity": "Elastic Orthotropic",
+    "springs": "Springs",
+    "strain_gradient": "StrainGradient",
+    "frames": "MeanFrame FirstFrame MirrorFrame NoFrame",
+    "free_edges": "Natural TractionFree",
+    "fracture": "NoFracture Threshold",
+    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea",
+}
+"""By module of this folder the classes that it offers."""
 
 
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
     """The built-in components of the six interfaces."""
-    from pbdkit.components import (
-        diagnostics,
-        elasticity,
-        fracture,
-        frames,
-        free_edges,
-        lattices,
-        neighbours,
-        rules,
-        springs,
-    )
-
-    return [
-        lattices.Square,
-        lattices.Rectangular,
-        lattices.CentredRectangular,
-        lattices.Hexagonal,
-        lattices.Oblique,
-        neighbours.Coordination,
-        neighbours.Chebyshev,
-        neighbours.Euclidean,
-        rules.Barycentre,
-        rules.MeanDisplacement,
-        rules.DistanceWeighted,
-        rules.MixedCoordinate,
-        elasticity.Elastic,
-        elasticity.Orthotropic,
-        springs.Springs,
-        frames.MeanFrame,
-        frames.FirstFrame,
-        frames.MirrorFrame,
-        frames.NoFrame,
-        free_edges.Natural,
-        fracture.NoFracture,
-        fracture.Threshold,
-        diagnostics.PE1,
-        diagnostics.PE1Intact,
-        diagnostics.PE2,
-        diagnostics.Displacement,
-        diagnostics.Track,
-        diagnostics.Broken,
-    ]
+    found = []
+    for module, names in COMPONENTS.items():
+        offered = import_module(f"{__name__}.{module}")
+        found += [getattr(offered, name) for name in names.split()]
+    return found

@@ -1,7 +1,8 @@
-"""Pseudo-energies, displacements, tracks and the count of broken bonds (model.md, section 8)."""
+"""Pseudo-energies, displacements, tracks, broken bonds, cells inside out (model.md, section 8)."""
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -124,6 +125,45 @@ class Broken(Diagnostic):
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The count."""
         return (now.broken_bonds(),)
+
+
+class SmallestCellArea(Diagnostic):
+    """The smallest signed area of a cell, as a share of its area at rest: 1 at rest, 0 where a cell
+    is flat, negative where one is inside out.
+
+    Of a cell with more than three corners it is the area at a corner, spanned by the two sides that
+    meet there: all are positive exactly where the cell is convex and the right way round. Cells
+    with broken bonds count too. For cells whose corners are all of the body.
+    """
+
+    type: Literal["smallest-cell-area"] = "smallest-cell-area"
+
+    uses_cells: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`smallest_cell_area`."""
+        name = "smallest signed cell area over that at rest, negative inside out"
+        return (Variable("smallest_cell_area", (), name, "1"),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """The smallest of all cells."""
+        return (now.over_cells(smallest_corner_area).min(),)
+
+
+def smallest_corner_area(d: tuple[Vector, ...], r: tuple[Vector, ...]) -> Any:
+    """min over the corners k of (x_k - x_k-1) × (x_k+1 - x_k), over the same at rest."""
+    rest = [Vector(r[k].x - r[k - 1].x, r[k].y - r[k - 1].y) for k in range(len(r))]
+    now = [
+        Vector(side.x + (d[k].x - d[k - 1].x), side.y + (d[k].y - d[k - 1].y))
+        for k, side in enumerate(rest)
+    ]
+    corners = range(len(r)) if len(r) > 3 else range(1)  # the corners of a triangle agree
+    shares = [_cross(now[k - 1], now[k]) / _cross(rest[k - 1], rest[k]) for k in corners]
+    return reduce(np.minimum, shares)
+
+
+def _cross(a: Vector, b: Vector) -> Any:
+    return a.x * b.y - a.y * b.x
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:

@@ -6,19 +6,16 @@ import math
 from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from pbdkit.components.cell_stiffness import (
+    in_rectangles,
+    in_triangles,
+    is_triangular,
+    rectangle_of,
+)
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FollowerRule, Here, Setting, Slot, Stiffness, Vector, where
-
-Floats = NDArray[np.float64]
-
-CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
-"""Of a rectangular cell, counterclockwise, in units of its sides."""
-HOURGLASS = np.array([1.0, -1.0, 1.0, -1.0])
-"""The displacement of the corners that no mean strain knows."""
 
 
 class CellElastic(FollowerRule):
@@ -42,19 +39,22 @@ class CellElastic(FollowerRule):
     def ratios(self) -> Stiffness:
         """The stiffness over `modulus`: finite for every material that the rule takes."""
 
-    def stiffness(self) -> Stiffness:
-        """Ratios times modulus."""
-        return Stiffness(*(self.modulus() * ratio for ratio in self.ratios()))
+    def stiffness(self) -> Stiffness | None:
+        """Ratios times modulus, where that is finite."""
+        modulus = self.modulus()
+        if not math.isfinite(modulus):
+            return None
+        return Stiffness(*(modulus * ratio for ratio in self.ratios()))
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The modulus; ExperimentError where the lattice has no such cells."""
-        if not (_rectangle(setting) or _triangle(setting)):
+        if not (rectangle_of(setting) or is_triangular(setting)):
             raise ExperimentError(
                 f"'{self.type}' works on the square and the rectangular lattice with 8 neighbours "
                 "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
                 "lattice with 6 ({type: coordination, shells: 1})"
             )
-        if _triangle(setting) and not _is_isotropic(self.ratios()):
+        if is_triangular(setting) and not _is_isotropic(self.ratios()):
             raise ExperimentError(
                 f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
             )
@@ -63,10 +63,10 @@ class CellElastic(FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
         """(xx, xy, yy, t): the weight of the cell to the left is [[xx, xy + t], [xy - t, yy]], of
         that to the right the transpose; a cell on both sides counts half on each."""
-        if sides := _rectangle(setting):
-            left, right = _beside(slot, rectangle_matrix(self.ratios(), *sides))
+        if sides := rectangle_of(setting):
+            left, right = in_rectangles(slot, self.ratios(), *sides)
         else:
-            left, right = (_in_triangle(slot, self.ratios(), turn) for turn in (1, -1))
+            left, right = in_triangles(slot, self.ratios())
         symmetric, skew = (left + right) / 2, (left - right) / 2
         found = symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
         return tuple(map(float, found))
@@ -90,7 +90,7 @@ class CellElastic(FollowerRule):
         return where(some, x, 0.0), where(some, y, 0.0)
 
     @staticmethod
-    def force(total: Any, p: Any) -> tuple[Any, Any]:
+    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
         """Modulus · Σ W d."""
         return p.modulus * total[0], p.modulus * total[1]
 
@@ -99,8 +99,8 @@ class Elastic(CellElastic):
     """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
 
     On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
-    it is linear triangles. At ν = -1 on the square lattice it is the barycentre of all neighbours.
-    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal).
+    it is linear triangles. At ν = -1 it is the barycentre, of the four nearest or all six.
+    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """
 
     type: Literal["elastic"] = "elastic"
@@ -171,73 +171,6 @@ class Orthotropic(CellElastic):
         """1, E_y/E_x, ν_xy E_y/E_x, and the shear ratio over the modulus."""
         coupled = self.poisson_ratio * self.modulus_ratio
         return Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / self.modulus())
-
-
-def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
-    """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
-    # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
-    signs = 2 * np.array(CORNERS) - 1.0
-    K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
-    stiffness = c.shear * (a / b + b / a) / 4
-    K += stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
-    return K
-
-
-def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
-    """∫ Bᵀ C B over a cell of constant strain, gradient (corner, axis) of its shape functions."""
-    B = np.zeros((3, len(gradient), 2))
-    B[0, :, 0] = B[2, :, 1] = gradient[:, 0]
-    B[1, :, 1] = B[2, :, 0] = gradient[:, 1]
-    C = np.array([[c.xx, c.xy, 0.0], [c.xy, c.yy, 0.0], [0.0, 0.0, c.shear]])
-    K: Floats = area * np.einsum("ima,ij,jnb->manb", B, C, B)
-    return K
-
-
-def _beside(slot: Slot, K: Floats) -> tuple[Floats, Floats]:
-    """-K_jk in the cell to the left and the cell to the right of a slot, half of it in each where
-    both are one cell."""
-    x, y = int(np.sign(slot.rest.x)), int(np.sign(slot.rest.y))
-    ends = {corner: n for n, corner in enumerate(CORNERS)}
-    if x and y:
-        block: Floats = -K[ends[int(x < 0), int(y < 0)], :, ends[int(x > 0), int(y > 0)], :] / 2
-        return block, block
-    found = []
-    for towards in ((-y, x), (y, -x)):  # where the cell to the left and that to the right lie
-        start = int(x + towards[0] < 0), int(y + towards[1] < 0)
-        found.append(-K[ends[start], :, ends[start[0] + x, start[1] + y], :])
-    return found[0], found[1]
-
-
-def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
-    """-K_jk in the equilateral triangle to the left (turn 1) or right (-1) of a slot."""
-    x, y = slot.rest
-    half, height = 0.5, turn * math.sqrt(0.75)
-    corners = np.array([[0.0, 0.0], [x, y], [half * x - height * y, height * x + half * y]])
-    gradient = np.linalg.inv(np.column_stack([np.ones(3), corners]))[1:].T
-    area = math.sqrt(0.75) * (x * x + y * y) / 2
-    block: Floats = -_of_mean_strain(c, gradient, area)[0, :, 1, :]
-    return block
-
-
-def _rectangle(setting: Setting) -> tuple[float, float] | None:
-    """The sides of the cells, where every site has the 8 neighbours of a rectangular lattice."""
-    a, b = setting.cell.vectors
-    if len(setting.cell.sites) > 1 or a.y != 0.0 or b.x != 0.0:
-        return None
-    around = {slot.cell for slot in setting.slots[0]}
-    ring = {(m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)} - {(0, 0)}
-    return (abs(a.x), abs(b.y)) if around == ring and len(setting.slots[0]) == 8 else None
-
-
-def _triangle(setting: Setting) -> bool:
-    """Whether every site has six neighbours at 60 degrees."""
-    for slots in setting.slots:
-        rests = [complex(*slot.rest) for slot in slots]
-        turned = [rest * complex(0.5, math.sqrt(0.75)) for rest in rests]
-        near = [min(abs(t - rest) for rest in rests) for t in turned]
-        if len(rests) != 6 or max(near) > 1e-9 * abs(rests[0]):
-            return False
-    return True
 
 
 def _is_isotropic(c: Stiffness) -> bool:

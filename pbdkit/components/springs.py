@@ -65,6 +65,6 @@ class Springs(FollowerRule):
         return x / share, y / share
 
     @staticmethod
-    def force(total: Any, p: Any) -> tuple[Any, Any]:
+    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
         """Σ k e n."""
         return total[0], total[1]

@@ -17,6 +17,8 @@ WAYS = {
     "estimated norm of the inverse": "three times an estimate of the norm of the inverse",
     "nothing to solve": "nobody follows",
 }
+CORRECTION = "correction, "
+"""Before the name of a way: it bounds only what a correction that was solved for leaves."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,12 @@ class Certificate:
         return asdict(self)
 
     def __str__(self) -> str:
+        way = WAYS[self.bound.removeprefix(CORRECTION)]
+        if self.bound.startswith(CORRECTION):
+            way = f"the correction to there; what it leaves is bounded by {way}"
         return (
             f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
-            f"prescribed displacement), by {WAYS[self.bound]}"
+            f"prescribed displacement), by {way}"
         )
 
 

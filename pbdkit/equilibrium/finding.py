@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.equilibrium.certificate import Certificate
-from pbdkit.equilibrium.moves import Moves, rounding
+from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
@@ -63,7 +63,7 @@ class _Search:
         self._place = finder.scene.raster.place_of(operator.followers)
         self._X = finder.scene.raster.reference(operator.followers)
         self._system = self._systematised(operator)
-        self._owed = self._owed_by(operator)
+        self._owed = owed_by(operator, state, self._place)
         self._left = self._moves()
 
     def run(self) -> Certificate:
@@ -150,17 +150,6 @@ class _Search:
         self._linearisations += 1
         return System(operator, self._finder.method, self._X)
 
-    def _owed_by(self, operator: StepOperator) -> Vectors | None:
-        """What frames that lag have yet to hand back, (follower, axis)."""
-        if not operator.couplings_before.parts:
-            return None
-        u, previous = (p.reshape(2, -1)[:, self._place] for p in (self._state.u, self._previous))
-        return operator.couplings_before.times((previous - u).T.astype(float))
-
-    @property
-    def _previous(self) -> Floats:
-        return self._state.previous
-
     def _shift(self, correction: Vectors, share: float) -> None:
         self._state.u.reshape(2, -1)[:, self._place] += share * correction.T
         self._left = self._moves()
@@ -186,7 +175,7 @@ class _Search:
         return max(LINEAR, 10 * accuracy) * before + self._floor()
 
     def _rounding(self) -> float:
-        return rounding(self._state.u)
+        return self._system.amplification * rounding(self._state.u)
 
     def _floor(self) -> float:
         return self._rounding() * math.sqrt(max(1, self._left.size))

@@ -11,7 +11,7 @@ from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.leaders import place, prescribe
+from pbdkit.stepping.leaders import last_event, place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 
@@ -63,7 +63,7 @@ def _load(scene: Scene, state: State, finder: Finder, increments: int) -> Certif
     """In increments up to the last motion or change of roles, breaking bonds on the way."""
     fracturing, steps = Fracturing(scene), scene.experiment.steps
     assert state.broken_step is not None
-    last = _last_event(scene)
+    last = last_event(scene)
     count = min(increments, last)
     certificate = None
     for step in np.unique(np.linspace(1, last, count).round().astype(int)).tolist():
@@ -85,14 +85,3 @@ def _last_change_of_roles(scene: Scene) -> int:
         first, last = leading.group.from_, leading.group.last(steps)
         changes += [step for step in (first - 1, last) if 0 <= step < steps]
     return max(changes)
-
-
-def _last_event(scene: Scene) -> int:
-    """The last step within the run at which leaders move or roles change, at least 1."""
-    steps, events = scene.experiment.steps, [1]
-    for leading in scene.leading:
-        first, last = leading.group.from_, leading.group.last(steps)
-        rests = leading.group.motion.rests_after() or 0
-        moments = (first, last + 1, min(last, first - 1 + rests))
-        events += [step for step in moments if step <= steps]
-    return max(events)

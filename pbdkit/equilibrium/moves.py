@@ -5,24 +5,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.analysis.operator import StepOperator
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing, Steps
 from pbdkit.stepping.slots import SlotFollowers
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
 
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
 class Moves:
-    """Evaluates the moves of a scene's followers, without relaxation and memory, the frame standing
-    where the body tells it to."""
+    """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
+    frame standing where the body tells it to."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         fracturing = Fracturing(scene) if scene.has_fracture else None
-        self._followers = SlotFollowers(scene, fracturing, Stepping())
+        self._followers = SlotFollowers(
+            scene, fracturing, Stepping(relaxation=scene.experiment.solver.relaxation)
+        )
         self._after: Floats | None = None
 
     def at(self, u: Floats, broken_step: Steps | None, place: Indices) -> NDArray[np.float64]:
@@ -37,6 +40,15 @@ class Moves:
             self._followers.move(u, self._after, broken_step)
         moved = (self._after.reshape(2, -1)[:, place] - flat[:, place]).T
         return moved.astype(float)
+
+
+def owed_by(operator: StepOperator, state: State, place: Indices) -> NDArray[np.float64] | None:
+    """What followers at their flat places have yet to get, (follower, axis), where the step looks
+    back: before · (u(t-1) - u(t)), None elsewhere."""
+    if not operator.couplings_before.parts:
+        return None
+    u, previous = (p.reshape(2, -1)[:, place] for p in (state.u, state.previous))
+    return operator.couplings_before.times((previous - u).T.astype(float))
 
 
 def rounding(u: Floats) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.matrices import DENSE
+from pbdkit.equilibrium.deflated import SINGULAR, Deflated, Shifted
 from pbdkit.equilibrium.linear import Dense, Krylov, LinearSolver, is_symmetric, linear_solver
 
 Floats = NDArray[np.float64]
@@ -19,9 +20,6 @@ SAFETY = 3.0
 """What an estimated norm, which may come out too small, is multiplied with."""
 ROUGH = 1e-3
 """The accuracy of solutions that only serve a bound."""
-SINGULAR = 1e-10
-"""Relative size below which a singular value counts as zero."""
-MOST_MODES = 6
 LARGEST_FALLBACK = 400_000
 """Unknowns up to which an LU factorisation takes over where an iteration gets stuck."""
 
@@ -138,12 +136,16 @@ class Floating(Part):
 
     def __init__(self, matrix: Any, before: Any) -> None:
         self._size = matrix.shape[0]
-        self._left = _left_kernel(matrix)
+        shifted = Shifted(matrix) if self._size > DENSE else None
+        self._left = shifted.left if shifted else _left_kernel(matrix)
         rows = self._left.T + (self._left.T @ before if before is not None else 0.0)
-        bordered = _bordered(matrix, self._left, np.asarray(rows))
         self._solver: LinearSolver | None = None
         with suppress(np.linalg.LinAlgError):  # modes that grow: only rest is an equilibrium
-            self._solver = linear_solver(bordered, "lu", symmetric=False)
+            self._solver = (
+                Deflated(shifted, np.asarray(rows))
+                if shifted
+                else Dense(_bordered(matrix, self._left, np.asarray(rows)))
+            )
 
     @property
     def name(self) -> str:
@@ -197,33 +199,16 @@ def estimated_norm(solver: LinearSolver, size: int) -> float:
 
 
 def _left_kernel(matrix: Any) -> Floats:
-    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0; few, for connected parts."""
-    size = matrix.shape[0]
-    if size <= DENSE:
-        dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-        left, values, _ = np.linalg.svd(dense)
-        basis: Floats = left[:, values <= SINGULAR * max(1.0, values.max(initial=0.0))]
-        return basis
-    # Inverse iteration: whatever is not in the kernel shrinks by shift / λ a turn.
-    from scipy.sparse import eye_array
-
-    shift = 1e-11
-    nearly = linear_solver(
-        (matrix + shift * eye_array(size)).tocsr(), "lu", symmetric=is_symmetric(matrix)
-    )
-    basis = np.random.default_rng(0).normal(size=(size, MOST_MODES))
-    for _ in range(4):
-        basis = np.linalg.qr(nearly.solve_transposed(basis, ROUGH))[0]
-    turned, values, _ = np.linalg.svd(basis.T @ matrix)
-    return np.asarray(basis @ turned[:, values <= SINGULAR])
+    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0."""
+    left, values, _ = np.linalg.svd(_dense(matrix))
+    basis: Floats = left[:, values <= SINGULAR * max(1.0, values.max(initial=0.0))]
+    return basis
 
 
-def _bordered(matrix: Any, left: Floats, rows: Floats) -> Any:
+def _bordered(matrix: Any, left: Floats, rows: Floats) -> Floats:
     corner = np.zeros((left.shape[1], left.shape[1]))
-    if matrix.shape[0] <= DENSE:
-        dense = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-        return np.block([[dense, left], [rows, corner]])
-    from scipy.sparse import block_array, csr_array
+    return np.block([[_dense(matrix), left], [rows, corner]])
 
-    found = block_array([[matrix, csr_array(left)], [csr_array(rows), csr_array(corner)]])
-    return found.tocsr()
+
+def _dense(matrix: Any) -> Floats:
+    return matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix.toarray())

@@ -44,6 +44,8 @@ class System:
         now, before = operator.couplings_now, operator.couplings_before
         both = Couplings(now.shape, now.parts + before.parts)
         self._both = both
+        self.amplification = 1.0
+        """How much larger moves are, in rounding too, than the displacements that make them."""
         first = 1 if both.couples(0, 1) else 0
         self._stages = [] if both.couples(first, 1 - first) else [self._stage((first,))]
         # One axis has a share in the invariants of the other, where it moves it.
@@ -115,6 +117,10 @@ class System:
             found[:, axes] = x.reshape(-1, len(axes))
         return found
 
+    def times(self, c: Floats) -> Floats:
+        """A c, (follower, axis)."""
+        return c - self._both.times(c)
+
     def distance(self, moves: Floats, rounding: float) -> float:
         """A bound on the distance of any follower from the solution, given its moves and what
         rounding may have done to them."""
@@ -165,6 +171,8 @@ class System:
 
     def _stage(self, axes: tuple[int, ...]) -> _Stage:
         matrix = _one_minus(self._of(self._both, axes))
+        largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
+        self.amplification = max(self.amplification, largest)
         held = self._held(axes)
         count, label = connected(matrix, strongly=False)
         led = np.zeros(count, bool)

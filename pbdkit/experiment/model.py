@@ -115,6 +115,12 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false or solver: {type: stepping}",
                 key="solver",
             )
+        if self.neighbours.nearness() and self.solver.settle:
+            raise fault(
+                "where neighbours are re-evaluated no distance from equilibrium is known; "
+                "set neighbours.reevaluate: false, or leave solver.settle out",
+                key="solver",
+            )
         return self
 
     @property

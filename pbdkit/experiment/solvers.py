@@ -9,6 +9,14 @@ from pydantic import Field, SerializeAsAny
 
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
+from pbdkit.interfaces.component import Strict
+
+
+class Settle(Strict):
+    """Stop early: once no follower can be farther from equilibrium than `tolerance`, a share of the
+    largest prescribed displacement."""
+
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
 
 class Solver(Component):
@@ -20,7 +28,8 @@ class Stepping(Solver):
 
     `relaxation` w and `memory` b apply to any rule's move, for followers only:
     x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
-    best; `precision` is that of the run's own numbers; `threads` for the compiled engine.
+    best; `precision` is that of the run's own numbers; `threads` for the compiled engine. With
+    `settle` the run ends where it has settled, after `steps` at the latest.
     """
 
     type: Literal["stepping"] = "stepping"
@@ -29,6 +38,7 @@ class Stepping(Solver):
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
     relaxation: Annotated[float, Field(gt=0.0)] = 1.0
     memory: float = 0.0
+    settle: Settle | None = None
 
 
 class Equilibrium(Solver):
@@ -52,6 +62,7 @@ class Equilibrium(Solver):
     threads: ClassVar[Literal["auto"] | int] = "auto"
     relaxation: ClassVar[float] = 1.0
     memory: ClassVar[float] = 0.0
+    settle: ClassVar[None] = None
 
 
 AnySolver = Annotated[

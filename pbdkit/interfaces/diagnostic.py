@@ -63,6 +63,22 @@ class Moment(ABC):
         """
 
     @abstractmethod
+    def over_cells(
+        self,
+        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> Floats:
+        """function(d, r) of every cell whose corners are all of the body, (cell,).
+
+        A cell is a polygon of neighbouring sites with no other site in its circumcircle: on the
+        square and rectangular lattice the rectangles, on the others triangles; together they tile
+        the plane, whatever the neighbours are. d and r hold a Vector a corner, counter-clockwise:
+        d[k] = u_k - u_0, r[k] = X_k - X_0; r is constant. Elementwise, and called once a shape and
+        part of the body. Cells with a broken bond between corners count unless `intact_only`.
+        """
+
+    @abstractmethod
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
@@ -76,6 +92,9 @@ class Diagnostic(Component):
 
     uses_bonds: ClassVar[bool] = False
     """Whether readers of the dataset need the table of bonds to make sense of it."""
+    uses_cells: ClassVar[bool] = False
+    """Whether it makes no sense without cells (`Moment.over_cells`); a body that has none, a single
+    row for instance, is then refused."""
     every_step: ClassVar[bool] = False
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
 

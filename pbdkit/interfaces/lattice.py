@@ -96,14 +96,15 @@ class Cell:
         a, b = self.vectors
         area = abs(a.x * b.y - a.y * b.x)
         spread = radius + max(math.hypot(*s.at) for s in self.sites) * 2
-        # |m|, |n| of a cell that reaches within `spread`: rows of the inverse of (a, b).
-        m_max = math.ceil(spread * math.hypot(*b) / area)
-        n_max = math.ceil(spread * math.hypot(*a) / area)
+        # |m| of a cell that reaches within `spread`, and for each m the n: of nearly collinear
+        # vectors all pairs would be too many.
+        m_max, half = math.ceil(spread * math.hypot(*b) / area), spread / math.hypot(*b)
+        tilt = (a.x * b.x + a.y * b.y) / (b.x * b.x + b.y * b.y)
         found = [
             self.offset(source, target, (m, n))
-            for target in range(len(self.sites))
             for m in range(-m_max, m_max + 1)
-            for n in range(-n_max, n_max + 1)
+            for n in range(math.floor(-m * tilt - half), math.ceil(-m * tilt + half) + 1)
+            for target in range(len(self.sites))
         ]
         inside = [o for o in found if o.site != (0, 0) and o.length <= radius]
         return sorted(inside, key=lambda o: (o.length, o.site))

@@ -91,6 +91,12 @@ class FollowerRule(Component):
         """The material whose linear elasticity the rule is, where it is calibrated to one."""
         return None
 
+    def inner(self) -> FollowerRule | None:
+        """The rule whose moves this rule works on, for operators that are applied twice; by default
+        none. With one, `gather` and `apply` are given its moves z, of followers and leaders alike,
+        in place of displacements: d = z_k - z_j and here.u = z_j."""
+        return None
+
     @staticmethod
     @abstractmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
@@ -102,7 +108,8 @@ class FollowerRule(Component):
         """The move of the follower (target - where it stands in m), elementwise."""
 
     @staticmethod
-    def force(total: Any, p: Any) -> tuple[Any, Any]:
-        """The force of the neighbours on the particle over Young's modulus and thickness (lattice
-        units), from the sums; calibrated rules have it, and it vanishes in equilibrium."""
+    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+        """The force of the neighbours on the particle over Young's modulus and thickness, (x, y)
+        in the lattice's units, from the sums. Calibrated rules have it; it vanishes in
+        equilibrium."""
         raise NotImplementedError("the rule is not calibrated to a material: it knows no forces")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Moment, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -130,3 +131,39 @@ class StateMoment(Moment):
             body = raster.kind[block.slices()] == FOLLOWER
             sums[block.slices()] = np.where(body, total, 0.0)
         return raster.table(sums[None])[:, 0]
+
+    def over_cells(
+        self,
+        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> Floats:
+        """Patch by patch, each with the cells of one shape."""
+        found = [np.empty(0)]
+        for patch, counted in self.patches(intact_only=intact_only):
+            values = function(self.corners(patch), patch.cell.rest)
+            found.append(np.broadcast_to(values, counted.shape)[counted])
+        return np.concatenate(found)
+
+    def patches(self, *, intact_only: bool = False) -> Iterator[tuple[Patch, NDArray[np.bool_]]]:
+        """The cells of the body, and which of them count."""
+        for patch in self._tables.scene.patches:
+            yield patch, self._intact(patch) if intact_only else patch.whole
+
+    def corners(self, patch: Patch) -> tuple[Vector, ...]:
+        """u_k - u_0 of the corners."""
+        return patch.differences(self._state.u)
+
+    def number_at(self, patch: Patch, place: int) -> int:
+        """The lowest number of the corners of a cell, given by its flat place on the patch."""
+        return int(patch.rows(self._tables.raster, place).min()) + 1
+
+    def _intact(self, patch: Patch) -> NDArray[np.bool_]:
+        """Which cells of a patch have no broken bond between their corners."""
+        fracturing, broken, intact = self._tables.fracturing, self._state.broken_step, patch.whole
+        if fracturing is None or broken is None:
+            return intact
+        sides = patch.cell.bonds(self._tables.scene.neighbourhood)
+        for block, slot in ((patch.corners[k], slot) for k, slot in sides):
+            intact = intact & ~fracturing.broken(block, slot, broken)
+        return intact

@@ -18,6 +18,7 @@ from pbdkit.errors import PluginError
 from pbdkit.interfaces import Diagnostic, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
+from pbdkit.results.inversion import inside_out
 from pbdkit.results.layout import Column
 from pbdkit.results.moment import StateMoment, Tables
 from pbdkit.scene.scene import Scene
@@ -65,7 +66,9 @@ class Recorder:
         self._scene = scene
         self._sink = sink
         self._tables = Tables(scene)
-        self._last_recorded = -1
+        self.last_recorded = -1
+        """The last step of which positions were taken."""
+        self.warnings: tuple[str, ...] = ()
         diagnostics = scene.experiment.diagnostics
         self._recorded = [d for d in diagnostics if not d.every_step]
         self._stepped = [d for d in diagnostics if d.every_step]
@@ -123,7 +126,7 @@ class Recorder:
 
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""
-        if state.step > self._last_recorded:
+        if state.step > self.last_recorded:
             with np.errstate(all="ignore"):
                 self._observe(state, recorded=True, stepped=False)
 
@@ -137,18 +140,22 @@ class Recorder:
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
             values |= self._measured(self._recorded, moment)
-            self._last_recorded = state.step
+            self.last_recorded = state.step
         if stepped:
             values |= {"step": state.step} | self._measured(self._stepped, moment)
         if values:
             self._sink.put(values)
 
     def finish(self, state: State, outcome: Outcome) -> None:
-        """Hands over what is known at the end, and the attributes."""
+        """Hands over what is known at the end, and the attributes; `warnings` says what the user
+        should know of the last state."""
+        if outcome.status != "diverged":
+            warning = inside_out(StateMoment(state, self._tables))
+            self.warnings = (warning,) if warning else ()
         if self._scene.has_fracture:
             broken = StateMoment(state, self._tables).broken_step()
             if outcome.status == "diverged":  # what broke since the last record is no result
-                broken = np.where(broken > self._last_recorded, -1, broken)
+                broken = np.where(broken > self.last_recorded, -1, broken)
             self._sink.put({"broken_step": broken})
         self._sink.finish(self._attributes(outcome))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import namedtuple
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,13 +33,18 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     with blaming(experiment.rule, "when asked for its constants", "rule"):
         rule = _named(experiment.rule.parameters(setting))
         sides = WHOLE_CELLS if experiment.rule.uses_cells else ()
-        weights = {slot: (*experiment.rule.weights(slot, setting), *sides) for slot in slots}
+        weights = {s: (*_numbers(experiment.rule.weights(s, setting)), *sides) for s in slots}
     fracture = experiment.fracture
     with blaming(fracture, "when asked for its constants", "fracture"):
         parameters = _named(fracture.parameters())
-        limits = {s: tuple(fracture.constants(s)) for s in slots} if fracture.can_break else {}
+        limits = {s: _numbers(fracture.constants(s)) for s in slots} if fracture.can_break else {}
     return SceneConstants(rule, weights, parameters, limits)
 
 
 def _named(values: dict[str, float]) -> Any:
-    return namedtuple("Parameters", values)(**values)
+    return namedtuple("Parameters", values)(**{k: float(value) for k, value in values.items()})
+
+
+def _numbers(values: Iterable[float]) -> Constants:
+    """Plain numbers: those of numpy would raise single precision to double."""
+    return tuple(map(float, values))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice
+from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.cells import Cells, Corners, Tiling
 from pbdkit.scene.filling import rounding_of, window
@@ -107,36 +109,27 @@ class _Cutter:
         if not self._of_sites:
             x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
             reach = np.hypot(x - x[0], y - y[0]).max()
-            cut = np.abs(distance).min(axis=0) <= 2 * reach
+            cut = np.abs(distance).min(axis=0) <= reach
             share[cut] = self._cut_shares(x[:, cut], y[:, cut])
         some = share > SMALLEST
         return i[some], j[some], share[some]
 
     def _cut_shares(self, x: Floats, y: Floats) -> Floats:
         """The share inside of cells with corners (corner, cell): the mean over its triangles, cut
-        into small ones."""
+        into small ones in which the distance is linear."""
         triangles = [(0, 1, 2)]
         if len(x) == 4:
             x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
             triangles = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
-        shares = [self._share_of_triangle(x[list(t)], y[list(t)]) for t in triangles]
-        share: Floats = np.mean(shares, axis=0)
-        return share
-
-    def _share_of_triangle(self, x: Floats, y: Floats) -> Floats:
-        a, b = (n.ravel() for n in np.indices((FINE + 1, FINE + 1)))
-        points = np.stack([FINE - a - b, a, b]) / FINE
-        px, py = points.T @ x, points.T @ y
+        corners = np.array(triangles).T
+        weights, small = _small_triangles()
+        px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
         nowhere = np.zeros(px.shape, int)
-        distance = self._signed(Sites(nowhere, nowhere, px, py)).reshape(FINE + 1, FINE + 1, -1)
-        parts: list[Floats] = []
-        for k in range(FINE):
-            for m in range(FINE - k):
-                one, other = distance[k + 1, m], distance[k, m + 1]
-                parts.append(_negative_share(distance[k, m], one, other))
-                if k + m < FINE - 1:
-                    parts.append(_negative_share(distance[k + 1, m + 1], one, other))
-        share: Floats = np.mean(parts, axis=0)
+        distance = self._signed(Sites(nowhere, nowhere, px, py))
+        share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
+        cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
+        a, b, c = (distance[corner][..., cut] for corner in small.T)
+        share[cut] = _negative_share(a, b, c).mean(axis=(0, 1))
         return share
 
     def _signed(self, at: Sites) -> Floats:
@@ -144,9 +137,28 @@ class _Cutter:
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
 
 
+@cache
+def _small_triangles() -> tuple[Floats, Indices]:
+    """(point, corner), the barycentric coordinates of the points at which a triangle is cut, and
+    (small triangle, corner), the points at the corners of each part."""
+    k, m = (n.ravel() for n in np.indices((FINE + 1, FINE + 1)))
+    inside = k + m <= FINE
+    k, m = k[inside], m[inside]
+    number = {place: n for n, place in enumerate(zip(k.tolist(), m.tolist(), strict=True))}
+    small = []
+    for a, b in number:
+        if a + b < FINE:
+            small.append([number[a, b], number[a + 1, b], number[a, b + 1]])
+        if a + b < FINE - 1:
+            small.append([number[a + 1, b + 1], number[a + 1, b], number[a, b + 1]])
+    return np.stack([FINE - k - m, k, m], axis=1) / FINE, np.array(small)
+
+
 def _negative_share(a: Floats, b: Floats, c: Floats) -> Floats:
     """The share of triangles in which a linear function, given at their corners, is negative."""
-    low, middle, high = np.sort([a, b, c], axis=0)
+    small, large = np.minimum(a, b), np.maximum(a, b)
+    low, middle = np.minimum(small, c), np.maximum(small, np.minimum(large, c))
+    high = np.maximum(large, c)
     with np.errstate(invalid="ignore", divide="ignore"):
         one = low * low / ((low - middle) * (low - high))
         two = 1.0 - high * high / ((high - low) * (high - middle))

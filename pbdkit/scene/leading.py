@@ -153,7 +153,9 @@ def _refuse_infinite(
 ) -> None:
     last = group.last(steps) - group.from_ + 1
     for n in sorted({1, last, *(k for k in group.motion.knots() if k <= last)}):
-        if n >= 1 and not np.isfinite(at + group.motion.offset(n, at)).all():
+        with np.errstate(all="ignore"):  # that it overflows is said below
+            finite = n < 1 or np.isfinite(at + group.motion.offset(n, at)).all()
+        if not finite:
             raise ExperimentError(f"leaves the finite numbers at its step {n}", where)
 
 

@@ -11,6 +11,11 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Cell, Lattice, NeighbourMetric, Offset, Slot, Vector
 
+FLATTEST = 1e-3
+"""Cells flatter than this are refused: within a cell vector of a site lie π/flatness others."""
+SAME_PLACE = 1e-9
+"""Sites nearer than this share of a cell vector lie at one place."""
+
 
 @dataclass(frozen=True)
 class BondPlane:
@@ -59,19 +64,42 @@ class Neighbourhood:
 
 
 def checked_cell(lattice: Lattice) -> Cell:
-    """The lattice's cell; ExperimentError where it is degenerate or its sites share an index."""
+    """The lattice's cell; ExperimentError where it is degenerate or its sites share an index or a
+    place."""
     cell = lattice.cell()
     a, b = cell.vectors
     indices = [site.index for site in cell.sites]
     inside = all(0 <= i < cell.period[0] and 0 <= j < cell.period[1] for i, j in indices)
     if not np.isfinite([*a, *b]).all() or a.x * b.y - a.y * b.x == 0.0:
         raise ExperimentError(f"the cell vectors {tuple(a)} and {tuple(b)} span no area")
+    if flatness(cell) < FLATTEST:
+        raise ExperimentError(
+            f"the cell vectors {tuple(a)} and {tuple(b)} are nearly degenerate: sites lie "
+            f"{1 / flatness(cell):.3g} times closer along one line than the longer is long, and "
+            f"{1 / FLATTEST:g} times is the most; open their angle, or make their lengths more "
+            "alike"
+        )
     if len(set(indices)) < len(indices) or not inside:
         raise ExperimentError(
             f"the basis sites have the indices {indices}: they must differ and lie within the "
             f"period {cell.period}"
         )
+    for s, site in enumerate(cell.sites):
+        for near in cell.offsets(s, SAME_PLACE * math.hypot(*a)):
+            raise ExperimentError(
+                f"the sites with the indices {site.index} and {cell.sites[near.target].index} lie "
+                f"at one place, {tuple(site.at)}; give each its own"
+            )
     return cell
+
+
+def flatness(cell: Cell) -> float:
+    """How much less area than a square a cell has: sites · area / (longer vector)², the sine of
+    the angle for one site and vectors of one length."""
+    a, b = cell.vectors
+    longer = max(math.hypot(*a), math.hypot(*b))
+    area: float = abs(a.x / longer * (b.y / longer) - a.y / longer * (b.x / longer))
+    return len(cell.sites) * area
 
 
 def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Cell, Lattice, Slot, Vector
+from pbdkit.interfaces import Cell, Lattice, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
@@ -35,8 +35,8 @@ class Block:
             slice(self.start[1], self.stop[1]),
         )
 
-    def seen_through(self, slot: Slot) -> Block:
-        """The block of the neighbours at that slot."""
+    def seen_through(self, slot: Slot | Offset) -> Block:
+        """The block of the neighbours at that slot, or of the sites at that offset."""
         (m, n), (a, b), (c, d) = slot.cell, self.start, self.stop
         return Block(slot.target, (a + m, b + n), (c + m, d + n))
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Setting, Vector
+from pbdkit.interfaces import Cell, Setting, Vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Cells, Tiling, tiling_of
@@ -18,19 +18,23 @@ from pbdkit.scene.cutting import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
-from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
+from pbdkit.scene.mesh import Patch, lattice_cells, patches
+from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
 from pbdkit.scene.sizes import refuse_too_large
+
+FLAT = 0.05
+"""Cells flatter than this are warned of."""
 
 
 @dataclass(frozen=True)
 class Scene:
     """An experiment on its lattice.
 
-    `constants` are what the elementwise functions are called with; `frame` is None without one,
-    `cells` where no frame weighs them; `leading` are the leader groups; `warnings` are for the
-    user.
+    `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner`
+    (the scene with the rule's inner rule) are None where the scene has none. `leading` are the
+    leader groups, `warnings` are for the user.
     """
 
     experiment: Experiment
@@ -39,6 +43,7 @@ class Scene:
     constants: SceneConstants
     frame: Frame | None
     cells: Cells | None
+    inner: Scene | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
 
@@ -62,6 +67,11 @@ class Scene:
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
+
+    @cached_property
+    def patches(self) -> tuple[Patch, ...]:
+        """The cells of the body."""
+        return _body_cells(self.raster)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -90,10 +100,10 @@ def _build(experiment: Experiment) -> Scene:
         body, first = filling.body, filling.first
     else:
         body, first = fill(experiment.body, experiment.lattice)
-    warnings += _doubts(neighbourhood, body, layers) + _edge_effects(experiment)
+    warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
     _check_diagnostics(experiment, raster)
-    constants = ask_for_constants(experiment, _setting(raster, neighbourhood))
+    constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
             f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
@@ -105,8 +115,32 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
     cells = filling.on(raster, tiling) if frame.weighs_cells else None
-    parts = (neighbourhood, raster, constants, following, cells, leading)
-    return Scene(experiment, *parts, tuple(warnings))
+    parts = (neighbourhood, raster, constants, following, cells, None, leading)
+    scene = Scene(experiment, *parts, tuple(warnings))
+    return replace(scene, inner=_inner(scene))
+
+
+def _inner(scene: Scene) -> Scene | None:
+    """The scene with the rule's inner rule in its place."""
+    experiment, rule = scene.experiment, scene.experiment.rule
+    with blaming(rule, "when asked for its inner rule", "rule"):
+        inner = rule.inner()
+    if inner is None:
+        return None
+    for unfit, part, remedy in (
+        (scene.frame, "frame", "{type: natural}, which has no points"),
+        (scene.has_fracture, "fracture", "{type: none}"),
+        (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
+    ):
+        if unfit:
+            raise ExperimentError(
+                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
+                f"this {part}; take {part}: {remedy}",
+                (part,),
+            )
+    experiment = experiment.model_copy(update={"rule": inner})
+    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
+    return replace(scene, experiment=experiment, constants=constants)
 
 
 def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:
@@ -123,7 +157,8 @@ def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Fillin
     return fill_with_cells(experiment.body, experiment.lattice, tiling), tiling
 
 
-def _setting(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+    """What a rule may derive its constants from."""
     cell = raster.lattice.cell()
     lower, upper = np.full(2, np.inf), np.full(2, -np.inf)
     for rows in raster.chunks():
@@ -133,8 +168,14 @@ def _setting(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     return Setting(cell, neighbourhood.slots, Vector(*lower.tolist()), Vector(*upper.tolist()))
 
 
-def _doubts(neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
+def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
     doubts = []
+    if flatness(cell) < FLAT:
+        doubts.append(
+            f"lattice: nearly degenerate, sites lie {1 / flatness(cell):.3g} times closer along "
+            "one line than its longer cell vector is long, so that neighbours by distance lie "
+            "along that line; take chebyshev neighbours, or open the angle between the vectors"
+        )
     if not neighbourhood.spans_plane():
         doubts.append(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
@@ -160,12 +201,21 @@ def _edge_effects(experiment: Experiment) -> list[str]:
     ]
 
 
+def _body_cells(raster: Raster) -> tuple[Patch, ...]:
+    return tuple(p for p in patches(raster, lattice_cells(raster.lattice.cell())) if p.whole.any())
+
+
 def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
     taken: dict[str, int] = {}
     for n, diagnostic in enumerate(experiment.diagnostics):
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
             diagnostic.check(raster.count)
             diagnostic.coordinates()
+            if diagnostic.uses_cells and not _body_cells(raster):
+                raise ExperimentError(
+                    f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
+                    "belong to the body; make it wider, or leave the diagnostic out"
+                )
             for variable in diagnostic.variables():
                 if variable.name in taken:
                     other = f"diagnostics.{taken[variable.name]} does too"

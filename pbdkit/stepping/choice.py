@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -9,6 +10,7 @@ from importlib.util import find_spec
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.stepper import Stepper
 
 PATIENCE_S = 3.0
@@ -77,6 +79,8 @@ def obstacle(scene: Scene) -> str:
         return "numba is not installed: pip install 'pbdkit[fast]'"
     if scene.experiment.neighbours.nearness():
         return "neighbours are found anew at every step"
+    if scene.inner:
+        return "the rule works on the moves of another"
     if max(map(len, scene.neighbourhood.slots)) > 31:
         return "more than 31 neighbours"
     return ""
@@ -85,7 +89,17 @@ def obstacle(scene: Scene) -> str:
 def _numpy_seconds(scene: Scene) -> float:
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.count / len(scene.neighbourhood.slots))
-    return a_step * scene.experiment.steps
+    return a_step * _steps(scene)
+
+
+def _steps(scene: Scene) -> float:
+    """How many steps may be made: one that is to settle makes no more than a plain barycentre
+    needs on a body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
+    steps, settle = scene.experiment.steps, scene.experiment.solver.settle
+    if settle is None:
+        return steps
+    cells = max(scene.raster.shape[1:])
+    return min(steps, last_event(scene) + (4 * cells / math.pi) ** 2 * -math.log(settle.tolerance))
 
 
 def _processors() -> int:

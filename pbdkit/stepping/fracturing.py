@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.sums import difference
 
 Steps = NDArray[np.int32]
+DIRECTIONS = tuple(
+    Vector(float(np.cos(angle)), float(np.sin(angle))) for angle in 2.0 * np.pi * np.arange(8) / 8
+)
 
 
 class Fracturing:
@@ -35,13 +39,38 @@ class Fracturing:
 
     def break_bonds(self, m: NDArray[Any], broken_step: Steps, step: int) -> None:
         """Marks, in place, the bonds that break in the intermediate configuration m."""
+        for plane, breaks in self._breaking(m, broken_step, f"at step {step}"):
+            plane[breaks] = step
+
+    def may_break(self, u: NDArray[Any], broken_step: Steps, within: float) -> bool:
+        """Whether any bond breaks at u, or at a configuration in which one of its ends is less than
+        `within` away from there as seen from the other.
+
+        Looked for in eight directions, so far out that the octagon takes in the circle.
+        """
+        radius = within / np.cos(np.pi / len(DIRECTIONS))
+        return any(
+            bool(breaks.any())
+            for along in (Vector(0.0, 0.0), *DIRECTIONS)
+            for _, breaks in self._breaking(
+                u, broken_step, "near equilibrium", Vector(radius * along.x, radius * along.y)
+            )
+        )
+
+    def _breaking(
+        self, m: NDArray[Any], broken_step: Steps, when: str, nudge: Vector | None = None
+    ) -> Iterator[tuple[Steps, NDArray[np.bool_]]]:
+        """For each slot the breaking steps of its bonds, and which break, all differences nudged
+        alike."""
         for n, slot, block, breakable, constants in self._breakable:
             _, rows, columns = block.slices()
             plane = broken_step[n, rows, columns]
             d = difference(m, block, slot)
-            with np.errstate(all="ignore"), blaming(self._model, f"at step {step}"):
+            if nudge:
+                d = Vector(d.x + nudge.x, d.y + nudge.y)
+            with np.errstate(all="ignore"), blaming(self._model, when):
                 breaks = self._model.breaks(d, slot.rest, constants, self._parameters)
-            plane[breakable & (plane < 0) & breaks] = step
+            yield plane, breakable & (plane < 0) & breaks
 
     def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, broken_step: Steps) -> Vector:
         """The difference that the rule sees: that of the fictitious point where the bond broke."""

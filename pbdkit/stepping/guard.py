@@ -1,22 +1,32 @@
-"""Notices a run that leaves all bounds, within a hundred steps of where it does."""
+"""Notices a run that leaves all bounds, within a hundred steps of where it does, and finds the last
+state that was good."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from pbdkit.scene.leading import Leading
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import State
+from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
 """Steps between two looks, at most; recorded steps are looked at too."""
+KEPT_EVERY = 5000
+"""Steps between two copies of the state, at least; what comes after is stepped once more."""
 BEYOND = 1e6
 """How many times the size of the body, its start and its leaders' ways a displacement may be."""
 SAMPLES = 64
 
 
 class Guard:
-    """Looks at states, at two passes over the displacements a look."""
+    """Looks at states, at two passes over the displacements a look.
+
+    A state is good where no displacement is larger than the body, its start and its leaders' ways
+    together.
+    """
 
     def __init__(self, scene: Scene, start: State) -> None:
         self._scene = scene
@@ -24,7 +34,9 @@ class Guard:
         spacing = max(abs(s.rest.x) + abs(s.rest.y) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
         ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
-        self._limit = BEYOND * (size + sum(ways))
+        self._size = size + sum(ways)
+        self._last_good = start.step
+        self._kept: State | None = None
         self.next_look = EVERY
         """The step at which to look at the latest."""
 
@@ -32,11 +44,32 @@ class Guard:
         """Raises FloatingPointError, with particle and step, where a displacement is not finite or
         beyond all bounds."""
         self.next_look = state.step + EVERY
-        if _most(state) <= self._limit:
+        most = _most(state)
+        if most <= self._size:
+            self._last_good = state.step
+            if state.step >= KEPT_EVERY + (self._kept.step if self._kept else 0):
+                self._kept = state.copy(self._kept)
+        if most <= BEYOND * self._size:
             return
         u = self._scene.raster.table(state.u)
         worst = int(np.argmax(np.abs(u).max(axis=1)))  # a NaN counts as the largest
         raise FloatingPointError(f"particle {worst + 1}, found at step {state.step},")
+
+    def last_good(
+        self, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
+    ) -> State | None:
+        """The last good state before a step, found by stepping once more, `patience` steps a call,
+        from where the guard kept a copy; None where `stopping` says so meanwhile."""
+        state, self._kept = self._kept or initial_state(self._scene), None
+        while state.step < self._last_good and not stopping():
+            state = engine.advance(state, min(patience, self._last_good - state.step))
+        good = state.copy()
+        while state.step + 1 < before and not stopping():
+            state = engine.advance(state)
+            if not _most(state) <= self._size:
+                break
+            good = state.copy(good)
+        return None if stopping() else good
 
 
 def _most(state: State) -> float:

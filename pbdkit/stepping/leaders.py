@@ -6,6 +6,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.leading import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
 
@@ -67,6 +68,24 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
         elif step < begins:
             most = min(most, begins - step)
     return most
+
+
+def last_event(scene: Scene) -> int:
+    """The last step within the run at which leaders move or roles change, at least 1."""
+    steps, events = scene.experiment.steps, [1]
+    for leading in scene.leading:
+        first, last = leading.group.from_, leading.group.last(steps)
+        rests = leading.group.motion.rests_after() or 0
+        moments = (first, last + 1, min(last, first - 1 + rests))
+        events += [step for step in moments if step <= steps]
+    return max(events)
+
+
+def is_cut_short(leading: Leading, steps: int) -> bool:
+    """Whether a group leads in the last step, and its motion is not over then."""
+    rests = leading.group.motion.rests_after()
+    over = rests is not None and leading.group.from_ - 1 + rests <= steps
+    return leading.group.leads(steps) and not over
 
 
 def place(u: Floats, led: Led) -> None:

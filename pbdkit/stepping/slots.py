@@ -60,12 +60,23 @@ class SlotFollowers(Followers):
         self._rule = scene.experiment.rule
         self._parameters = scene.constants.rule
         self._fracturing = fracturing
+        self._inner = SlotFollowers(scene.inner, None, Stepping()) if scene.inner else None
         self._parts = [part for s in range(scene.raster.shape[0]) for part in self._cut(s)]
 
     def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
         """Every block from m alone: their order does not matter."""
+        seen = self._inner.moves(m) if self._inner else m
         for part in self._parts:
-            self._move(part, m, new, broken_step)
+            self._place(part, self._moves(part, seen, broken_step), m, new)
+
+    def moves(self, m: Floats) -> Floats:
+        """The rule's moves, leaders' too; zero where nobody can move."""
+        seen, out = self._inner.moves(m) if self._inner else m, np.zeros_like(m)
+        for part in self._parts:
+            moves = self._moves(part, seen, None)
+            for move, plane in zip(moves, planes(out, part.block), strict=True):
+                plane[...] = move if part.movable is None else np.where(part.movable, move, 0.0)
+        return out
 
     def _cut(self, sublattice: int) -> list[_Part]:
         whole = self._scene.raster.body_block(sublattice)
@@ -85,9 +96,9 @@ class SlotFollowers(Followers):
             None if movable.all() else movable,
         )
 
-    def _move(
-        self, part: _Part, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None
-    ) -> None:
+    def _moves(
+        self, part: _Part, m: Floats, broken_step: NDArray[np.int32] | None
+    ) -> tuple[Any, Any]:
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
@@ -97,8 +108,11 @@ class SlotFollowers(Followers):
             return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
 
         total = sum_over_slots(part.slots, part.present, contribution)
-        move = self._rule.apply(total, Here(u, part.X), self._parameters)
-        out = planes(new, part.block)
+        return self._rule.apply(total, Here(u, part.X), self._parameters)
+
+    def _place(self, part: _Part, move: tuple[Any, Any], m: Floats, new: Floats) -> None:
+        """Writes where the particles of a block go."""
+        u, out = planes(m, part.block), planes(new, part.block)
         for here, step, plane in zip(u, move, out, strict=True):
             moved = target(here, step, plane, self._solver)
             plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)

@@ -36,6 +36,18 @@ class State:
     broken_step: NDArray[np.int32] | None
     starts: tuple[Floats | None, ...]
 
+    def copy(self, over: State | None = None) -> State:
+        """The same state in arrays of its own, or in those of a state of the same scene that
+        nobody needs any more: memory that is new costs several times as much as what is copied."""
+        if over is None:
+            broken = None if self.broken_step is None else self.broken_step.copy()
+            return State(self.step, self.u.copy(), self.previous.copy(), broken, self.starts)
+        np.copyto(over.u, self.u)
+        np.copyto(over.previous, self.previous)
+        if over.broken_step is not None and self.broken_step is not None:
+            np.copyto(over.broken_step, self.broken_step)
+        return State(self.step, over.u, over.previous, over.broken_step, self.starts)
+
 
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across

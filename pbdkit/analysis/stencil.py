@@ -1,0 +1,111 @@
+"""The rule's move linearised at rest on the infinite lattice: a matrix for each neighbour.
+
+    move_j = own u_j + Σ_k W_k u_k,  W_k = ∂move/∂u_k,  own = ∂move/∂u_j
+
+from the rule's own `gather` and `apply`; exact for linear rules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.derivatives import derivative
+from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.interfaces.lattice import Index
+from pbdkit.scene.scene import Scene
+
+Floats = NDArray[np.float64]
+NOWHERE = Vector(None, None)
+STILL = Vector(np.float64(0.0), np.float64(0.0))
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """`own` is (sublattice, axis of the move, axis of u), `neighbours` holds W_k of every slot,
+    (axis of the move, axis of u)."""
+
+    own: Floats
+    neighbours: dict[Slot, Floats]
+
+
+def linearised(scene: Scene, at: Vector = NOWHERE) -> Stencil:
+    """The stencil of the scene's rule; `at` is the reference position for rules that use it."""
+    if scene.inner:
+        return _composed(linearised(replace(scene, inner=None), at), linearised(scene.inner, at))
+    every = scene.neighbourhood.slots
+    own = np.array([_derivative(scene, slots, None, at) for slots in every])
+    neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
+    return Stencil(own, neighbours)
+
+
+def _composed(outer: Stencil, inner: Stencil) -> Stencil:
+    """The stencil of a rule that works on the moves of another."""
+    own = np.zeros_like(outer.own)
+    neighbours: dict[Slot, Floats] = {}
+    known: dict[tuple[int, int, Index], Slot] = {}
+    for first, W in _with_itself(outer):
+        for second, V in _with_itself(inner):
+            if first.target != second.source:
+                continue
+            slot = _after(first, second)
+            key = slot.source, slot.target, slot.cell
+            if slot.source == slot.target and slot.cell == (0, 0):
+                own[slot.source] += W @ V
+            else:
+                slot = known.setdefault(key, slot)
+                neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
+    return Stencil(own, neighbours)
+
+
+def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
+    for s, own in enumerate(stencil.own):
+        yield Slot(s, s, (0, 0), (0, 0), Vector(0.0, 0.0), 0), own
+    yield from stencil.neighbours.items()
+
+
+def _after(first: Slot, second: Slot) -> Slot:
+    """Where two slots lead, one after the other."""
+    return Slot(
+        first.source,
+        second.target,
+        (first.cell[0] + second.cell[0], first.cell[1] + second.cell[1]),
+        (first.site[0] + second.site[0], first.site[1] + second.site[1]),
+        Vector(first.rest.x + second.rest.x, first.rest.y + second.rest.y),
+        first.shell + second.shell,
+    )
+
+
+def move(
+    scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Vector], here: Here
+) -> tuple[Any, Any]:
+    """The rule's move of a particle with all its neighbours, d = difference(slot) along each."""
+    rule, constants = scene.experiment.rule, scene.constants
+    parts = [
+        rule.gather(difference(slot), slot.rest, constants.weights[slot], constants.rule)
+        for slot in slots
+    ]
+    total = tuple(sum(part[1:], part[0]) for part in zip(*parts, strict=True))
+    return rule.apply(total, here, constants.rule)
+
+
+def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Vector) -> Floats:
+    """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are: (2, 2)."""
+    columns = []
+    for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+
+        def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
+            nudge = Vector(np.multiply(step, along.x), np.multiply(step, along.y))
+            back = Vector(-nudge.x, -nudge.y)
+
+            def difference(slot: Slot) -> Vector:
+                return back if of is None else nudge if slot is of else STILL
+
+            return move(scene, slots, difference, Here(nudge if of is None else STILL, at))
+
+        columns.append(derivative(moved))
+    return np.array(columns).T

@@ -1,0 +1,113 @@
+"""What Python users call: from a file, a dict or an object to an experiment and its dataset."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pbdkit.analysis.analysis import Analysis
+from pbdkit.analysis.forecast import refuse_too_much_output
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.settings import with_setting
+from pbdkit.experiment.shipped import read_experiment
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import Component
+from pbdkit.registry.registry import GIVEN, Registry
+from pbdkit.results.memory import MemorySink
+from pbdkit.running import run_into
+from pbdkit.scene.scene import build_scene
+
+if TYPE_CHECKING:
+    import xarray
+
+    from pbdkit.identity.identity import Identity
+
+Components = Iterable[type[Component]]
+
+
+def load(
+    name: str | Path, *, components: Components = (), settings: Iterable[str] = ()
+) -> Experiment:
+    """The experiment in a YAML file, or the shipped one of that name, e.g. "paper/a".
+
+    `settings` are changes such as "rule.K=-0.002"; `components` are classes from Python that the
+    experiment may name besides the installed ones. Raises ExperimentError and PluginError.
+    """
+    source = read_experiment(str(name))
+    for setting in settings:
+        source = with_setting(source, setting, Experiment.defaults())
+    return Experiment.build(source, components)
+
+
+def run(
+    experiment: Experiment | Mapping[str, Any] | str | Path,
+    *,
+    components: Components = (),
+    progress: bool = True,
+) -> xarray.Dataset:
+    """Runs an experiment and returns its dataset; nothing is written.
+
+    `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
+    ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
+    DivergedError, with what was recorded before, when the run leaves the finite numbers. Warns,
+    with pbdkit.PbdkitWarning, where the last state is inside out.
+    """
+    sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
+    refuse_too_much_output(scene)
+    report = run_into(sink, scene, progress=progress)
+    dataset = sink.dataset()
+    if report.outcome.status in ("diverged", "unconverged"):
+        raise DivergedError(report.outcome.stop_reason, dataset)
+    for warning in report.warnings:
+        warnings.warn(warning, PbdkitWarning, stacklevel=2)
+    return dataset
+
+
+def analyse(
+    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
+) -> Analysis:
+    """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
+    and the step operator as a sparse matrix (``.operator``)."""
+    return Analysis(build_scene(_experiment(experiment, components)))
+
+
+def identify(
+    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
+) -> Identity:
+    """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
+    elastic body, with its constants, from the rule's answer to plane waves."""
+    from pbdkit.identity.finding import identified
+
+    return identified(build_scene(_experiment(experiment, components)))
+
+
+def rerun(
+    dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
+) -> xarray.Dataset:
+    """The same run again, bit for bit, from the experiment that the dataset carries."""
+    if "experiment" not in dataset.attrs:
+        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
+    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
+    try:
+        experiment = Experiment.build(source, components)
+    except ExperimentError as error:
+        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
+        if given is None or components:
+            raise
+        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+    return run(experiment, progress=progress)
+
+
+def _experiment(
+    given: Experiment | Mapping[str, Any] | str | Path, components: Components
+) -> Experiment:
+    if isinstance(given, Experiment):
+        Registry(components)  # what is handed over is checked, needed or not
+        return given
+    if isinstance(given, Mapping):
+        return Experiment.build(Source(data=dict(given)), components)
+    return load(given, components=components)

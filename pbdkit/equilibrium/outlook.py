@@ -1,0 +1,160 @@
+"""Where a state is heading for, and how far that is at most."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.equilibrium.certificate import spacing_of
+from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
+from pbdkit.equilibrium.moves import Moves, owed_by, rounding
+from pbdkit.equilibrium.system import System
+from pbdkit.errors import ExperimentError
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import Floats, State
+
+Vectors = NDArray[np.float64]
+ACCURACY = 1e-8
+"""How well linear systems are solved; the bound takes in what that leaves."""
+
+CONTRACTION = 0.1
+"""The share of the moves that a correction may leave for its linearisation to be trusted: further
+ones, each that much smaller, then lie within a ninth of the first."""
+BENT = "the rule bends too much between there and equilibrium for a bound"
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """`u` is the equilibrium ahead as far as it is known, and no follower is farther from it than
+    `distance`; `residual` is the largest move at the state, `bound` says how the distance was
+    obtained, by which linear `method`, and whether the rule was `linearised`; `obstacle` why there
+    is no distance, where it is infinite."""
+
+    u: Floats
+    distance: float
+    residual: float
+    method: str
+    bound: str
+    linearised: bool
+    obstacle: str
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """A linearisation of the step, and where its unknowns are on the flat raster."""
+
+    operator: StepOperator
+    system: System
+    place: NDArray[np.intp]
+
+
+class Foresight:
+    """The outlook from states of a scene with the roles of its last step.
+
+    The correction c, A c = move, leads from u to the equilibrium, and what it fails to do is seen
+    in the moves where it leads:
+
+        distance ≤ max |c| + (bound on |A⁻¹|) · |move(u + c)|,
+
+    for rules that are not linear with A linearised at u, the second term to first order, doubled,
+    and only where the correction leaves a tenth of the moves at most.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._moves = scene, Moves(scene)
+        self._at_rest: _Linearised | None = None
+        self._broken = 0
+        self._linear = False
+        self._past_iterations = 0
+        self.linearisations = 0
+        """How often a system was set up."""
+
+    def from_(self, state: State) -> Outlook:
+        """The outlook from the end of a step, which is left as it is.
+
+        The distance is infinite where no bound is known: for what is pushed on for ever, and for
+        parts that nothing holds under rules that are not linear.
+        """
+        u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
+        here = replace(state, u=u, previous=previous)
+        broken = 0 if state.broken_step is None else int((state.broken_step >= 0).sum())
+        if self._at_rest is None or broken != self._broken:
+            self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
+            self._linear = self._is_linear(here, self._at_rest)
+        if self._linear:
+            return self._outlook(here, self._at_rest)
+        known = self._linearised(here, u)
+        found = self._outlook(here, known, anew=True)
+        self._past_iterations += known.system.iterations
+        return found
+
+    @property
+    def iterations(self) -> int:
+        """Those of the linear solvers."""
+        own = self._at_rest.system.iterations if self._at_rest else 0
+        return self._past_iterations + own
+
+    def _linearised(self, state: State, u: Floats) -> _Linearised:
+        operator = step_operator(self._scene, replace(state, u=u))
+        reference = self._scene.raster.reference(operator.followers)
+        self.linearisations += 1
+        system = System(operator, "auto", reference)
+        return _Linearised(operator, system, self._scene.raster.place_of(operator.followers))
+
+    def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:
+        """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
+        moves = self._moves.at(here.u, here.broken_step, known.place)
+        ahead, distance = here.u.copy(), math.inf
+        correction, obstacle = self._correction(here, known, moves, anew)
+        if correction is not None:
+            ahead.reshape(2, -1)[:, known.place] += correction.T
+            left = self._moves.at(ahead, here.broken_step, known.place)
+            bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
+            distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
+            if anew and not _smaller(left, moves, rounding(ahead)):
+                distance, obstacle = math.inf, BENT
+        return Outlook(
+            u=ahead,
+            distance=distance if math.isfinite(distance) else math.inf,
+            residual=float(np.abs(moves).max(initial=0.0)),
+            method=known.system.methods,
+            bound=known.system.how,
+            linearised=anew,
+            obstacle=obstacle,
+        )
+
+    def _correction(
+        self, here: State, known: _Linearised, moves: Vectors, anew: bool
+    ) -> tuple[Vectors | None, str]:
+        """(follower, axis); None, and why, where there is no equilibrium, or none that is known."""
+        try:
+            if anew:
+                known.system.refuse_moving_floats(moves, rounding(here.u))
+            owed = owed_by(known.operator, here, known.place)
+            return known.system.solve(moves, ACCURACY, owed), ""
+        except ExperimentError as error:
+            return None, str(error).partition("; ")[0] + "; let a leader hold it"
+
+    def _is_linear(self, here: State, known: _Linearised) -> bool:
+        """Whether followers put elsewhere, at random and as far as the body has come, move by what
+        the linearisation at rest says."""
+        size = float(np.abs(here.u).max()) or spacing_of(self._scene)
+        shape = (len(known.place), 2)
+        put = np.random.default_rng(0).uniform(-size, size, shape)
+        there = here.u.copy()
+        there.reshape(2, -1)[:, known.place] += put.T
+        change = self._moves.at(there, here.broken_step, known.place) - self._moves.at(
+            here.u, here.broken_step, known.place
+        )
+        with np.errstate(all="ignore"):
+            wrong = float(np.linalg.norm(change + known.system.times(put)))
+        return wrong <= LINEAR * float(np.linalg.norm(put))
+
+
+def _smaller(left: Vectors, moves: Vectors, rounding: float) -> bool:
+    most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding
+    return bool(np.abs(left).max(initial=0.0) <= most)

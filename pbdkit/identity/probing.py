@@ -1,0 +1,172 @@
+"""What plane waves do not tell: whether a rule rests, is linear, turns with the body, and is the
+same everywhere. Asked of the rule's own functions with single numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.stencil import NOWHERE, STILL, Stencil, linearised, move
+from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.scene.scene import Scene, setting_of
+
+Floats = NDArray[np.float64]
+Slots = tuple[Slot, ...]
+Differences = dict[Slot, Floats]
+ROUNDING = 1e-9
+SLANT = 0.3137
+"""Of a free edge: no row of a lattice lies along it."""
+ANGLE = 1.0
+"""A finite rotation, in radians: any but a symmetry of some lattice."""
+AMPLITUDE, SMALL = 0.1, 1e-5
+"""Of the displacements that a rule is tried with, in units of the spacing."""
+STRAIGHT = 1e-3
+"""How far the answer to small displacements may be from a linear one."""
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What a rule answers: `stencil` in the middle of the body; `move_at_rest`, its largest move
+    of a body at rest (lattice units), and `rests_at_edges`, whether there is none either with half
+    the neighbours missing; `smooth`, `linear` and `turns` anywhere in the body;
+    `place_dependence` in words, None where there is none."""
+
+    stencil: Stencil
+    move_at_rest: float
+    rests_at_edges: bool
+    smooth: bool
+    linear: bool
+    turns: bool
+    symmetric: bool
+    place_dependence: str | None
+
+
+def probed(scene: Scene, spacing: float) -> Probed:
+    """The answers of the scene's rule, in the middle and, where it asks for the place, in the
+    corners of the body."""
+    stencils = {at: linearised(scene, at) for at in _places(scene)}
+    middle = next(iter(stencils.values()))
+    half = tuple(_one_side(own) for own in scene.neighbourhood.slots)
+    passes = [(one, at) for one in _passes(scene) for at in stencils]
+    return Probed(
+        middle,
+        max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes),
+        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
+        all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes),
+        all(_answers(one, at, AMPLITUDE * spacing, ROUNDING) for one, at in passes),
+        all(_turns_with_the_body(one, at, spacing) for one, at in passes),
+        all(_is_symmetric(of) for of in stencils.values()),
+        _place_dependence(scene, stencils),
+    )
+
+
+def _passes(scene: Scene) -> list[Scene]:
+    """The scene with each of its rules alone, where one works on the moves of another."""
+    inner = _passes(scene.inner) if scene.inner else []
+    return [replace(scene, inner=None), *inner]
+
+
+def _places(scene: Scene) -> list[Vector]:
+    """The middle of the body, and its corners, for rules that ask for the place."""
+    if not scene.experiment.rule.uses_reference:
+        return [NOWHERE]
+    setting = setting_of(scene.raster, scene.neighbourhood)
+    (left, low), (right, high) = setting.lower, setting.upper
+    corners = [(x, y) for x in (left, right) for y in (low, high)]
+    at = [((left + right) / 2, (low + high) / 2), *corners]
+    return [Vector(np.float64(x), np.float64(y)) for x, y in at]
+
+
+def _one_side(slots: Slots) -> Slots:
+    """The neighbours that a particle on a free edge has: those on one side of a slanted line."""
+    return tuple(slot for slot in slots if slot.rest.x + SLANT * slot.rest.y > 0.0)
+
+
+def _move_at_rest(scene: Scene, at: Vector, slots: tuple[Slots, ...]) -> float:
+    moves = [np.abs(_moved(scene, own, {}, at)).max() for own in slots if own]
+    return float(max(moves, default=0.0))
+
+
+def _answers(scene: Scene, at: Vector, size: float, within: float) -> bool:
+    """Whether the rule's move is Σ W d for random differences d of that size."""
+    stencil = linearised(scene, at)
+    generator = np.random.default_rng(0)
+    for slots in scene.neighbourhood.slots:
+        d = {slot: size * generator.uniform(-1, 1, 2) for slot in slots}
+        moved = _moved(scene, slots, d, at) - _moved(scene, slots, {}, at)
+        expected = sum(stencil.neighbours[slot] @ d[slot] for slot in slots)
+        if not np.abs(moved - expected).max() <= within * size:
+            return False
+    return True
+
+
+def _turns_with_the_body(scene: Scene, at: Vector, spacing: float) -> bool:
+    """Whether a finite rotation of all neighbours about the particle rotates its move."""
+    generator = np.random.default_rng(1)
+    c, s = np.cos(ANGLE), np.sin(ANGLE)
+    turn = np.array([[c, -s], [s, c]])
+    for slots in scene.neighbourhood.slots:
+        d = {k: AMPLITUDE * spacing * generator.uniform(-1, 1, 2) for k in slots}
+        turned = {k: turn @ (np.array(k.rest) + d[k]) - np.array(k.rest) for k in slots}
+        expected = turn @ _moved(scene, slots, d, at)
+        found = _moved(scene, slots, turned, at)
+        if not np.abs(found - expected).max() < ROUNDING * spacing:
+            return False
+    return True
+
+
+def _is_symmetric(stencil: Stencil) -> bool:
+    """Whether the matrix of j for k is the transpose of that of k for j."""
+    by_key = {(s.source, s.target, s.cell): matrix for s, matrix in stencil.neighbours.items()}
+    scale = max(np.abs(matrix).max() for matrix in by_key.values())
+    apart = [
+        np.abs(matrix - by_key[t, s, (-m, -n)].T).max() for (s, t, (m, n)), matrix in by_key.items()
+    ]
+    own = np.abs(stencil.own - np.swapaxes(stencil.own, 1, 2)).max()
+    return bool(max(*apart, own) <= ROUNDING * scale)
+
+
+def _place_dependence(scene: Scene, stencils: dict[Vector, Stencil]) -> str | None:
+    """How the rule differs between the body's middle and its corners; None where it does not."""
+    middle, *corners = [_matrices(of) for of in stencils.values()]
+    if not corners:
+        return None
+    differences = [corner - middle for corner in corners]
+    sizes = [float(np.abs(difference).max()) for difference in differences]
+    worst = int(np.argmax(sizes))
+    if sizes[worst] <= ROUNDING * np.abs(middle).max():
+        return None
+    corner = list(stencils)[1 + worst]
+    parameters = ", ".join(scene.experiment.rule.numeric_parameters())
+    verdict = f"; no constant of a material does that: {parameters} is no Poisson ratio"
+    text = _worded(scene, differences[worst], f"({corner.x:.6g}, {corner.y:.6g})")
+    return text + (verdict if parameters else "")
+
+
+def _matrices(stencil: Stencil) -> Floats:
+    return np.array([*stencil.neighbours.values(), *stencil.own])
+
+
+def _worded(scene: Scene, difference: Floats, corner: str) -> str:
+    """The effect on a translation, where there is one."""
+    slots = scene.neighbourhood.slots
+    defect = difference[: len(slots[0])].sum(axis=0) + difference[-len(slots)]
+    pushed = int(np.abs(defect).argmax())
+    if abs(defect.ravel()[pushed]) < ROUNDING:
+        return f"it depends on the place: the weights at {corner} are not those in the middle"
+    to, along = "xy"[pushed // 2], "xy"[pushed % 2]
+    return (
+        f"it depends on the place: when everything moves by 1 along {along}, the particle at "
+        f"{corner} of the body moves {defect.ravel()[pushed]:.6g} more along {to} a step than the "
+        "one in the middle"
+    )
+
+
+def _moved(scene: Scene, slots: Slots, d: Differences, at: Vector) -> Floats:
+    def difference(slot: Slot) -> Vector:
+        return Vector(*d[slot]) if slot in d else STILL
+
+    with np.errstate(all="ignore"):
+        return np.array(move(scene, slots, difference, Here(STILL, at)), float)

@@ -1,0 +1,166 @@
+"""The cells between the sites of a lattice: they tile the plane, and show what is inside out."""
+
+import json
+from typing import Literal
+
+import numpy as np
+import pytest
+from property_cases import BOTH_ENDS_HELD, LATTICES, displace, experiment, scene_of, state_with
+
+import pbdkit
+from pbdkit.components.diagnostics import smallest_corner_area
+from pbdkit.interfaces import BasisSite, Cell, Vector
+from pbdkit.results.inversion import inside_out
+from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.scene.mesh import lattice_cells
+from pbdkit.stepping.state import initial_state
+
+every_lattice = pytest.mark.parametrize("lattice", LATTICES)
+ROOT3 = 3.0**0.5
+HONEYCOMB = Cell(
+    (Vector(1.5, ROOT3 / 2), Vector(0.0, ROOT3)),
+    (BasisSite(), BasisSite(Vector(1.0, 0.0), (1, 0), (1, 0))),
+    (2, 1),
+    ((2, 0), (0, 1)),
+)
+KAGOME = Cell(
+    (Vector(2.0, 0.0), Vector(1.0, ROOT3)),
+    (
+        BasisSite(),
+        BasisSite(Vector(1.0, 0.0), (1, 0), (1, 0)),
+        BasisSite(Vector(0.5, ROOT3 / 2), (0, 1), (0, 1)),
+    ),
+    (2, 2),
+    ((2, 0), (0, 2)),
+)
+
+
+def area_of(polygon):
+    (x, y), (to_x, to_y) = np.transpose(polygon), np.roll(polygon, -1, axis=0).T
+    return float((x * to_y - y * to_x).sum()) / 2
+
+
+def cell_of(lattice):
+    return scene_of(lattice=lattice).raster.lattice.cell()
+
+
+@pytest.mark.parametrize(
+    ("cell", "corners"),
+    [
+        *((cell_of(name), [4] if "rect" in name[:4] or name == "square" else None)
+          for name in LATTICES),
+        (HONEYCOMB, [6]),
+        (KAGOME, [3, 3, 6]),
+        (Cell((Vector(1.0, 0.0), Vector(0.996, 0.087))), [3, 3]),
+        (Cell((Vector(1.0, 0.0), Vector(7.0, 1.0))), [4]),
+    ],
+)  # fmt: skip
+def test_the_cells_of_a_lattice_tile_the_plane(cell, corners):
+    polygons = [found.rest for found in lattice_cells(cell)]
+    a, b = cell.vectors
+    areas = [area_of(polygon) for polygon in polygons]
+    assert min(areas) > 0
+    assert sum(areas) == pytest.approx(abs(a.x * b.y - a.y * b.x), rel=1e-12)
+    assert sorted(map(len, polygons)) == (corners or [3] * 2 * len(cell.sites))
+
+
+def measured(scene, u, *, intact_only=False):
+    """The shares of all cells of a body whose displacements are u, (body particle, axis)."""
+    moment = StateMoment(state_with(scene, u), Tables(scene))
+    return moment.over_cells(smallest_corner_area, intact_only=intact_only)
+
+
+@every_lattice
+def test_all_cells_of_an_affine_deformation_have_the_share_of_its_determinant(lattice):
+    scene = scene_of(5, 4, lattice=lattice)
+    X = scene.raster.reference(scene.raster.body_rows)
+    assert (measured(scene, 0 * X) == 1.0).all()
+    for gradient in (
+        [[0.3, -0.2], [0.5, 0.1]],
+        [[-2.0, 0.0], [0.0, 0.0]],
+        [[0.0, 0.0], [1.0, -3.0]],
+    ):
+        shares = measured(scene, X @ np.array(gradient).T)
+        determinant = np.linalg.det(np.eye(2) + gradient)
+        np.testing.assert_allclose(shares, determinant, rtol=0, atol=1e-13)
+
+
+def test_a_corner_folded_over_its_diagonal_is_inside_out_though_the_square_is_not():
+    """A square with a corner at (.4, .4): the whole has .4 of its area, that corner -.2."""
+    scene = scene_of(2, 2)
+    u = np.zeros((4, 2))
+    u[3] = -0.6
+    assert area_of([(0, 0), (1, 0), (0.4, 0.4), (0, 1)]) == pytest.approx(0.4)
+    np.testing.assert_allclose(measured(scene, u), [-0.2], rtol=0, atol=1e-15)
+
+
+@every_lattice
+def test_cells_with_a_broken_bond_count_where_they_are_asked_for(lattice):
+    crack = {"type": "threshold", "thresholds": [9.0], "cracks": [[[1.75, -9.0], [1.75, 9.0]]]}
+    scene = scene_of(6, 5, lattice=lattice, fracture=crack)
+    moment = StateMoment(initial_state(scene), Tables(scene))
+    low = scene.raster.reference(scene.raster.body_rows).min(axis=0)
+    high = scene.raster.reference(scene.raster.body_rows).max(axis=0)
+    assert low[0] < 1.75 < high[0]
+    every, intact = (moment.over_cells(smallest_corner_area, intact_only=k) for k in (False, True))
+    assert 0 < len(intact) < len(every)
+    if lattice == "square":
+        assert (len(intact), len(every)) == (16, 20)  # the crack runs through a column of four
+
+
+def test_parts_of_a_broken_body_may_pass_each_other():
+    """Both halves as they were, the right one moved to the other side of the left one."""
+    crack = {"type": "threshold", "thresholds": [9.0], "cracks": [[[2.5, -9.0], [2.5, 9.0]]]}
+    scene = scene_of(6, 5, fracture=crack)
+    u = np.zeros((30, 2))
+    u[15:, 0] = -4.0
+    broken = StateMoment(state_with(scene, u), Tables(scene))
+    assert inside_out(broken) is None
+    whole = scene_of(6, 5)
+    warning = inside_out(StateMoment(state_with(whole, u), Tables(whole)))
+    assert warning == (
+        "the last state is inside out: 4 of 20 cells have turned over, the worst, at particle "
+        "23, to -3 of its area at rest; let the leaders go less far, or weaken the rule where it "
+        "couples x and y"
+    )
+
+
+def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
+    (tmp_path / "e.json").write_text(json.dumps(experiment(leaders=[displace([9], 4.0, 0.0)])))
+    said = call("run", str(tmp_path / "e.json"), "-o", "a.nc")
+    assert said.code == 0
+    assert said.err.startswith("warning: the last state is inside out: ")
+    quiet = call("run", str(tmp_path / "e.json"), "-o", "b.nc", "--quiet")
+    assert quiet.err == ""
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(1, 5), (6, 1), (1, 1)])
+def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
+    given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
+    asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
+    message = "diagnostics.0.*needs cells, and nowhere do the corners of one all belong to the body"
+    with pytest.raises(pbdkit.ExperimentError, match=message):
+        pbdkit.run(asked, progress=False)
+    assert pbdkit.run(given, progress=False).status == "complete"
+
+
+class Areas(pbdkit.Diagnostic):
+    """The sum of the areas of all cells now: a third party's use of them."""
+
+    type: Literal["areas"] = "areas"
+
+    def variables(self):
+        return (pbdkit.Variable("areas", (), "area", "1"),)
+
+    def measure(self, now):
+        def area(d, r):
+            x = [Vector(a.x + b.x, a.y + b.y) for a, b in zip(d, r, strict=True)]
+            return sum(x[k - 1].x * x[k].y - x[k - 1].y * x[k].x for k in range(len(x))) / 2
+
+        return (now.over_cells(area).sum(),)
+
+
+def test_a_diagnostic_of_ones_own_gets_the_cells():
+    given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
+    ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)
+    assert ds.areas[0] == pytest.approx(1.5 * 20)

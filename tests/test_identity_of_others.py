@@ -1,0 +1,224 @@
+"""What `pbdkit identify` says of third parties' rules and lattices, and how it says it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identity_cases import (
+    BARYCENTRE,
+    EIGHT,
+    HEXAGONAL,
+    NEAREST,
+    RECTANGULAR,
+    SQUARE,
+    WEIGHTED,
+    identity,
+    oblique,
+)
+
+import pbdkit
+from pbdkit.identity.picture import by_direction
+
+HONEYCOMB = {"type": "honeycomb"}
+
+
+def test_a_lattice_with_two_sites_is_seen_through_its_slow_waves():
+    """A walk over three neighbours at distance 1 spreads by 1/4; waves λ = ±|Σ exp(ik·r)|/3."""
+    found = identity(HONEYCOMB, NEAREST, BARYCENTRE)
+    assert (found.kind, found.symmetry) == ("diffusion", "isotropic")
+    assert found.stencil.sites == 2
+    assert found.diffusivity == pytest.approx(0.25, rel=1e-12)
+    assert found.spectrum.smallest == pytest.approx(-1.0, abs=1e-12)
+    assert "2 sites a cell: shifts of them are eliminated" in found.notes
+
+
+def test_springs_along_a_honeycomb_resist_no_shear():
+    """Three bonds a site are too few: C11 = C12 and C66 = 0, with the sites' shift let go."""
+    found = identity(HONEYCOMB, NEAREST, "central")
+    constants = found.body.stiffness / found.body.stiffness[0, 0]
+    np.testing.assert_allclose(constants, [[1, 1, 0], [1, 1, 0], [0, 0, 0]], atol=1e-12)
+    assert found.body.least_stiffness == pytest.approx(0.0, abs=1e-12)
+    assert "some uniform strain costs no energy" in found.notes
+    assert any(note.endswith("do not decay at all") for note in found.notes)
+
+
+def test_equal_springs_along_triangles_are_isotropic_and_along_squares_are_not():
+    triangles = identity(HEXAGONAL, NEAREST, "central")
+    assert (triangles.symmetry, triangles.poisson_ratio) == ("isotropic", pytest.approx(1 / 3))
+    squares = identity(SQUARE, EIGHT, "central")
+    assert (squares.symmetry, squares.body.axis) == ("square", 0.0)
+    # C11 as Σ n_x² x² = 2 + 2 over edges and diagonals, C12 = C66 as Σ n_x² y² = 0 + 2.
+    np.testing.assert_allclose(
+        squares.body.stiffness / squares.body.stiffness[0, 0],
+        [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 0.5]],
+        atol=1e-12,
+    )
+    assert squares.body.zener == pytest.approx(2.0)
+
+
+def test_a_cell_larger_than_needed_changes_nothing():
+    two_sites, one_site = (
+        identity(lattice, NEAREST, WEIGHTED)
+        for lattice in ({"type": "hexagonal", "a": 1.0}, oblique(60.0))
+    )
+    assert (two_sites.stencil.sites, one_site.stencil.sites) == (1, 1)
+    np.testing.assert_allclose(two_sites.long.second, one_site.long.second, atol=1e-12)
+    assert two_sites.spectrum.smallest == pytest.approx(one_site.spectrum.smallest, abs=1e-9)
+
+
+def test_the_scale_of_the_lattice_changes_nothing():
+    small, large = (
+        identity({"type": "square", "a": a}, EIGHT, {"type": "elastic", "poisson_ratio": 0.3})
+        for a in (1e-3, 1e3)
+    )
+    np.testing.assert_allclose(small.long.second, large.long.second, atol=1e-12)
+    assert (small.spacing, large.spacing) == (1e-3, 1e3)
+
+
+@pytest.mark.parametrize(
+    ("rule", "reason"),
+    [
+        (
+            "odd",
+            "the coupling is not symmetric: ∂x∂x of y moves x by 0.1125 and ∂x∂x of x moves y by "
+            "-0.1125, so that there is no energy",
+        ),
+        (
+            "slanted",
+            "a rigid rotation costs energy: the second-order terms Q_xxxy = 0.125 and Q_xyxx = 0 "
+            "would be one constant",
+        ),
+        (
+            "windy",
+            "neighbours opposite to each other do not weigh the same: a displacement is carried "
+            "along, on average by (-0.15, 0) h a step",
+        ),
+        (
+            "anchored",
+            "a rigid translation is not left alone: when everything moves by 1 along x, the rule "
+            "moves a particle by -0.1 along x a step",
+        ),
+        (
+            "restless",
+            "a body at rest does not stay: the rule moves it by 0.01 h a step",
+        ),
+        (
+            "bent",
+            "small displacements do not add up, however small: the rule is not differentiable at "
+            "rest, and no plane wave answers for another",
+        ),
+        (
+            "idle",
+            "nothing of second order is left: long waves do not decay as diffusion does",
+        ),
+        (
+            "growing",
+            "long waves along 0° grow instead of decaying: their diffusivity is -0.375",
+        ),
+        (
+            "sloping",
+            "it depends on the place: the weights at (8, 0) are not those in the middle",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_neither_is_told_why(rule, reason):
+    found = identity(SQUARE, EIGHT, rule)
+    assert (found.kind, found.symmetry, found.poisson_ratio) == ("neither", None, None)
+    assert reason in found.reasons
+    json.dumps(found.as_dict())
+
+
+def test_growing_waves_are_stable_at_no_relaxation():
+    found = identity(SQUARE, EIGHT, "growing")
+    assert found.spectrum.largest_stable_relaxation is None
+    assert "some waves grow at any relaxation" in found.notes
+
+
+def test_turning_waves_have_their_own_bound():
+    """z = 1 ± 0.3 i times that of the barycentre, up to 3/2: w < 2 / (1.5 · 1.09)."""
+    found = identity(SQUARE, EIGHT, "odd")
+    assert found.spectrum.largest_stable_relaxation == pytest.approx(2 / (1.5 * 1.09))
+    assert found.spectrum.imaginary == pytest.approx(0.45)
+
+
+def test_a_rule_at_fault_is_named():
+    with pytest.raises(pbdkit.PluginError) as caught:
+        identity(SQUARE, EIGHT, "failing")
+    assert str(caught.value) == (
+        "FollowerRule 'failing' failed when asked for its answer to small displacements: "
+        "ValueError: no such neighbour"
+    )
+    with pytest.raises(pbdkit.ExperimentError) as refused:
+        identity(SQUARE, EIGHT, "dividing")
+    assert str(refused.value) == (
+        "'dividing' answers small displacements of a body at rest with numbers that are not "
+        "finite: look at what it divides by"
+    )
+    assert refused.value.where == ("rule",)
+
+
+def test_the_command_prints_a_table_and_the_figures(call):
+    result = call("identify", "e.json")
+    assert (result.code, result.err) == (0, "")
+    assert result.out.startswith("tensile: barycentre, square lattice, 4 neighbours (coordination)")
+    rows = {line[:22].strip(): line[22:].strip() for line in result.out.splitlines()}
+    assert rows["it is"] == "isotropic diffusion"
+    assert rows["diffusivity D"] == "0.25 h²/step"
+    assert rows["relaxation"] == "stable below 1"
+    assert "note: away from free edges it is plane-stress elasticity" in result.out
+    settings = ("--set", "rule={type: springs}", "--set", "neighbours={type: chebyshev}")
+    figures = json.loads(call("identify", "e.json", "--json", *settings).out)
+    assert figures == pbdkit.identify(pbdkit.load("e.json", settings=settings[1::2])).as_dict()
+    assert figures["poisson_ratio"] == pytest.approx(1 / 3)
+
+
+def test_the_table_of_an_anisotropic_body(call):
+    parts = {
+        "lattice": RECTANGULAR,
+        "neighbours": EIGHT,
+        "rule": "{type: orthotropic, poisson_ratio: 0.2, modulus_ratio: 0.5, shear_ratio: 0.3}",
+        "solver": "{type: stepping, memory: 0.25}",
+    }
+    settings = [a for k, v in parts.items() for a in ("--set", f"{k}={v}".replace("'", ""))]
+    lines = call("identify", "e.json", *settings).out.splitlines()
+    rows = {line[:22].strip(): line[22:].strip() for line in lines}
+    assert rows["it is"] == "orthotropic elasticity"
+    assert rows["elastic constants"].startswith("C22 0.5, C12 0.1, C66 0.294 in units of C11 = ")
+    assert rows["Poisson's ratio"] == "0.2 pulled along x, 0.1 along y (plane stress)"
+    assert rows["axis of symmetry"] == "at 0°"
+    assert rows["relaxation"] == "stable below 0.900625 with memory 0.25"
+    assert rows["wave speed"].endswith("h/step with memory 0.25")
+
+
+def test_the_picture(call, monkeypatch):
+    settings = ("--set", "rule={type: springs}", "--set", "neighbours={type: chebyshev}")
+    result = call("identify", "e.json", "--picture", "e.svg", *settings)
+    assert (result.code, result.out.splitlines()[-1]) == (0, "e.svg written")
+    assert Path("e.svg").read_text().rstrip().endswith("</svg>")
+    assert call("identify", "e.json", "--picture", "e.txt").err == (
+        "pbdkit: e.txt: a picture ends in .png, .svg, .pdf\n"
+    )
+    assert call("identify", "e.json", "--picture", "no/e.png").code == 6
+    monkeypatch.setattr("pbdkit.cli.pictures.find_spec", lambda name: None)
+    assert call("identify", "e.json", "--picture", "e.png").err == (
+        "pbdkit: a picture needs matplotlib: pip install 'pbdkit[plot]'\n"
+    )
+
+
+def test_the_curves_of_the_picture():
+    """Circles for an isotropic body, of E = 1 and ν; the faster wave is C11, the slower C66."""
+    found = identity(SQUARE, EIGHT, {"type": "elastic", "poisson_ratio": 0.3})
+    waves, bars = by_direction(found).axes
+    fast, slow, *_ = (line.get_ydata() for line in waves.lines)
+    np.testing.assert_allclose(fast, found.body.stiffness[0, 0], rtol=1e-6)
+    np.testing.assert_allclose(slow, found.body.stiffness[2, 2], rtol=1e-6)
+    modulus, ratio = (line.get_ydata() for line in bars.lines)
+    np.testing.assert_allclose(modulus, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(ratio, 0.3, rtol=1e-11)
+    assert len(by_direction(identity(SQUARE, NEAREST, BARYCENTRE)).axes) == 1
+
+
+def test_nothing_is_drawn_where_there_are_no_waves():
+    with pytest.raises(pbdkit.ExperimentError, match="'anchored' has no waves to draw: a rigid"):
+        by_direction(identity(SQUARE, NEAREST, "anchored"))

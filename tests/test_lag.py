@@ -1,0 +1,184 @@
+"""How far a body trails its equilibrium: against the closed form, and against runs."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from property_cases import (
+    BOTH_ENDS_HELD,
+    HOLD_LEFT,
+    LATTICES,
+    NEIGHBOURS,
+    body_of,
+    experiment,
+    pull_right,
+    scene_of,
+)
+
+import pbdkit
+from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+
+def pulled(columns, rows, x, y=0.0, steps=10, **parts):
+    """A sheet whose right end moves by (x, y) in each of its steps."""
+    leaders = [HOLD_LEFT, pull_right(x, y, steps)]
+    return {"columns": columns, "rows": rows, "leaders": leaders, "steps": steps} | parts
+
+
+def trailing(**parts):
+    """By how much a run is behind the equilibrium of its last step."""
+    scene = scene_of(**parts)
+    stepped = Stepper(scene).advance(initial_state(scene), scene.experiment.steps)
+    straight = scene_of(**parts | {"solver": {"type": "equilibrium", "tolerance": 1e-9}})
+    settled, _ = equilibrium_state(straight)
+    return float(np.hypot(*(body_of(scene, settled) - body_of(scene, stepped)).T).max())
+
+
+def closed_form(speed, length):
+    """4 v l² / (9 √3 h²), h = 1."""
+    return 4 * speed * length**2 / (9 * math.sqrt(3))
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(20, 20), (30, 8), (41, 5)])
+def test_lag_is_the_closed_form(columns, rows):
+    analysis = pbdkit.analyse(experiment(**pulled(columns, rows, 0.0035)))
+    assert analysis.lag == pytest.approx(closed_form(0.0035, columns - 1), rel=0.02)
+
+
+def test_lag_is_what_a_run_shows():
+    """Case a's sheet, long enough on its way for the lag to become steady."""
+    parts = pulled(20, 20, 0.0035, steps=2200)
+    measured, lag = trailing(**parts), pbdkit.analyse(experiment(**parts)).trailing
+    assert measured == pytest.approx(0.322, abs=5e-4)
+    assert lag.reached == pytest.approx(measured, rel=1e-9)
+    assert lag.steady == pytest.approx(measured, rel=1e-5)
+    assert closed_form(0.0035, 19) == pytest.approx(0.3242, abs=1e-4)
+
+
+@pytest.mark.parametrize("frame", ["mean", "first", "lag", "wide", {"type": "none"}], ids=str)
+@pytest.mark.parametrize("neighbours", NEIGHBOURS)
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours, frame):
+    """Frame points that follow leaders are late, in every neighbourhood and frame its own way."""
+    parts = pulled(
+        7, 6, 0.2, -0.1, steps=6, lattice=lattice, neighbours=neighbours, frame=frame,
+        rule="mean-displacement",
+    )  # fmt: skip
+    lag = pbdkit.analyse(experiment(**parts)).trailing
+    if (lattice, neighbours) == ("oblique", "coordination-1"):
+        assert lag is None  # neighbours lie along the columns: nobody feels the leaders
+        return
+    assert (lag.first, lag.last) == (1, 6)
+    assert lag.speed == pytest.approx(math.hypot(0.2, 0.1))
+    assert lag.reached == pytest.approx(trailing(**parts), rel=1e-7)
+
+
+@pytest.mark.parametrize("frame", ["mean", "lag"])
+@pytest.mark.parametrize(("relaxation", "memory"), [(0.7, 0.0), (1.0, 0.9), (0.5, -0.4)])
+@pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
+def test_relaxation_and_memory_have_their_share(rule, relaxation, memory, frame):
+    solver = {"type": "stepping", "relaxation": relaxation, "memory": memory}
+    for steps in (2, 9, 2000):
+        parts = pulled(7, 6, 2e-3, 1e-3, steps=steps, rule=rule, frame=frame, solver=solver)
+        lag = pbdkit.analyse(experiment(**parts)).trailing
+        measured = trailing(**parts)
+        assert lag.reached == pytest.approx(measured, rel=1e-6)
+    assert lag.steady == pytest.approx(measured, rel=1e-6)
+
+
+def test_large_sheets_are_looked_at_sparsely():
+    parts = pulled(50, 12, 0.01, steps=40, neighbours="chebyshev-1")
+    assert pbdkit.analyse(experiment(**parts)).trailing.reached == pytest.approx(
+        trailing(**parts), rel=1e-7
+    )
+
+
+def test_the_fastest_steps_of_all_leaders_count():
+    path = {"type": "path", "steps": [4, 9, 10], "displacements": [[0.4, 0], [1.9, 0], [9.0, 0]]}
+    later = {"select": {"edge": "right"}, "motion": path, "from": 3}
+    drift = {"type": "velocity", "velocity": [0.0, 0.4], "steps": 99}
+    other = {"select": {"edge": "left"}, "motion": drift, "until": 2}
+    lag = pbdkit.analyse(experiment(8, 5, leaders=[other, later], steps=40)).trailing
+    # The way from 1.9 to 9 is a jump of one step: it has no speed.
+    assert (lag.first, lag.last) == (1, 2)
+    assert lag.speed == pytest.approx(0.4)
+    lag = pbdkit.analyse(experiment(8, 5, leaders=[later, HOLD_LEFT], steps=40)).trailing
+    assert (lag.first, lag.last) == (7, 11)
+    assert lag.speed == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"leaders": []},
+        {"leaders": BOTH_ENDS_HELD},
+        {"leaders": [HOLD_LEFT, pull_right(1.0, 0.0, steps=1)]},
+        {"leaders": [pull_right(0.1, 0.0)], "solver": {"type": "stepping", "relaxation": 1.3}},
+        {"leaders": [HOLD_LEFT, pull_right(0.1, 0.0)], "solver": {"type": "equilibrium"}},
+        {
+            "leaders": [pull_right(0.1, 0.0)],
+            "neighbours": {"type": "euclidean", "radius": 1.1, "reevaluate": True},
+        },
+    ],
+    ids=["nobody", "still", "jump", "unstable", "straight", "found anew"],
+)
+def test_without_steady_motion_and_stable_steps_there_is_no_lag(parts):
+    analysis = pbdkit.analyse(experiment(**parts))
+    assert analysis.lag is analysis.trailing is None
+    assert not any("behind its equilibrium" in w for w in analysis.warnings())
+
+
+def test_a_long_motion_of_a_large_sheet_is_not_followed_to_its_end():
+    lag = pbdkit.analyse(experiment(**pulled(60, 60, 1e-4, steps=100_000))).trailing
+    assert lag.reached is None
+    assert lag.size == lag.steady == pytest.approx(closed_form(1e-4, 59), rel=0.02)
+
+
+FAST, SLOW = "0.35", "0.04"
+
+
+@pytest.mark.parametrize(("speed", "warned"), [(FAST, True), (SLOW, False)])
+def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
+    arguments = ["check", "paper/a", "--set", f"leaders.1.motion.velocity=[{speed}, 0.0]"]
+    figures = json.loads(call(*arguments, "--json").out)
+    steady, reached = (float(speed) / 0.35 * x for x in (7.0648, 2.0426))
+    assert figures["lag"] == pytest.approx(steady, rel=1e-4)
+    assert figures["lag_reached"] == pytest.approx(reached, rel=1e-4)
+    said = call(*arguments).out
+    assert (
+        f"lag        {steady:.4g} lattice units behind equilibrium if the leaders' fastest steps "
+        f"went on, {reached:.4g} when they end"
+    ) in said
+    expected = (
+        "leaders: in steps 1 to 10 the fastest moves by 0.35 a step and leaves the body 2.04 "
+        "behind its equilibrium, more than a bond (1): its speed decides how far bonds stretch; "
+        "move by less than 0.05 a step, or take solver: {type: equilibrium}"
+    )
+    assert (expected in figures["warnings"]) == warned
+    assert (expected in said) == warned
+
+
+def test_the_speed_that_is_advised_keeps_the_lag_below_a_bond():
+    fast = pbdkit.analyse("paper/a").trailing
+    slow = fast.speed / fast.steady
+    lag = pbdkit.analyse(experiment(**pulled(10, 10, slow, steps=4000))).trailing
+    assert lag.reached == pytest.approx(1.0, rel=1e-6)
+
+
+def test_check_says_nothing_of_lag_where_there_is_none(call):
+    figures = json.loads(call("check", "stability/oscillation", "--json").out)
+    assert figures["lag"] is figures["lag_reached"] is None
+    assert "behind equilibrium" not in call("check", "stability/oscillation").out
+
+
+def test_case_22_bonds_of_a_fast_test_stretch_nine_times_as_far_as_in_equilibrium():
+    parts = pulled(20, 20, 0.35, steps=10)
+    scene = scene_of(**parts)
+    u = body_of(scene, Stepper(scene).advance(initial_state(scene), 10)).reshape(20, 20, 2)
+    assert np.diff(u[:, 10, 0]).max() == pytest.approx(1.66, abs=0.005)
+    assert pytest.approx(0.18, abs=0.005) == 3.5 / 19
+    (warning,) = pbdkit.analyse(experiment(**parts)).warnings()
+    assert f"leaves the body {trailing(**parts):.3g} behind its equilibrium" in warning

@@ -1,0 +1,364 @@
+"""solver.settle ends a run where it is certainly near equilibrium, never before, hardly after."""
+
+import json
+import re
+import subprocess
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from property_cases import BOTH_ENDS_HELD, HOLD_LEFT, LATTICES, experiment, pull_right
+from scene_strategies import experiments
+
+import pbdkit
+from pbdkit.cli import program
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+run = partial(pbdkit.run, progress=False)
+PULLED = [HOLD_LEFT, pull_right(0.1, 0.05)]
+LAST = {"at": [0]}
+
+
+def settling(tolerance, **parts):
+    return {"type": "stepping", "settle": {"tolerance": tolerance}} | parts
+
+
+def sheet(columns=9, rows=6, tolerance=1e-4, solver=None, **parts):
+    base = {"leaders": PULLED, "steps": 20_000, "record": LAST}
+    asked = settling(tolerance, **(solver or {}))
+    return experiment(columns, rows, **(base | parts)) | {"solver": asked}
+
+
+def certificate(ds):
+    return json.loads(ds.attrs["certificate"])
+
+
+def steps_of(ds):
+    return int(ds.time[-1])
+
+
+def stepped_on(given, ds, most=20_000):
+    """Where the steps lead without an early end, (particle, axis), found by making them: None where
+    they do not come to rest; and the breaking steps at the end."""
+    solver = {k: v for k, v in given["solver"].items() if k != "settle"}
+    scene = build_scene(pbdkit.Experiment(**given | {"solver": solver, "steps": most}))
+    stepper, state = Stepper(scene), initial_state(scene)
+    while state.step < most:
+        state = stepper.advance(state, min(500, most - state.step))
+        moved = float(np.abs(state.u - state.previous).max())
+        if state.step > steps_of(ds) and moved <= 1e-15 * max(1.0, np.abs(state.u).max()):
+            return scene.raster.table(state.u), state.broken_step
+    return None, state.broken_step
+
+
+def error_of(ds, rest):
+    """The largest distance of a follower from there at the end of a run."""
+    u = (ds.position[-1] - ds.reference).values
+    return float(np.hypot(*(u - rest).T)[ds.kind[-1].values == 1].max(initial=0.0))
+
+
+@settings(
+    max_examples=15,
+    deadline=None,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+@given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
+def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
+    """All lattices, rules, frames, motions and fracture, against the steps themselves."""
+    assume(not drawn["neighbours"].get("reevaluate"))
+    solver = drawn["solver"] | {"settle": {"tolerance": tolerance}, "engine": "numpy"}
+    if drawn["rule"]["type"] == "distance-weighted":
+        solver |= {"relaxation": 0.4, "memory": 0.0}
+    given_ = drawn | {"solver": solver, "steps": 1000, "record": LAST, "diagnostics": []}
+    try:
+        ds = run(given_)
+    except (pbdkit.ExperimentError, pbdkit.DivergedError):
+        assume(False)
+    assume(ds.attrs["status"] == "settled")
+    rest, broken = stepped_on(given_, ds, 3000)
+    assume(rest is not None)
+    known = certificate(ds)
+    assert error_of(ds, rest) <= known["distance"] + 1e-11 * max(1.0, np.abs(rest).max())
+    assert known["share"] <= tolerance
+    if broken is not None:
+        assert np.count_nonzero(broken >= 0) >= np.count_nonzero(ds.broken_step >= 0)
+        assert broken.max() <= steps_of(ds)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("rule", ["barycentre", "mean-displacement", "mixed-coordinate"])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
+def test_it_ends_hardly_after_the_first_step_within_the_tolerance(lattice, rule, tolerance):
+    near = {"type": "chebyshev", "shells": 1}
+    parts = {"lattice": lattice, "rule": rule, "neighbours": near}
+    given_ = sheet(**parts, tolerance=tolerance, solver={"relaxation": 0.9})
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds)
+    full = run(given_ | {"solver": {"type": "stepping", "relaxation": 0.9}, "record": {"every": 1},
+                         "steps": steps_of(ds)})  # fmt: skip
+    u = (full.position - full.reference).values
+    within = np.hypot(*(u - rest).transpose(2, 0, 1))
+    within = np.where(full.kind == 1, within, 0.0).max(axis=1) <= certificate(ds)["distance"]
+    # Symmetric or nearly, without memory: the distance falls in every step, so there is one first.
+    first = int(np.argmax(within))
+    assert 0 < first <= steps_of(ds) <= first + 2 + first / 64
+    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    assert certificate(ds)["distance"] <= 1.001 * error_of(ds, rest)
+
+
+LATE = [
+    [HOLD_LEFT, pull_right(0.0, 0.0, 1), {"select": {"edge": "top"}, "motion": {"type": "hold"},
+     "from": 700}],
+    [HOLD_LEFT, pull_right(0.1, 0.0) | {"until": 700}],
+    [HOLD_LEFT, {"select": {"edge": "right"}, "motion": {
+        "type": "path", "steps": [5, 699, 700], "displacements": [[0.5, 0], [0.5, 0], [1, 0]]}}],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("leaders", LATE, ids=["begins", "ends", "moves again"])
+def test_it_never_ends_before_the_last_motion_and_change_of_roles(leaders):
+    ds = run(sheet(5, 4, leaders=leaders, tolerance=1e-3))
+    assert ds.attrs["status"] == "settled"
+    assert steps_of(ds) >= 700
+    assert run(sheet(5, 4, leaders=leaders, tolerance=1e-3, steps=650)).attrs["status"] == (
+        "complete" if "path" in str(leaders) else "settled"
+    )
+
+
+def test_a_body_at_rest_has_settled_in_the_first_step():
+    ds = run(sheet(leaders=BOTH_ENDS_HELD))
+    assert (ds.attrs["status"], steps_of(ds), certificate(ds)["distance"]) == ("settled", 1, 0.0)
+
+
+@pytest.mark.parametrize("memory", [0.5, 0.97, -0.5])
+@pytest.mark.parametrize("frame", ["mean", "lag"])
+def test_what_swings_through_its_equilibrium_has_not_settled(memory, frame):
+    """From the end of the run on, no state is farther than the tolerance."""
+    solver = {"memory": memory, "relaxation": 0.5}
+    given_ = sheet(frame=frame, solver=solver, tolerance=1e-3)
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds, 40_000)
+    onwards = run(given_ | {"solver": solver | {"type": "stepping"}, "record": {"every": 1},
+                            "steps": steps_of(ds) + 400})  # fmt: skip
+    u = (onwards.position - onwards.reference).values[steps_of(ds) :]
+    farthest = np.hypot(*(u - rest).transpose(2, 0, 1))[:, ds.kind[-1].values == 1].max()
+    assert farthest <= certificate(ds)["distance"] <= 1e-3 * 0.5
+
+
+NECK = {
+    "body": {"type": "union", "of": [
+        {"type": "rectangle", "width": 4.1, "height": 0.1, "origin": [0.0, 3.0]},
+        {"type": "rectangle", "width": 6.1, "height": 6.1, "origin": [4.0, 0.0]}]},
+    "frame": {"type": "none"},
+    "leaders": [
+        {"select": {"box": [-0.1, 2.9, 0.1, 3.1]}, "motion": {"type": "hold"}},
+        {"select": {"box": [9.9, -0.1, 10.1, 6.1]},
+         "motion": {"type": "velocity", "velocity": [0.004, 0.0], "steps": 250}}],
+}  # fmt: skip
+
+
+def test_it_does_not_end_before_a_bond_that_breaks_on_the_way_to_equilibrium():
+    """A sheet on a thin neck, pulled slowly: the neck is longest at rest, after all motion."""
+    whole = run(sheet(**NECK, tolerance=0.05))
+    rest = run(sheet(**NECK, tolerance=1e-10))
+    neck = [float(ds.position[-1, 1, 0] - ds.position[-1, 0, 0]) for ds in (whole, rest)]
+    assert steps_of(whole) < steps_of(rest)
+    assert neck[0] < neck[1]
+
+    def torn(threshold):
+        fracture = {"type": "threshold", "thresholds": [threshold], "fictitious": "reference"}
+        return run(sheet(**NECK, tolerance=0.05, fracture=fracture))
+
+    breaks = torn(0.5 * sum(neck))
+    first = breaks.broken_step.values[breaks.broken_step.values >= 0].min()
+    assert first > steps_of(whole)  # without a look at bonds it would have ended before
+    assert steps_of(breaks) > first
+    holds = torn(2.0 * neck[1])
+    assert (holds.broken_step == -1).all()
+    assert steps_of(holds) == steps_of(whole)
+
+
+def test_nonlinear_rules_settle_where_leaders_hold_them():
+    rule, solver = {"type": "distance-weighted"}, {"relaxation": 0.5}
+    given_ = sheet(rule=rule, solver=solver, leaders=[HOLD_LEFT, pull_right(0.6, 0.2)])
+    ds = run(given_)
+    rest, _ = stepped_on(given_, ds)
+    assert ds.attrs["status"] == "settled"
+    assert certificate(ds)["linearised"]
+    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.1 * error_of(ds, rest)
+
+
+def test_a_bound_to_first_order_is_not_given_where_the_rule_has_a_kink():
+    """A body without a frame that shrinks to a point: there the distance-weighted rule has no
+    derivative, and a correction that is too short by far must not be trusted."""
+    body = {"type": "dogbone", "length": 9.1, "width": 5.0, "gauge_length": 3.0,
+            "gauge_width": 2.1, "radius": 2.0, "origin": [-2.0, -1.0]}  # fmt: skip
+    hold = {"select": {"nearest": [[0.95, 1.6]]}, "motion": {"type": "hold"}, "from": 5}
+    given_ = sheet(
+        lattice={"type": "hexagonal", "a": 1.9},
+        body=body,
+        neighbours={"type": "chebyshev", "shells": 1},
+        rule="distance-weighted",
+        frame={"type": "none"},
+        initial={"type": "noise", "amplitude": 0.05},
+        leaders=[hold],
+        solver={"relaxation": 0.4},
+        steps=3000,
+    )
+    ds = run(given_)
+    rest, _ = stepped_on(given_, ds)
+    assert np.ptp((ds.reference.values + rest), axis=0).max() < 1e-9
+    assert ds.attrs["status"] == "settled"
+    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    early = run(given_ | {"steps": 320})
+    assert "not settled: at step" in early.attrs["stop_reason"]
+    assert "the rule bends too much" in early.attrs["stop_reason"]
+
+
+def test_a_nonlinear_body_that_nothing_holds_goes_on_and_says_why():
+    noise = {"type": "noise", "amplitude": 0.1}
+    given_ = sheet(4, 3, rule="distance-weighted", solver={"relaxation": 0.5}, leaders=[],
+                   initial=noise, steps=100)  # fmt: skip
+    ds = run(given_)
+    assert ds.attrs["status"] == "complete"
+    reason = r"not settled: at step \d+ there is no unique .*a part of 12 particles.*hold it"
+    assert re.search(reason, ds.attrs["stop_reason"])
+
+
+class Leaning(pbdkit.FollowerRule):
+    """A barycentre that leans on its right neighbours: not symmetric."""
+
+    type: str = "leaning"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        share = 1.0 + 0.6 * r.x
+        return share * d.x, share * d.y
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / 4, total[1] / 4
+
+
+@pytest.mark.parametrize("columns", [9, 30])
+def test_unsymmetric_rules_settle_within_what_is_certified(columns):
+    given_ = sheet(columns, 9, rule=Leaning(), frame={"type": "none"})
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds)
+    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
+
+
+@pytest.mark.parametrize("record", [{"every": 1}, {"every": 37}, {"at": [0, 3]}])
+def test_what_is_recorded_does_not_move_the_end(record):
+    plain, ds = run(sheet()), run(sheet(record=record))
+    assert steps_of(ds) == steps_of(plain)
+    np.testing.assert_array_equal(ds.position[-1], plain.position[-1])
+    assert ds.attrs["certificate"] == plain.attrs["certificate"]
+
+
+def test_diagnostics_of_every_step_end_with_the_run_and_it_repeats_itself():
+    ds = run(sheet(diagnostics=[{"type": "track", "numbers": [8]}]))
+    assert ds.step[-1] == steps_of(ds)
+    again = pbdkit.rerun(ds, progress=False)
+    assert again.attrs["status"] == "settled"
+    np.testing.assert_array_equal(again.position, ds.position)
+
+
+def test_both_engines_end_at_the_same_step():
+    pytest.importorskip("numba")
+    ends = [run(sheet(solver={"engine": engine})) for engine in ("numpy", "compiled")]
+    assert steps_of(ends[0]) == steps_of(ends[1])
+    np.testing.assert_array_equal(ends[0].position, ends[1].position)
+
+
+def test_single_precision_settles_as_far_as_it_goes():
+    given_ = sheet(solver={"precision": "float32"}, tolerance=1e-3)
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_ | {"solver": {"type": "stepping"}}, ds)
+    assert error_of(ds, rest) <= certificate(ds)["distance"]
+    fine = run(sheet(solver={"precision": "float32"}, tolerance=1e-12, steps=3000))
+    assert fine.attrs["status"] == "complete"
+    assert "not settled: at step" in fine.attrs["stop_reason"]
+
+
+def test_neighbours_found_anew_cannot_settle():
+    near = {"type": "euclidean", "radius": 1.1, "reevaluate": True}
+    message = r"solver.*no distance from equilibrium is known.*leave solver.settle out"
+    with pytest.raises(pbdkit.ExperimentError, match=message):
+        run(sheet(neighbours=near))
+
+
+def test_motions_without_end_never_settle_and_the_run_says_so():
+    swinging = {"type": "oscillation", "amplitude": [1.0, 0.0], "period": 30.0}
+    leaders = [HOLD_LEFT, {"select": {"edge": "right"}, "motion": swinging}]
+    ds = run(sheet(leaders=leaders, steps=100))
+    assert ds.attrs["status"] == "complete"
+    reason = "all steps done, not settled: leaders do not come to rest before its end"
+    assert ds.attrs["stop_reason"] == reason
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1.0, -1e-3])
+def test_a_tolerance_is_a_share(tolerance):
+    with pytest.raises(pbdkit.ExperimentError, match=r"solver.*settle.*tolerance"):
+        run(sheet(tolerance=tolerance))
+
+
+def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call = ["run", "paper/a", "--set", "solver.settle.tolerance=1e-3", "--set", "steps=5000"]
+    done = CliRunner().invoke(program, call)
+    assert done.exit_code == 0
+    assert "settled: 144 particles, 878 steps in " in done.output
+    assert "of equilibrium (0.001 of the largest prescribed displacement), by the" in done.output
+    assert "engine: numpy" in done.output
+    figures = CliRunner().invoke(program, [*call, "--json", "--force"])
+    assert json.loads(figures.output)["status"] == "settled"
+    short = CliRunner().invoke(program, [*call[:4], "--force", "--set", "steps=40"])
+    assert short.exit_code == 0
+    assert "all steps done, not settled: in step " in short.output
+
+
+def test_runs_without_it_import_nothing_of_it():
+    start = (
+        "import sys, pbdkit\n"
+        "pbdkit.run(pbdkit.load('paper/a', settings=['steps=2']), progress=False)\n"
+        "print([m for m in sys.modules if m.startswith('pbdkit.equilibrium.') "
+        "and m.rpartition('.')[2] in ('settling', 'outlook', 'pacing')])"
+    )
+    done = subprocess.run([sys.executable, "-c", start], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
+@pytest.mark.parametrize("memory", [0.0, 0.3])
+@pytest.mark.parametrize("frame", ["mean", "lag"])
+def test_a_large_released_body_settles_within_what_is_certified(rule, memory, frame):
+    """More than 500 unknowns that nothing holds, which keep what they had at the release."""
+    solver = {"memory": memory, "relaxation": 0.9}
+    leaders = [pull_right(0.3, 0.1) | {"until": 9}]
+    given_ = sheet(25, 24, rule=rule, leaders=leaders, solver=solver, frame=frame, steps=40_000)
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds, 40_000)
+    assert np.abs(rest).max() > 0.01
+    assert error_of(ds, rest) <= certificate(ds)["distance"] <= 1.01 * error_of(ds, rest)
+
+
+def test_what_swings_for_ever_never_settles():
+    """Relaxation 1 has a mode that alternates for ever (eigenvalue -1), by .0018 a step here."""
+    leaders = [pull_right(0.3, 0.1) | {"until": 9}]
+    parts = {"rule": "mixed-coordinate", "leaders": leaders, "frame": "lag", "steps": 4000}
+    ds = run(sheet(25, 24, **parts, solver={"engine": "numpy"}))
+    assert ds.attrs["status"] == "complete"
+    reason = r"not settled: in step \d+ particles still moved by up to 0.0018$"
+    assert re.search(reason, ds.attrs["stop_reason"])

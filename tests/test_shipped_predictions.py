@@ -1,0 +1,100 @@
+"""What `pbdkit check` says of every shipped experiment, against its run.
+
+The run is followed from where its leaders have come to rest, shaken a little so that symmetric
+leaders leave no mode out, to its equilibrium, which is known without stepping.
+"""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from property_cases import body_of
+
+import pbdkit
+from pbdkit.analysis.operator import step_operator
+from pbdkit.analysis.spectrum import spectrum
+from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.stepper import Stepper
+
+TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
+SMALLER = {
+    "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
+    + [
+        f"leaders.{n}.select={{nearest: [[{x}, {y}]]}}"
+        for n, (x, y) in enumerate([(9, 9), (9, 10), (10, 9), (10, 10)])
+    ]
+}
+"""Settings of shorter variants where the experiment itself would take minutes to settle."""
+LONG = ["steps=100000", "record={at: [100000]}"]
+STRAIGHT = ["solver={type: equilibrium, tolerance: 1.0e-12}"]
+SHAKEN = 0.1
+
+
+def scene_with(name, *settings):
+    return build_scene(pbdkit.load(name, settings=[*SMALLER.get(name, []), *LONG, *settings]))
+
+
+def at_rest(scene):
+    """The first step in which no leader begins, moves or ends any more."""
+    groups = [leading.group for leading in scene.leading]
+    ends = [g.until + 1 for g in groups if g.until]
+    return max([1, *ends, *(g.from_ + k for g in groups for k in g.motion.knots() if k < 1e9)])
+
+
+def shaken(scene, state):
+    """The state with its followers a little off."""
+    rows = np.setdiff1d(scene.raster.body_rows, np.concatenate([x.rows for x in scene.leading]))
+    noise = SHAKEN * np.random.default_rng(0).uniform(-1, 1, (2, len(rows)))
+    state.u.reshape(2, -1)[:, scene.raster.place_of(rows)] += noise
+    return state
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_runs_settle_in_the_steps_that_check_says(call, name):
+    """With bonds that hold: torn bodies have another operator, see below."""
+    whole = ["fracture={type: none}"] if name in TORN else []
+    if name in TORN:
+        whole.append("diagnostics=[]")
+    settings = [*SMALLER.get(name, []), *LONG, *whole]
+    words = [word for setting in settings for word in ("--set", setting)]
+    said = json.loads(call("check", name, "--json", *words).out)
+    assert said["stable"]
+    steps, radius = said["steps_to"]["1e-3"], said["spectral_radius"]
+    window = max(2, math.ceil(said["period"] / 2)) if said["period"] else 2
+
+    scene = scene_with(name, *whole)
+    straight = scene_with(name, *whole, *STRAIGHT)
+    settled = body_of(straight, equilibrium_state(straight)[0])
+    stepper = Stepper(scene)
+    state = shaken(scene, stepper.advance(initial_state(scene), at_rest(scene)))
+    state = stepper.advance(state, 2 * steps)  # the slowest mode remains
+    sizes = np.empty(steps + window)
+    for n in range(len(sizes)):
+        sizes[n] = np.abs(body_of(scene, state) - settled).max() * radius**-n
+        state = stepper.advance(state)
+    excess = sizes[-window:].max() / sizes[:window].max()
+    assert abs(math.log(excess)) < 0.05 * math.log(1e3)
+
+
+@pytest.mark.parametrize("name", TORN)
+def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
+    """check speaks of the whole body, and says so; the operator of the torn one has the rate."""
+    said = json.loads(call("check", name, "--json").out)
+    assert "as long as no bond breaks" in call("check", name).out
+    scene = scene_with(name)
+    stepper = Stepper(scene)
+    state = stepper.advance(initial_state(scene), at_rest(scene) + 400)
+    assert (state.broken_step >= 0).any()
+    torn = spectrum(step_operator(scene, state).augmented().matrix()).radius
+    assert said["spectral_radius"] < torn < 1.0
+    moves = []
+    for _ in range(2):
+        before = body_of(scene, state)
+        state = stepper.advance(state)
+        moves.append(np.abs(body_of(scene, state) - before).max())
+        state = stepper.advance(state, 199)
+    assert math.log(moves[1] / moves[0]) / 200 == pytest.approx(math.log(torn), rel=0.05)
