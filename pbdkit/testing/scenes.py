@@ -26,7 +26,7 @@ PARTNERS = ({"type": "barycentre"}, {"type": "distance-weighted"})
 """The rules with which lattices and neighbours are tried: a linear one, and one that is not."""
 MEAN, NATURAL = {"type": "mean"}, {"type": "natural"}
 ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
-"""The rule with which frames are tried that weigh cells."""
+"""The rule with which frames are tried whose edges are free of stress."""
 BODY = {"type": "grid", "columns": 6, "rows": 5}
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
@@ -64,7 +64,7 @@ def alternatives(part: Any) -> list[Any]:
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:
-    if isinstance(component, FramePolicy) and component.weighs_cells:
+    if isinstance(component, FramePolicy) and component.edges_are_free:
         return [ELASTIC]
     return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 

@@ -92,6 +92,15 @@ class SeenMoment(Moment):
         """That of the moment itself, in this order."""
         return self._moment.sum_over_neighbours(function, intact_only=intact_only)[self._order]
 
+    def over_cells(
+        self,
+        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> NDArray[Any]:
+        """That of the moment itself: cells are in no order of particles."""
+        return self._moment.over_cells(function, intact_only=intact_only)
+
     def broken_bonds(self) -> int:
         """That of the moment itself."""
         return self._moment.broken_bonds()
