@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Cell, FrameSites, Moment, Vector
+from pbdkit.interfaces import Cell, FollowerRule, FrameSites, Moment, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
@@ -24,6 +24,7 @@ class SeenFrame(FrameSites):
     site: NDArray[np.int32]
     low: Index
     high: Index
+    rule: FollowerRule
     point: Indices
     body: Indices
 
@@ -32,7 +33,7 @@ class SeenFrame(FrameSites):
         cls, frame: FrameSites, site: NDArray[np.int32], point: Indices, body: Indices
     ) -> SeenFrame:
         """A frame with these tables in the place of its own."""
-        return cls(frame, frame.cell, site, frame.low, frame.high, point, body)
+        return cls(frame, frame.cell, site, frame.low, frame.high, frame.rule, point, body)
 
     def only(self, points: Indices) -> SeenFrame:
         """The frame of some of its points, sorted, counted anew."""
