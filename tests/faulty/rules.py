@@ -202,14 +202,14 @@ class HoldsOn(Sound):
 
 
 class Unlike(Sound):
-    """Keeps digits in whole numbers that compiled code, with floats, does not have."""
+    """Multiplies whole numbers beyond 63 bits, which wrap around in compiled code."""
 
     type: Literal["unlike"] = "unlike"
-    large: int = Field(2**53 + 1, description="A whole number that is no float.")
 
     @staticmethod
     def apply(total, here, p):
-        return (p.large - 2**53) * total[0] / total[2], total[1] / total[2]
+        side = 3037000500
+        return side * side / 2.0**63 * total[0] / total[2], total[1] / total[2]
 
 
 class Restarts(Sound):
