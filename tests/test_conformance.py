@@ -51,7 +51,7 @@ FAULTS = [
     (rules.Forgets, "survives-json", "`strength` is 2.0, and 1.0 after JSON"),
     (rules.homeless, "survives-pickling", "define the class at the top of a module"),
     (rules.Chooses, "takes-part", "name the parts that go with it"),
-    (others.Twins, "has-a-sound-cell", "basis sites 0 and 1 have the same place (0.0, 0.0)"),
+    (others.Twins, "has-a-sound-cell", "(0, 0) and (0, 1) lie at one place, (0.0, 0.0)"),
     (others.Flat, "has-a-sound-cell", "span no area"),
     (others.Rooted, "keeps-its-cell-wherever-it-lies", "leave `self.origin` out of `cell`"),
     (others.OneSided, "is-mutual", "'one-sided' is not mutual"),
