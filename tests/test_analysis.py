@@ -327,3 +327,25 @@ def test_a_particle_without_neighbours_stays_whatever_the_memory():
     assert remembering.smallest_eigenvalue == pytest.approx(plain.smallest_eigenvalue, abs=1e-12)
     assert remembering.spectral_radius == pytest.approx(1.0, abs=1e-12)
     assert remembering.parts_without_leader == plain.parts_without_leader
+
+
+def test_a_mirror_frame_holds_a_body_that_no_leader_reaches():
+    loose = pbdkit.analyse(sheet(leaders=[], frame={"type": "mean"}))
+    assert any(w.startswith("leaders: none reaches a part") for w in loose.warnings())
+    mirrored = pbdkit.analyse(sheet(leaders=[], frame={"type": "mirror"}))
+    assert mirrored.spectral_radius < 1.0 - 1e-6
+    assert mirrored.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("parts", "exact"),
+    [
+        ({}, True),
+        ({"rule": {"type": "mixed-coordinate", "K": -0.002}}, True),
+        ({"rule": {"type": "distance-weighted"}}, False),
+        ({"fracture": {"type": "threshold", "thresholds": [1.5]}}, False),
+        ({"neighbours": {"type": "euclidean", "radius": 1.2, "reevaluate": True}}, False),
+    ],
+)
+def test_predictions_are_exact_where_a_linear_rule_keeps_its_neighbours(parts, exact):
+    assert pbdkit.analyse(sheet(**parts)).exact is exact

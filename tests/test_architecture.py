@@ -22,6 +22,7 @@ ORDER = [
     "running",
     "api",
     "benching",
+    "testing",
     "cli",
 ]
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)

@@ -269,3 +269,13 @@ def test_whatever_a_rule_reads_is_part_of_its_kernels_key(monkeypatch, name, val
 def test_what_cannot_be_told_apart_makes_a_new_kernel_every_time(monkeypatch):
     monkeypatch.setitem(globals(), "FACTORS", [object()])
     assert source_key(Reads.apply) != source_key(Reads.apply)
+
+
+def test_functions_of_one_source_in_two_modules_have_kernels_of_their_own():
+    """A kernel that is kept finds its functions by their modules, which may be gone."""
+    source = "def gather(d, r, w, p):\n    return d.x, d.y, 1.0\n"
+    one, other, again = {"__name__": "one"}, {"__name__": "other"}, {"__name__": "one"}
+    for names in (one, other, again):
+        exec(source, names)
+    assert source_key(one["gather"]) == source_key(again["gather"])
+    assert source_key(one["gather"]) != source_key(other["gather"])

@@ -28,6 +28,7 @@ EVERY_COMMAND = {
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
     "plot": ["plot", "made.nc"],
+    "explain": ["explain", "made.nc"],
     "identify": ["identify", "e.json", HEALTHY],
     "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
     "plugins": ["plugins", "list"],

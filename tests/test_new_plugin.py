@@ -23,6 +23,7 @@ from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.source import read_file
 from pbdkit.interfaces import INTERFACES
 from pbdkit.registry.registry import Registry
+from pbdkit.testing import examine
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -62,10 +63,9 @@ def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> 
 
 @pytest.mark.parametrize("interface", OFFERED)
 def test_the_project_conforms(new: New, interface: str) -> None:
-    testing = pytest.importorskip("pbdkit.testing")
     new("pbdkit-brand-new", interface)
     kind = next(i for i in INTERFACES.values() if i.__name__ == interface)
-    (report,) = (testing.examine(c) for c in [Registry().find(kind, "brand-new")()])
+    (report,) = (examine(c) for c in [Registry().find(kind, "brand-new")()])
     assert report.holds, str(report)
 
 

@@ -37,6 +37,14 @@ class Analysis:
 
     scene: Scene
 
+    @property
+    def exact(self) -> bool:
+        """Whether the numbers hold for the whole run, and not near its start alone: the rule
+        declares itself linear, and neither bonds nor neighbours change."""
+        experiment = self.scene.experiment
+        lasting = not self.scene.has_fracture and experiment.neighbours.nearness() is None
+        return experiment.rule.linear and lasting
+
     @cached_property
     def operator(self) -> StepOperator:
         """The step operator, two unknowns a follower."""
@@ -173,7 +181,8 @@ class Analysis:
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         found = []
-        parts = self.parts_without_leader
+        anchored = self.scene.frame is not None and self.scene.experiment.frame.anchors()
+        parts = [] if anchored else self.parts_without_leader
         if len(parts) > 3:
             found.append(
                 f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"

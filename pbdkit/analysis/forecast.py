@@ -24,7 +24,8 @@ class Forecast:
     where it cannot tell or it would take too long; with memory, the period in steps of the slowest
     mode that swings and by what it shrinks a step, None where nothing swings; by how much the body
     trails its equilibrium in the leaders' fastest steps, in lattice units, once that is steady and
-    when these steps end, None where no leader moves steadily; warnings."""
+    when these steps end, None where no leader moves steadily; whether what the analysis found is
+    exact, or linearised at the start; warnings."""
 
     particles: int
     followers: int
@@ -38,6 +39,7 @@ class Forecast:
     steps_to: dict[str, int | None]
     period: float | None
     decay: float | None
+    exact: bool
     lag: float | None
     lag_reached: float | None
     warnings: tuple[str, ...]
@@ -69,6 +71,7 @@ def forecast(scene: Scene) -> Forecast:
         steps_to=analysis.steps_to,
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
+        exact=analysis.exact,
         lag=analysis.lag,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
         warnings=(*_doubts(scene), *exact, *waves),

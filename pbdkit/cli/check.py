@@ -33,7 +33,8 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     click.echo(f"  output     about {found.output_mib:.3g} MiB")
     if found.spectral_radius is not None:
         verdict = "stable" if found.stable else "not stable"
-        click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}")
+        near = "" if found.exact else ", linearised at the start"
+        click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}{near}")
         steps = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
         if steps:
             whole = "" if loaded.fracture.type == "none" else ", as long as no bond breaks"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pbdkit.cli.conformance import check
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
@@ -29,6 +30,9 @@ INTERFACES = (
 @click.group()
 def plugins() -> None:
     """What is installed, and in which state."""
+
+
+plugins.add_command(check)
 
 
 @plugins.command("list")

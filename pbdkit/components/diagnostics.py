@@ -85,7 +85,9 @@ class Track(Diagnostic):
     """The position of chosen particles at every step."""
 
     type: Literal["track"] = "track"
-    numbers: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
+    numbers: Annotated[
+        tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)
+    ] = Field(description="The particles to follow, by number.", examples=[[3, 1]])
 
     every_step: ClassVar[bool] = True
 

@@ -28,6 +28,7 @@ class CellElastic(FollowerRule):
     the entries exchanged, and (1 + ν)/(4(5 - 3ν)) [[1, s], [s, 1]] on the diagonals (s = ±1).
     """
 
+    linear: ClassVar[bool] = True
     uses_cells: ClassVar[bool] = True
 
     @abstractmethod
@@ -67,7 +68,8 @@ class CellElastic(FollowerRule):
         else:
             left, right = in_triangles(slot, self.ratios())
         symmetric, skew = (left + right) / 2, (left - right) / 2
-        return symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
+        found = symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
+        return tuple(map(float, found))
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
@@ -102,8 +104,12 @@ class Elastic(CellElastic):
     """
 
     type: Literal["elastic"] = "elastic"
-    poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)]
-    plane: Literal["stress", "strain"] = "stress"
+    poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)] = Field(
+        description="ν, from -1 to 0.5.", examples=[0.3, -1.0]
+    )
+    plane: Literal["stress", "strain"] = Field(
+        "stress", description="Plane stress or plane strain.", examples=["strain"]
+    )
 
     @model_validator(mode="after")
     def _compressible(self) -> Elastic:
@@ -138,9 +144,15 @@ class Orthotropic(CellElastic):
     """
 
     type: Literal["orthotropic"] = "orthotropic"
-    poisson_ratio: Annotated[float, Field(gt=-10.0, lt=10.0)]
-    modulus_ratio: Annotated[float, Field(gt=0.0, le=1e6)]
-    shear_ratio: Annotated[float, Field(gt=0.0, le=1e6)]
+    poisson_ratio: Annotated[float, Field(gt=-10.0, lt=10.0)] = Field(
+        description="ν_xy, the contraction along y under tension along x.", examples=[0.3]
+    )
+    modulus_ratio: Annotated[float, Field(gt=0.0, le=1e6)] = Field(
+        description="E_y/E_x.", examples=[0.5]
+    )
+    shear_ratio: Annotated[float, Field(gt=0.0, le=1e6)] = Field(
+        description="G_xy/E_x.", examples=[0.4]
+    )
 
     @model_validator(mode="after")
     def _positive(self) -> Orthotropic:

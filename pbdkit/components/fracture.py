@@ -50,10 +50,19 @@ class Parting(FractureModel):
     start.
     """
 
-    placement: float = 1.0
-    fictitious_at: Literal["cell", "reference"] = Field("cell", alias="fictitious")
-    frame_bonds: bool = True
-    cracks: Cracks = ()
+    placement: float = Field(
+        1.0, description="λ: the fictitious point stands at m_j + λ R.", examples=[1.2]
+    )
+    fictitious_at: Literal["cell", "reference"] = Field(
+        "cell",
+        alias="fictitious",
+        description="Where the fictitious point stands: at m_j + λ R, or at X_k.",
+        examples=["reference"],
+    )
+    frame_bonds: bool = Field(
+        True, description="Whether bonds to frame points break too.", examples=[False]
+    )
+    cracks: Cracks = Field((), description="Segments whose bonds are broken from the start.")
 
     def parameters(self) -> dict[str, float]:
         """λ - 1, and whether the reference position counts."""
@@ -89,7 +98,10 @@ class Threshold(Parting):
     """
 
     type: Literal["threshold"] = "threshold"
-    thresholds: Thresholds
+    thresholds: Thresholds = Field(
+        description="The length at which bonds break, one a shell (lattice units).",
+        examples=[[1.6], [1.6, 2.4]],
+    )
 
     def constants(self, slot: Slot) -> tuple[float, ...]:
         """The squared threshold of the slot's shell.

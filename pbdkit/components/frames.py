@@ -29,7 +29,9 @@ class NoFrame(FramePolicy):
 class LayeredFrame(FramePolicy):
     """Common to all frames; `layers` defaults to what the neighbour metric reaches."""
 
-    layers: Annotated[int, Field(ge=1, le=64)] | None = None
+    layers: Annotated[int, Field(ge=1, le=64)] | None = Field(
+        None, description="Layers of points; by default what the neighbours reach.", examples=[3]
+    )
 
     def depth(self, reach: int) -> int:
         """`layers`, or the reach of the neighbours."""
@@ -42,7 +44,9 @@ class CopyingFrame(LayeredFrame):
     With `lag` 1 they copy the displacements of the step before.
     """
 
-    lag: Annotated[int, Field(ge=0, le=1)] = 0
+    lag: Annotated[int, Field(ge=0, le=1)] = Field(
+        0, description="1 copies the displacements of the step before.", examples=[1]
+    )
 
 
 class MeanFrame(CopyingFrame):
@@ -76,6 +80,10 @@ class MirrorFrame(LayeredFrame):
     """
 
     type: Literal["mirror"] = "mirror"
+
+    def anchors(self) -> bool:
+        """The planes of reflection stand in space."""
+        return True
 
     def follow(self, frame: FrameSites) -> FrameMap:
         """One entry a point, with the matrix R."""

@@ -12,12 +12,15 @@ from pbdkit.interfaces import BasisSite, Cell, Lattice, Vector
 Spacing = Annotated[float, Field(ge=1e-100, le=1e100)]
 """A lattice constant; the range keeps squared lengths finite."""
 
+A = Field(description="Distance of the sites along a row (lattice units).", examples=[1.0])
+B = Field(description="The other edge of the rectangle (lattice units).", examples=[1.3])
+
 
 class Square(Lattice):
     """Sites at (i·a, j·a)."""
 
     type: Literal["square"] = "square"
-    a: Spacing
+    a: Spacing = A
 
     def cell(self) -> Cell:
         """One site."""
@@ -28,8 +31,8 @@ class Rectangular(Lattice):
     """Sites at (i·a, j·b)."""
 
     type: Literal["rectangular"] = "rectangular"
-    a: Spacing
-    b: Spacing
+    a: Spacing = A
+    b: Spacing = B
 
     def cell(self) -> Cell:
         """One site."""
@@ -40,9 +43,13 @@ class Oblique(Lattice):
     """Sites at i·(a, 0) + j·b·(cos angle, sin angle); the angle is in degrees."""
 
     type: Literal["oblique"] = "oblique"
-    a: Spacing
-    b: Spacing
-    angle: Annotated[float, Field(gt=0.0, lt=180.0)]
+    a: Spacing = A
+    b: Spacing = Field(
+        description="Distance of the sites up the slanted line (lattice units).", examples=[0.9]
+    )
+    angle: Annotated[float, Field(gt=0.0, lt=180.0)] = Field(
+        description="Angle between row and slanted line (degrees).", examples=[65.0]
+    )
 
     def cell(self) -> Cell:
         """One site."""
@@ -56,8 +63,8 @@ class CentredRectangular(Lattice):
     """Rows b/2 apart, the odd ones shifted by a/2."""
 
     type: Literal["centred-rectangular"] = "centred-rectangular"
-    a: Spacing
-    b: Spacing
+    a: Spacing = A
+    b: Spacing = B
 
     def cell(self) -> Cell:
         """A rectangle a × b with a site in its centre."""
@@ -68,7 +75,7 @@ class Hexagonal(Lattice):
     """Rows a·√3/2 apart, the odd ones shifted by a/2: six neighbours at distance a."""
 
     type: Literal["hexagonal"] = "hexagonal"
-    a: Spacing
+    a: Spacing = A
 
     def cell(self) -> Cell:
         """A rectangle a × a√3 with a site in its centre."""

@@ -17,8 +17,8 @@ Weight = Annotated[float, Field(gt=0.0)]
 class LatticeNeighbours(NeighbourMetric):
     """Common to neighbours in shells of the lattice, which stay as they are."""
 
-    shells: Shells = 1
-    reevaluate: bool = False
+    shells: Shells = Field(1, description="How many shells count, from the nearest.", examples=[2])
+    reevaluate: bool = Field(False, description="Always false: these neighbours stay.")
 
     @model_validator(mode="after")
     def _stay(self) -> LatticeNeighbours:
@@ -77,9 +77,16 @@ class Euclidean(NeighbourMetric):
     """
 
     type: Literal["euclidean"] = "euclidean"
-    radius: Annotated[float, Field(gt=0.0)]
-    weights: Annotated[tuple[Weight, Weight], Field(strict=False)] = (1.0, 1.0)
-    reevaluate: bool = False
+    radius: Annotated[float, Field(gt=0.0)] = Field(
+        description="Weighted distance up to which particles are neighbours (lattice units).",
+        examples=[1.5],
+    )
+    weights: Annotated[tuple[Weight, Weight], Field(strict=False)] = Field(
+        (1.0, 1.0), description="w_x and w_y of the distance.", examples=[[1.0, 1.7]]
+    )
+    reevaluate: bool = Field(
+        False, description="Whether neighbours are found anew at every step.", examples=[True]
+    )
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Ranked by weighted distance."""

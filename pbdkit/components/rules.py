@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+from pydantic import Field
+
 from pbdkit.interfaces import FollowerRule, Here, Setting, Vector, length, where
 
 
@@ -15,6 +17,8 @@ class Barycentre(FollowerRule):
     """
 
     type: Literal["barycentre"] = "barycentre"
+
+    linear: ClassVar[bool] = True
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
@@ -32,6 +36,8 @@ class MeanDisplacement(FollowerRule):
     """u_j = (1/N) Σ u_k."""
 
     type: Literal["mean-displacement"] = "mean-displacement"
+
+    linear: ClassVar[bool] = True
 
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
@@ -78,9 +84,13 @@ class MixedCoordinate(FollowerRule):
     """
 
     type: Literal["mixed-coordinate"] = "mixed-coordinate"
-    K: float
-    axis: Literal["x", "y"] = "x"
+    K: float = Field(
+        description="Contraction across the loading axis, per way and height (1 / lattice unit).",
+        examples=[-0.004],
+    )
+    axis: Literal["x", "y"] = Field("x", description="The loading axis.", examples=["y"])
 
+    linear: ClassVar[bool] = True
     uses_reference: ClassVar[bool] = True
 
     def parameters(self, setting: Setting) -> dict[str, float]:

@@ -30,16 +30,17 @@ class Springs(FollowerRule):
         return Stiffness(9 / 8, 9 / 8, 3 / 8, 3 / 8)
 
     def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
-        """Half the spring's stiffness, for each of the cells beside it."""
+        """Half the spring's stiffness, for each of the cells beside it, and its rest length."""
         rests = [math.hypot(*s.rest) for s in setting.slots[slot.source]]
         edge = min(rests)
         diagonals = sum(math.isclose(rest, edge * math.sqrt(2.0)) for rest in rests)
         edges = sum(math.isclose(rest, edge) for rest in rests)
         if (edges, diagonals) == (6, 0) and len(rests) == 6:
-            return (OF_TRIANGLE / 2,)
+            return OF_TRIANGLE / 2, math.hypot(*slot.rest)
         if (edges, diagonals) == (4, 4) and len(rests) == 8:
             is_edge = math.isclose(math.hypot(*slot.rest), edge)
-            return ((EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2,)
+            half = (EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2
+            return half, math.hypot(*slot.rest)
         raise ExperimentError(
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"
@@ -48,9 +49,9 @@ class Springs(FollowerRule):
     @staticmethod
     def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
-        half, left, right = w
+        half, rest, left, right = w
         stiffness = half * (left + right)
-        v, rest = Vector(r.x + d.x, r.y + d.y), length(r)
+        v = Vector(r.x + d.x, r.y + d.y)
         distance = length(v)
         elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (distance + rest)
         pull = stiffness * elongation / where(distance > 0.0, distance, 1.0)

@@ -25,7 +25,9 @@ class StrainGradient(Elastic):
     """
 
     type: Literal["strain-gradient"] = "strain-gradient"  # type: ignore[assignment]
-    length: Annotated[float, Field(ge=0.0, le=1e6)]
+    length: Annotated[float, Field(ge=0.0, le=1e6)] = Field(
+        description="The internal length l (lattice units).", examples=[0.5]
+    )
 
     def inner(self) -> Elastic:
         """The elastic rule."""

@@ -14,6 +14,7 @@ from pbdkit.interfaces.remembered import Drawn
 
 StrainLimit = Annotated[float, Field(gt=0.0, le=1e75)]
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
+SCATTER = "s: strengths are drawn from 1 ± s, uniformly, by the seed."
 
 
 def _factors(bonds: Bonds, scatter: float, generator: np.random.Generator) -> Any:
@@ -29,8 +30,10 @@ class Strain(Parting):
     """
 
     type: Literal["strain"] = "strain"
-    failure: StrainLimit
-    scatter: Scatter = 0.0
+    failure: StrainLimit = Field(
+        description="The strain above which a bond breaks.", examples=[0.1]
+    )
+    scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
     def constants(self, slot: Slot) -> tuple[float, ...]:
         """(|r|², failure strain of the bond), the latter remembered where it is scattered; or,
@@ -71,9 +74,11 @@ class Damage(Parting):
     """
 
     type: Literal["damage"] = "damage"
-    onset: StrainLimit
-    failure: StrainLimit
-    scatter: Scatter = 0.0
+    onset: StrainLimit = Field(
+        description="The strain at which a bond begins to soften.", examples=[0.05]
+    )
+    failure: StrainLimit = Field(description="The strain at which it is broken.", examples=[0.2])
+    scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
     @model_validator(mode="after")
     def _onset_comes_first(self) -> Self:

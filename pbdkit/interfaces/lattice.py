@@ -6,6 +6,8 @@ import math
 from abc import abstractmethod
 from dataclasses import dataclass
 
+from pydantic import Field
+
 from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component, Pair
 
@@ -114,7 +116,7 @@ class Lattice(Component):
     To add a lattice, write `cell`. A site has an integer index (i, j); (0, 0) lies at `origin`.
     """
 
-    origin: Pair = (0.0, 0.0)
+    origin: Pair = Field((0.0, 0.0), description="Where site (0, 0) lies (lattice units).")
 
     @abstractmethod
     def cell(self) -> Cell:

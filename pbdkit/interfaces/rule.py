@@ -68,7 +68,13 @@ class FollowerRule(Component):
     has no neighbour stays. A fictitious neighbour counts as present.
     """
 
+    linear: ClassVar[bool] = False
+    """Whether moves superpose: with the same neighbours the move is a constant and a part linear in
+    the displacements. What `check` predicts then holds for the whole run, not near its start
+    alone."""
     uses_reference: ClassVar[bool] = False
+    """Whether it counts where the particle stands: `here.X` is then given. Other rules move a
+    translated body in the same way, wherever it stands."""
     uses_cells: ClassVar[bool] = False
     """Whether the rule works cell by cell of the lattice. The last two of `gather`'s w are then the
     shares, 0 to 1, of the cells to the left and to the right of the bond, seen from j, that belong

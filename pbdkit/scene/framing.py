@@ -36,19 +36,10 @@ class Frame:
 
 def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Frame | None:
     """The policy's map for this raster; None where the scene has no frame."""
-    rows = np.flatnonzero(raster.table_kind == FRAME)
-    if not len(rows):
+    frame = sites_of_frame(raster, rule)
+    if frame is None:
         return None
-    inside = raster.site_of(raster.body_rows)
-    frame = RasterFrame(
-        raster,
-        rows,
-        raster.lattice.cell(),
-        raster.site_of(rows).astype(np.int32),
-        tuple(inside.min(axis=0).tolist()),
-        tuple(inside.max(axis=0).tolist()),
-        rule,
-    )
+    rows = frame.frame_rows
     follow = policy.follow(frame)
     _refuse_unfit(follow, len(rows), raster)
     says = np.abs(follow.weight).reshape(len(follow.point), -1).max(axis=1, initial=0.0) > 0.0
@@ -59,6 +50,23 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
             "and it would anchor the body"
         )
     return Frame(raster.place_of(rows), follow, raster.place_of(follow.body))
+
+
+def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
+    """The frame points of a raster as a policy sees them; None where there are none."""
+    rows = np.flatnonzero(raster.table_kind == FRAME)
+    if not len(rows):
+        return None
+    inside = raster.site_of(raster.body_rows)
+    return RasterFrame(
+        raster,
+        rows,
+        raster.lattice.cell(),
+        raster.site_of(rows).astype(np.int32),
+        tuple(inside.min(axis=0).tolist()),
+        tuple(inside.max(axis=0).tolist()),
+        rule,
+    )
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:

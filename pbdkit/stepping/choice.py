@@ -37,18 +37,18 @@ def choose(scene: Scene) -> Choice:
     Raises ExperimentError where the compiled engine is asked for and cannot be had.
     """
     solver = scene.experiment.solver
-    obstacle = _obstacle(scene)
-    if solver.engine == "compiled" and obstacle:
+    hindrance = obstacle(scene)
+    if solver.engine == "compiled" and hindrance:
         raise scene.experiment.located(
-            ExperimentError(f"the compiled engine cannot be had: {obstacle}", ("solver", "engine"))
+            ExperimentError(f"the compiled engine cannot be had: {hindrance}", ("solver", "engine"))
         )
     if solver.engine == "numpy":
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
     if solver.engine == "auto" and seconds < PATIENCE_S:
         return Choice("numpy", 1, "small: there is nothing to gain by compiling")
-    if obstacle:
-        return Choice("numpy", 1, f"slower than it could be: {obstacle}")
+    if hindrance:
+        return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
         threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
@@ -73,7 +73,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
         return Stepper(scene), Choice("numpy", 1, reason)
 
 
-def _obstacle(scene: Scene) -> str:
+def obstacle(scene: Scene) -> str:
     """Why the compiled engine cannot step this scene; empty where it can."""
     if find_spec("numba") is None:
         return "numba is not installed: pip install 'pbdkit[fast]'"

@@ -8,6 +8,7 @@ import numpy as np
 
 from pbdkit.interfaces import Here, Nearness, Vector
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
@@ -20,6 +21,8 @@ class GatheringFollowers(Followers):
     """Moves the followers of a scene in which neighbours come and go.
 
     The same `gather` and `apply` run on tables: a row a pair of neighbours, a row a particle.
+    Neighbours of the reference configuration are summed first, in the order of their slots and with
+    the rest offsets of these, so that a body at rest stays as it is, exactly.
     """
 
     def __init__(self, scene: Scene, near: Nearness) -> None:
@@ -29,15 +32,17 @@ class GatheringFollowers(Followers):
         self._parameters = scene.constants.rule
         everybody = np.arange(raster.count)
         self._place, self._body = raster.place_of(everybody), raster.body_rows
-        self._X = np.stack(positions(raster.lattice.cell(), *raster.cells_of(everybody)))
+        self._site = raster.cells_of(everybody)
+        self._X = np.stack(positions(raster.lattice.cell(), *self._site))
+        self._rank, self._rest = _tables(scene.neighbourhood)
         self._scale = np.sqrt(np.array(near.weights))
         self._radius = near.radius * (1 + 1e-9)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Bonds do not last here, so that none can be broken."""
         u = m.reshape(2, -1)[:, self._place]
-        j, k = self._pairs(self._X + u)
-        d, r = Vector(*(u[:, k] - u[:, j])), Vector(*(self._X[:, k] - self._X[:, j]))
+        j, k, rest = self._pairs(self._X + u)
+        d, r = Vector(*(u[:, k] - u[:, j])), Vector(*rest)
         count = len(self._place)
         total = tuple(
             np.bincount(j, np.broadcast_to(part, j.shape), count)
@@ -65,13 +70,43 @@ class GatheringFollowers(Followers):
         for plane, values in zip(changing(numbers, state.particle_values), fresh, strict=True):
             plane.reshape(-1)[place] = values[movable]
 
-    def _pairs(self, x: Floats) -> tuple[Indices, Indices]:
-        """(j, k): every body particle j with each of its neighbours k, sorted."""
+    def _pairs(self, x: Floats) -> tuple[Indices, Indices, Floats]:
+        """(j, k, rest): every body particle j with each of its neighbours k and the rest offset,
+        (axis, pair), sorted by j, by slot and by k."""
         from scipy.spatial import cKDTree
 
         tree = cKDTree(x.T * self._scale)
         pairs = tree.query_pairs(self._radius, output_type="ndarray").astype(np.intp)
         both = np.concatenate([pairs, pairs[:, ::-1]])
         both = both[np.isin(both[:, 0], self._body)]
-        j, k = both[np.lexsort((both[:, 1], both[:, 0]))].T
-        return j, k
+        j, k = both.T
+        rank, rest = self._of_slots(j, k)
+        # One key for (j, slot, k) sorts faster than three.
+        order = np.argsort((j * (len(self._rest[0]) + 1) + rank) * len(self._place) + k)
+        return j[order], k[order], rest[:, order]
+
+    def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
+        """The number of each pair's slot, the largest of all where it is none, and the rest offset,
+        (axis, pair)."""
+        s, m, n = self._site
+        table = self._rank.shape
+        p, q = m[k] - m[j] + table[2] // 2, n[k] - n[j] + table[3] // 2
+        near = (p >= 0) & (p < table[2]) & (q >= 0) & (q < table[3])
+        rank = np.full(len(j), len(self._rest[0]))
+        rank[near] = self._rank[s[j[near]], s[k[near]], p[near], q[near]]
+        slot = np.minimum(rank, len(self._rest[0]) - 1)
+        known = rank < len(self._rest[0])
+        rest: Floats = np.where(known, self._rest[:, slot], self._X[:, k] - self._X[:, j])
+        return rank, rest
+
+
+def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
+    """The number of a slot by (sublattice, sublattice, step of cells, step of cells), the count of
+    slots where there is none; and the rest offset by that number, (axis, slot)."""
+    slots = [slot for own in neighbourhood.slots for slot in own]
+    m, n = neighbourhood.reach_in_cells
+    size = len(neighbourhood.slots)
+    rank = np.full((size, size, 2 * m + 1, 2 * n + 1), len(slots))
+    for number, slot in enumerate(slots):
+        rank[slot.source, slot.target, slot.cell[0] + m, slot.cell[1] + n] = number
+    return rank, np.array([slot.rest for slot in slots]).T

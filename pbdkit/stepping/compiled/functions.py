@@ -44,12 +44,14 @@ def compiled(function: Function) -> Any:
 def source_key(*functions: Function) -> str:
     """A digest of the source of these functions and of all that they reach, constants included.
 
+    Where they stand counts too: a kernel that is kept finds its functions by their modules.
     What a function reads and cannot be told apart by its value gets a key of its own every time,
     so that a kernel is rather made anew than out of date.
     """
     digest = hashlib.sha256()
     for function in functions:
         for reached in _reached(function):
+            digest.update(f"{reached.__module__}.{reached.__qualname__}".encode())
             digest.update(_source(reached).encode())
             digest.update(repr((reached.__defaults__, reached.__kwdefaults__)).encode())
             for name, value in sorted(_names(reached).items()):
@@ -104,7 +106,7 @@ def _names(function: Function) -> dict[str, Any]:
     while modules:
         module = modules.pop()
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
-            for name in names & set(vars(module)):
+            for name in names & set(dir(module)):  # pbdkit's own are loaded when first used
                 member = getattr(module, name)
                 found[f"{module.__name__}.{name}"] = member
                 modules += [member] if isinstance(member, types.ModuleType) else []

@@ -1,0 +1,34 @@
+"""The conformance suite: every property that components of an interface must have, for anybody's.
+
+In a plugin's tests one line is enough::
+
+    from pbdkit.testing import conformance
+
+    test_conformance = conformance(MyRule())
+
+`examine` gives the same as a report, and `pbdkit plugins check DISTRIBUTION` does it for all
+components of a distribution. docs/extending/testing.md lists the properties.
+"""
+
+from pbdkit.testing.conformance import conformance
+from pbdkit.testing.distributions import examine_all
+from pbdkit.testing.examining import Examination, examine
+from pbdkit.testing.examples import examples_of
+from pbdkit.testing.properties import PROPERTIES, properties_of
+from pbdkit.testing.property import NotAskedError, Property, PropertyError
+from pbdkit.testing.report import Outcome, Report
+
+__all__ = [
+    "PROPERTIES",
+    "Examination",
+    "NotAskedError",
+    "Outcome",
+    "Property",
+    "PropertyError",
+    "Report",
+    "conformance",
+    "examine",
+    "examine_all",
+    "examples_of",
+    "properties_of",
+]

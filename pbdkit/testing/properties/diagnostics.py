@@ -1,0 +1,88 @@
+"""What is asked of diagnostics."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Diagnostic, Variable
+from pbdkit.testing.properties.answers import REPEATABLE
+from pbdkit.testing.property import PropertyError, asked_of
+from pbdkit.testing.questions import moment_of
+from pbdkit.testing.sight import SeenMoment
+from pbdkit.testing.subject import Subject
+
+NAME = r"[a-z][a-z0-9_]*"
+ROUNDING = 1e-12
+
+
+@asked_of(Diagnostic)
+def labels_its_variables(subject: Subject) -> None:
+    """Every variable has a name in lower case, a long name and units ("1" where it has none), so
+    that a dataset can be read without the program."""
+    for variable in _diagnostic(subject).variables():
+        if not re.fullmatch(NAME, variable.name):
+            raise PropertyError(f"the variable '{variable.name}' is not named as `my_quantity` is")
+        for what in ("long_name", "units"):
+            if not getattr(variable, what).strip():
+                raise PropertyError(f"the variable '{variable.name}' has no {what}")
+
+
+@asked_of(Diagnostic, needs=REPEATABLE)
+def measures_what_it_declares(subject: Subject) -> None:
+    """`measure` returns one array for each of its variables, shaped as their `dims` say, of numbers
+    that go into the declared dtype without loss of kind."""
+    diagnostic, scene = _diagnostic(subject), subject.scene()
+    sizes = {"particle": scene.raster.count, "axis": 2}
+    sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
+    variables, measured = diagnostic.variables(), diagnostic.measure(moment_of(scene, 0))
+    if len(variables) != len(measured):
+        raise PropertyError(f"{len(measured)} arrays for {len(variables)} variables")
+    for variable, value in zip(variables, measured, strict=True):
+        unknown = [dim for dim in variable.dims if dim not in sizes]
+        if unknown:
+            raise PropertyError(
+                f"'{variable.name}' has the dimension '{unknown[0]}', which `coordinates` does not "
+                "give"
+            )
+        _refuse_unfit(variable, np.asarray(value), tuple(sizes[dim] for dim in variable.dims))
+
+
+def _refuse_unfit(variable: Variable, value: NDArray[Any], shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise PropertyError(f"'{variable.name}' has the shape {value.shape}, not {shape}")
+    if not np.can_cast(value.dtype, variable.dtype, "same_kind"):
+        raise PropertyError(
+            f"'{variable.name}' is declared as {variable.dtype} and measured as {value.dtype}: "
+            "digits would be lost without a word"
+        )
+
+
+@asked_of(Diagnostic, needs=(*REPEATABLE, "measures-what-it-declares"))
+def takes_rows_in_any_order(subject: Subject) -> None:
+    """Particles in another order have the same values in that order, and all else stays, to
+    rounding: rows are found by `now.rows(numbers)` and mean nothing else."""
+    diagnostic, scene = _diagnostic(subject), subject.scene()
+    moment, count = moment_of(scene, 0), scene.raster.count
+    order = np.random.default_rng(0).permutation(count)
+    seen = diagnostic.measure(SeenMoment(moment, order=order))
+    for variable, one, other in zip(
+        diagnostic.variables(), diagnostic.measure(moment), seen, strict=True
+    ):
+        expected = np.asarray(one)
+        for axis, dim in enumerate(variable.dims):
+            expected = np.take(expected, order, axis) if dim == "particle" else expected
+        size = float(np.abs(expected).max(initial=1e-300))
+        if not (np.abs(np.asarray(other) - expected) <= ROUNDING * size).all():
+            raise PropertyError(
+                f"'{variable.name}' depends on the order of the rows: ask `now.rows(numbers)` for "
+                "particles by number"
+            )
+
+
+def _diagnostic(subject: Subject) -> Diagnostic:
+    assert isinstance(subject.component, Diagnostic)
+    return subject.component

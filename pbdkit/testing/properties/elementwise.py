@@ -1,0 +1,141 @@
+"""What is asked of functions that are called with whole arrays, single numbers or probes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import FollowerRule, FractureModel
+from pbdkit.testing.properties.answers import REPEATABLE
+from pbdkit.testing.property import PropertyError, asked_of
+from pbdkit.testing.questions import (
+    SHAPE,
+    Arrays,
+    applied,
+    differences,
+    gathered,
+    own,
+    summed,
+)
+from pbdkit.testing.subject import Subject
+
+ROUNDING = 1e-12
+"""Some thousand roundings: functions of numpy may differ in the last digit from place to place."""
+ORDERLY = (*REPEATABLE, "returns-a-value-a-particle")
+
+
+@asked_of(FollowerRule, FractureModel, needs=REPEATABLE)
+def returns_a_value_a_particle(subject: Subject) -> None:
+    """Each component of an answer is one value a particle, or one number for all of them; a rule
+    contributes as many from every neighbour, and `breaks` says yes or no."""
+    for question in subject.questions():
+        for name, value in question.answer().items():
+            if value.shape not in ((), SHAPE):
+                raise PropertyError(
+                    f"`{question.what}` returns the shape {value.shape} for particles of shape "
+                    f"{SHAPE} ({name}): it is not elementwise"
+                )
+            if question.what == "breaks" and value.dtype != bool:
+                raise PropertyError(f"`breaks` returns {value.dtype}: compare, as in `... > c[0]`")
+    if isinstance(subject.component, FollowerRule):
+        scene = subject.scene()
+        counts = {len(c) for c in gathered(subject.component, scene, differences(scene, 0))}
+        if len(counts) > 1:
+            raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
+
+
+@asked_of(FollowerRule, FractureModel, needs=REPEATABLE)
+def keeps_single_precision(subject: Subject) -> None:
+    """Numbers of float32 get answers of float32: a run in single precision is one throughout."""
+    for question in subject.questions():
+        single = {name: value.astype(np.float32) for name, value in question.inputs.items()}
+        with np.errstate(all="ignore"):
+            found = question.ask(single)
+        for name, value in found.items():
+            kind = getattr(value, "dtype", None)
+            if kind is not None and kind.kind == "f" and kind != np.float32:
+                raise PropertyError(
+                    f"`{question.what}` returns {kind} for float32 ({name}): leave the dtype to "
+                    "the arithmetic, and make parameters and constants plain numbers, `float(...)`"
+                )
+
+
+@asked_of(FollowerRule, FractureModel, needs=ORDERLY)
+def takes_particles_in_any_order(subject: Subject) -> None:
+    """Particles in another order get the same answers in that order, and neighbours summed in the
+    opposite order the same move, to rounding: numbering means nothing."""
+    order = np.random.default_rng(0).permutation(int(np.prod(SHAPE)))
+    for question in subject.questions():
+        mixed = {name: _in_order(value, order) for name, value in question.inputs.items()}
+        whole = question.answer()
+        with np.errstate(all="ignore"):
+            found = question.ask(mixed)
+        for name, value in found.items():
+            expected = _in_order(np.broadcast_to(whole[name], SHAPE), order)
+            if (place := _apart(np.broadcast_to(value, SHAPE), expected)) is not None:
+                raise PropertyError(
+                    f"`{question.what}` gives a particle another answer where it stands in another "
+                    f"order ({name}: {value[place]} and {expected[place]})"
+                )
+    if isinstance(subject.component, FollowerRule):
+        _refuse_an_order_of_slots(subject.component, subject)
+
+
+def _refuse_an_order_of_slots(rule: FollowerRule, subject: Subject) -> None:
+    scene = subject.scene()
+    arrays = differences(scene, 0) | own(scene, 0)
+    contributions = gathered(rule, scene, arrays)
+    one = applied(rule, scene, summed(contributions), arrays)
+    other = applied(rule, scene, summed(contributions[::-1]), arrays)
+    for name, value in one.items():
+        if _apart(np.asarray(value), np.asarray(other[name])) is not None:
+            raise PropertyError(
+                f"the move depends on the order in which neighbours are summed ({name}): do not "
+                "sum large numbers that cancel"
+            )
+
+
+@asked_of(FollowerRule, FractureModel, needs=(*ORDERLY, "takes-particles-in-any-order"))
+def is_local(subject: Subject) -> None:
+    """A particle that is asked about alone, with plain numbers, gets the answer that it gets among
+    the others: only itself and its neighbours count."""
+    for question in subject.questions():
+        whole = question.answer()
+        for place in [(0, 0), (2, 1), (3, 2)]:
+            alone = {name: float(value[place]) for name, value in question.inputs.items()}
+            try:
+                with np.errstate(all="ignore"):
+                    found = question.ask(alone)
+            except Exception as error:
+                raise PropertyError(
+                    f"`{question.what}` fails with plain numbers in the place of arrays: "
+                    f"{type(error).__name__}: {error}"
+                ) from None
+            _compare_alone(question.what, found, whole, place)
+
+
+def _compare_alone(what: str, found: Arrays, whole: Arrays, place: tuple[int, int]) -> None:
+    for name, value in found.items():
+        among = np.broadcast_to(whole[name], SHAPE)[place]
+        if np.shape(value) or _apart(np.asarray(value), np.asarray(among)) is not None:
+            raise PropertyError(
+                f"`{what}` gives a particle another answer alone than among others "
+                f"({name}: {value} and {among}): it is not elementwise"
+            )
+
+
+def _in_order(value: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
+    return value.reshape(-1)[order].reshape(value.shape)
+
+
+def _apart(one: NDArray[Any], other: NDArray[Any]) -> tuple[int, ...] | None:
+    """The first place at which two answers differ by more than rounding."""
+    if one.dtype == bool:
+        differs = one != other
+    else:
+        size = max(1e-300, float(np.abs(other).max(initial=0.0)))
+        differs = ~(np.abs(one - other) <= ROUNDING * size)
+    places = np.argwhere(differs)
+    return tuple(places[0].tolist()) if len(places) else None

@@ -1,0 +1,210 @@
+"""What is asked of whole steps that a component takes part in."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from pbdkit.errors import PluginError
+from pbdkit.interfaces import (
+    INTERFACES,
+    Diagnostic,
+    FollowerRule,
+    FractureModel,
+    FramePolicy,
+    Lattice,
+    NeighbourMetric,
+)
+from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import obstacle
+from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.stepper import Stepper
+from pbdkit.testing.properties.answers import differing
+from pbdkit.testing.properties.elementwise import ORDERLY
+from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.scenes import place_of
+from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
+from pbdkit.testing.subject import Subject, scenes_with
+
+ALL = tuple(INTERFACES.values())
+STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
+ROUNDING = 1e-12
+"""As a share of the largest displacement; a few steps are some hundred roundings of 1e-16."""
+STEPS = 4
+SOUND = (*ORDERLY, "takes-particles-in-any-order")
+"""What must hold before it means something to step with it."""
+
+
+@asked_of(*STEPPED, needs=(*SOUND, "finds-the-same-anew", "is-seen-alike-from-both-ends"))
+def rests(subject: Subject) -> None:
+    """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
+    by 1e-17 has moved."""
+    quiet = [scene for scene in subject.scenes if not _warned(scene)]
+    if not quiet:
+        raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
+    for scene in quiet:
+        framed, engine, state = scene.frame is not None, Stepper(scene), initial_state(scene)
+        for _ in range(STEPS):
+            state = engine.advance(state)
+            where = f"in step {state.step} {place_of(scene.experiment)}"
+            if state.broken_step is not None and (state.broken_step > 0).any():
+                broken = int((state.broken_step > 0).sum())
+                raise PropertyError(f"{broken} bonds of a body at rest break {where}")
+            if framed and state.u.any():
+                moved = float(np.abs(state.u).max())
+                raise PropertyError(
+                    f"a body at rest moves by {moved:.3g} {where}: zero differences must give a "
+                    "move of exactly zero; let terms of opposite neighbours cancel one by one"
+                )
+
+
+def _warned(scene: Scene) -> bool:
+    return bool(scene.experiment.fracture.check(scene.neighbourhood.shells()))
+
+
+@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=SOUND)
+def follows_translations(subject: Subject) -> None:
+    """A body that is translated as a whole moves as before, translated, to rounding; rules that
+    declare `uses_reference` and frames that say they `anchors` it need not."""
+    component, most = subject.component, 0.0
+    anchors = isinstance(component, FramePolicy) and component.anchors()
+    for scene in _free(subject):
+        u, size = displacements(scene, 1), spacing(scene)
+        shift = size * np.array([0.75, -1.5])
+        moved, there = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
+        most = max(most, _apart(there[-1], moved[-1], moved))
+        if most > ROUNDING and not anchors:
+            remedy = {
+                FollowerRule: "use differences `d`, not `here.u`, or declare `uses_reference`",
+                FramePolicy: "let the weights of each point sum to 1, or answer `anchors`",
+            }.get(next(i for i in STEPPED if isinstance(component, i)), "")
+            raise PropertyError(
+                f"a translated body moves otherwise, by {most:.3g} of its displacement, "
+                f"{place_of(scene.experiment)}" + (f": {remedy}" if remedy else "")
+            )
+    if anchors and most <= ROUNDING:
+        raise PropertyError("it says that it `anchors` the body, and follows every translation")
+
+
+def _free(subject: Subject) -> list[Scene]:
+    """The scenes in which nothing else counts where particles stand; NotAskedError without any."""
+    parts = [(scene, scene.experiment) for scene in subject.scenes]
+    free = [
+        scene
+        for scene, e in parts
+        if not e.rule.uses_reference and (e.frame is subject.component or not e.frame.anchors())
+    ]
+    if not free:
+        whose = "it" if isinstance(subject.component, FollowerRule) else "the rule"
+        raise NotAskedError(
+            f"{whose} declares `uses_reference`, or a frame anchors: where a body lies may count"
+        )
+    return free
+
+
+@asked_of(FollowerRule, FramePolicy, needs=SOUND)
+def superposes(subject: Subject) -> None:
+    """Where a rule declares `linear`, and with every frame, the steps from two displacements
+    together are the steps from each, added, to rounding."""
+    component = subject.component
+    scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
+    if not scenes:
+        whose = "it" if isinstance(component, FollowerRule) else "the rule"
+        raise NotAskedError(f"{whose} does not declare `linear`")
+    for scene in scenes:
+        one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
+        both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
+        off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
+        if not off <= ROUNDING:
+            raise PropertyError(
+                f"displacements do not superpose, by {off:.3g} of the largest, "
+                f"{place_of(scene.experiment)}: "
+                + ("do not declare `linear`" if isinstance(component, FollowerRule) else "")
+            )
+
+
+def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
+    """How far two states are apart, as a share of the largest displacement there was: what grows
+    takes its roundings with it."""
+    return float(np.abs(one - other).max() / max(1e-300, np.abs(all_of_them).max()))
+
+
+@asked_of(*ALL, needs=(*SOUND, "survives-json"))
+def continues_where_it_stopped(subject: Subject) -> None:
+    """A run that is saved, read by a component made anew from its JSON and continued is the same to
+    the last bit as one that was never interrupted."""
+    component, kind = subject.component, type(subject.component)
+    anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
+    for n, (scene, again) in enumerate(
+        zip(subject.scenes, scenes_with(anew, subject.parts), strict=True)
+    ):
+        start = displacements(scene, n, share=0.4)
+        whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
+        saved = pickle.dumps(Stepper(scene).advance(state_with(scene, start), STEPS))
+        continued = Stepper(again).advance(pickle.loads(saved), STEPS)
+        _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
+        if isinstance(component, Diagnostic) and isinstance(anew, Diagnostic):
+            _compare_measured(component, scene, whole, anew, again, continued)
+
+
+def _compare_measured(
+    one: Diagnostic, scene: Scene, whole: State, other: Diagnostic, again: Scene, continued: State
+) -> None:
+    names = [variable.name for variable in one.variables()]
+    expected = one.measure(StateMoment(whole, Tables(scene)))
+    found = other.measure(StateMoment(continued, Tables(again)))
+    pairs = [
+        {n: np.array(v) for n, v in zip(names, values, strict=True)} for values in (expected, found)
+    ]
+    if names := differing(*pairs):
+        raise PropertyError(f"`{names[0]}` of a run continued at step {STEPS} is another one")
+
+
+@asked_of(*STEPPED, needs=(*SOUND, "is-local", "continues-where-it-stopped"))
+def is_the_same_compiled(subject: Subject) -> None:
+    """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
+    compile is stepped by numpy, and says so."""
+    scene = subject.scene()
+    if reason := obstacle(scene):
+        raise NotAskedError(reason)
+    from pbdkit.stepping.compiled.stepper import CompiledStepper
+
+    try:
+        compiled: Engine = CompiledStepper(scene)
+    except PluginError as error:
+        text = str(error).splitlines()[0]
+        raise NotAskedError(f"numpy alone steps it, more slowly: {text}") from None
+    start = displacements(scene, 4, share=0.6)
+    state, expected = state_with(scene, start), state_with(scene, start)
+    for steps in (1, 2, STEPS):
+        state, expected = compiled.advance(state, steps), Stepper(scene).advance(expected, steps)
+        _refuse_difference(state, expected, "the compiled engine", scene)
+
+
+def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) -> None:
+    for field in fields(expected):
+        one, other = getattr(state, field.name), getattr(expected, field.name)
+        if not _identical(one, other):
+            raise PropertyError(
+                f"{whose} gives another `{field.name}`{_by(one, other)} at step {expected.step}, "
+                f"{place_of(scene.experiment)}"
+            )
+
+
+def _identical(one: Any, other: Any) -> bool:
+    if isinstance(one, (tuple, list)):
+        return len(one) == len(other) and all(map(_identical, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
+    return bool(one == other)
+
+
+def _by(one: Any, other: Any) -> str:
+    if not isinstance(one, np.ndarray) or np.shape(one) != np.shape(other):
+        return ""
+    return f", by {np.abs(one.astype(float) - other.astype(float)).max():.3g} at most,"

@@ -1,0 +1,264 @@
+"""Lattices, neighbour metrics, frames, fracture models and diagnostics with one fault each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+import pbdkit
+
+
+class Twins(pbdkit.Lattice):
+    """Two sites in one place."""
+
+    type: Literal["twins"] = "twins"
+
+    def cell(self):
+        twin = pbdkit.BasisSite(pbdkit.Vector(0.0, 0.0), index=(0, 1), primitive=(0, 1))
+        return pbdkit.Cell(
+            (pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 2.0)),
+            (pbdkit.BasisSite(), twin),
+            period=(1, 2),
+            primitive=((1, 0), (0, 2)),
+        )
+
+
+class Flat(pbdkit.Lattice):
+    """Both cell vectors along x."""
+
+    type: Literal["flat"] = "flat"
+
+    def cell(self):
+        return pbdkit.Cell((pbdkit.Vector(1.0, 0.0), pbdkit.Vector(2.0, 0.0)))
+
+
+class Rooted(pbdkit.Lattice):
+    """A square lattice that grows with the distance of its origin."""
+
+    type: Literal["rooted"] = "rooted"
+
+    def cell(self):
+        a = 1.0 + 1e-9 * abs(self.origin[0])
+        return pbdkit.Cell((pbdkit.Vector(a, 0.0), pbdkit.Vector(0.0, a)))
+
+
+class OneSided(pbdkit.NeighbourMetric):
+    """Neighbours to the right only."""
+
+    type: Literal["one-sided"] = "one-sided"
+
+    def shells_around(self, cell, sublattice):
+        return [[o for o in cell.offsets(sublattice, 1.5) if o.rest.x > 0.0]]
+
+
+class Approximate(pbdkit.NeighbourMetric):
+    """Rest offsets to ten digits."""
+
+    type: Literal["approximate"] = "approximate"
+
+    def shells_around(self, cell, sublattice):
+        shell = cell.offsets(sublattice, 1.35)
+        return [[replace(o, rest=pbdkit.Vector(*np.round(o.rest, 10).tolist())) for o in shell]]
+
+
+class Favours(pbdkit.NeighbourMetric):
+    """The first sublattice sees farther within itself."""
+
+    type: Literal["favours"] = "favours"
+
+    def shells_around(self, cell, sublattice):
+        near = cell.offsets(sublattice, 1.45)
+        far = [o for o in cell.offsets(sublattice, 1.9) if o.target == sublattice == 0]
+        return [list(dict.fromkeys([*near, *far]))]
+
+
+class Contradicts(pbdkit.NeighbourMetric):
+    """Chooses within one radius and finds anew within another."""
+
+    type: Literal["contradicts"] = "contradicts"
+
+    def shells_around(self, cell, sublattice):
+        return [cell.offsets(sublattice, 1.5)]
+
+    def nearness(self):
+        return pbdkit.Nearness(2.1, (1.0, 1.0))
+
+
+class Following(pbdkit.FramePolicy):
+    """The first of the nearest: what the others would be without their fault."""
+
+    type: Literal["following"] = "following"
+
+    def depth(self, reach):
+        return reach
+
+    def follow(self, frame):
+        point, body = frame.nearest()
+        points, first = np.unique(point, return_index=True)
+        return pbdkit.FrameMap(points, body[first], np.ones(len(points)))
+
+
+class Alternates(Following):
+    """Every second point follows the first of its nearest, the others the last."""
+
+    type: Literal["alternates"] = "alternates"
+
+    def follow(self, frame):
+        point, body = frame.nearest()
+        points, first = np.unique(point, return_index=True)
+        last = np.append(first[1:], len(point)) - 1
+        chosen = np.where(np.arange(len(points)) % 2 == 0, first, last)
+        return pbdkit.FrameMap(points, body[chosen], np.ones(len(points)))
+
+
+class Shrinks(Following):
+    """Follows by nine tenths, which ties the body to its place, and does not say so."""
+
+    type: Literal["shrinks"] = "shrinks"
+
+    def follow(self, frame):
+        found = super().follow(frame)
+        return replace(found, weight=0.9 * found.weight)
+
+
+class SaysItAnchors(Following):
+    """Says that it ties the body to its place, and does not."""
+
+    type: Literal["says-it-anchors"] = "says-it-anchors"
+
+    def anchors(self):
+        return True
+
+
+class WritesSites(Following):
+    """Counts the sites from 1, where they lie."""
+
+    type: Literal["writes-sites"] = "writes-sites"
+
+    def follow(self, frame):
+        frame.site[...] += 1
+        return super().follow(frame)
+
+
+class Strain(pbdkit.FractureModel):
+    """A limit of strain: what the others would be without their fault."""
+
+    type: Literal["strain"] = "strain"
+    limit: float = Field(0.5, description="The strain at which bonds break.")
+
+    def constants(self, slot):
+        return ((1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest),)
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) > c[0]
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return pbdkit.Vector(0.0, 0.0)
+
+
+class Lopsided(Strain):
+    """Breaks where the far end has moved to the right."""
+
+    type: Literal["lopsided"] = "lopsided"
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x > p.limit
+
+
+class Directed(Strain):
+    """Has a limit for either direction of a bond."""
+
+    type: Literal["directed"] = "directed"
+
+    def constants(self, slot):
+        return (1e3 + slot.rest.x,)
+
+
+class DeniesBreaking(Strain):
+    """Says that nothing breaks, and breaks."""
+
+    type: Literal["denies-breaking"] = "denies-breaking"
+    can_break: ClassVar[bool] = False
+
+
+class BreaksAtRest(Strain):
+    """Has no strength at all, and no warning."""
+
+    type: Literal["breaks-at-rest"] = "breaks-at-rest"
+    limit: float = Field(-0.1, description="The strain at which bonds break.")
+
+
+class Measures(Strain):
+    """Answers with a number where yes or no is asked."""
+
+    type: Literal["measures"] = "measures"
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) - c[0]
+
+
+class Extent(pbdkit.Diagnostic):
+    """How far each particle has moved: what the others would be without their fault."""
+
+    type: Literal["extent"] = "extent"
+
+    def variables(self):
+        return (pbdkit.Variable("extent", ("particle",), "displacement", "lattice unit"),)
+
+    def measure(self, now):
+        return (np.hypot(*now.displacement().T),)
+
+
+class NoUnits(Extent):
+    """Does not say in which units it is."""
+
+    type: Literal["no-units"] = "no-units"
+
+    def variables(self):
+        return (pbdkit.Variable("extent", ("particle",), "displacement", ""),)
+
+
+class OneShort(Extent):
+    """Leaves the last particle out."""
+
+    type: Literal["one-short"] = "one-short"
+
+    def measure(self, now):
+        return (super().measure(now)[0][:-1],)
+
+
+class Truncates(Extent):
+    """Is declared as whole numbers."""
+
+    type: Literal["truncates"] = "truncates"
+
+    def variables(self):
+        return (pbdkit.Variable("extent", ("particle",), "displacement", "1", "i4"),)
+
+
+class FromFirstRow(Extent):
+    """Measures from whatever particle comes first."""
+
+    type: Literal["from-first-row"] = "from-first-row"
+
+    def measure(self, now):
+        return (np.hypot(*(now.displacement() - now.displacement()[0]).T),)
+
+
+class KeepsLargest(Extent):
+    """Keeps the largest value of all runs."""
+
+    type: Literal["keeps-largest"] = "keeps-largest"
+    largest: ClassVar[list[float]] = [0.0]
+
+    def measure(self, now):
+        extent = super().measure(now)[0]
+        self.largest[0] = max(self.largest[0], float(extent.max()))
+        return (extent / self.largest[0],)

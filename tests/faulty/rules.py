@@ -1,0 +1,312 @@
+"""Rules with one fault each."""
+
+from __future__ import annotations
+
+import random
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, PrivateAttr
+
+import pbdkit
+
+
+class Sound(pbdkit.FollowerRule):
+    """The mean displacement: what the others would be without their fault."""
+
+    type: Literal["sound"] = "sound"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[2], total[1] / total[2]
+
+
+class WritesInput(Sound):
+    """Doubles the difference where it lies."""
+
+    type: Literal["writes-input"] = "writes-input"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        x, y = d
+        x *= 2.0
+        return x, y, 1.0
+
+
+class CountsPlaces(Sound):
+    """Moves the more, the later a particle comes."""
+
+    type: Literal["counts-places"] = "counts-places"
+
+    @staticmethod
+    def apply(total, here, p):
+        later = np.arange(np.size(total[0]), dtype=total[0].dtype).reshape(np.shape(total[0]))
+        return total[0] * later, total[1] * later
+
+
+class SumsInOrder(Sound):
+    """Takes large numbers in and out again."""
+
+    type: Literal["sums-in-order"] = "sums-in-order"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return 1e8 * r.x + d.x, d.y, 1.0
+
+
+class Doubles(Sound):
+    """Computes in double precision, whatever it is given."""
+
+    type: Literal["doubles"] = "doubles"
+
+    @staticmethod
+    def apply(total, here, p):
+        half = np.float64(0.5)
+        return half * total[0], half * total[1]
+
+
+class LooksAround(Sound):
+    """Moves everybody by the mean of all."""
+
+    type: Literal["looks-around"] = "looks-around"
+
+    @staticmethod
+    def apply(total, here, p):
+        return np.mean(total[0]) + 0.0 * total[0], total[1] / total[2]
+
+
+class NeedsArrays(Sound):
+    """Calls a method that plain numbers do not have."""
+
+    type: Literal["needs-arrays"] = "needs-arrays"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0].clip(-1.0, 1.0), total[1]
+
+
+SEEN: list[float] = []
+
+
+class Remembers(Sound):
+    """Goes on from what it was asked before."""
+
+    type: Literal["remembers"] = "remembers"
+
+    @staticmethod
+    def apply(total, here, p):
+        SEEN.append(float(np.sum(total[0])))
+        return total[0] + SEEN[-2 if len(SEEN) > 1 else -1], total[1]
+
+
+class Counts(Sound):
+    """Moves less with every call."""
+
+    type: Literal["counts"] = "counts"
+    calls: ClassVar[dict[str, int]] = {"apply": 0}
+
+    @staticmethod
+    def apply(total, here, p):
+        Counts.calls["apply"] += 1
+        return total[0] / Counts.calls["apply"], total[1]
+
+
+class Throws(Sound):
+    """Throws dice."""
+
+    type: Literal["throws"] = "throws"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * random.random(), total[1]
+
+
+class Drifts(Sound):
+    """Moves to the right, at rest too."""
+
+    type: Literal["drifts"] = "drifts"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[2] + 1e-9, total[1] / total[2]
+
+
+class DriftsByRounding(Sound):
+    """Adds a tenth for every neighbour, and takes it away again all at once."""
+
+    type: Literal["drifts-by-rounding"] = "drifts-by-rounding"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x + 0.1, d.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] - 0.1 * total[2], total[1]
+
+
+class Divides(Sound):
+    """Divides by the distance, which can be zero."""
+
+    type: Literal["divides"] = "divides"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        distance = pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y))
+        return d.x / distance, d.y / distance, 1.0
+
+
+class Square(Sound):
+    """Returns a value too many for every particle."""
+
+    type: Literal["square-shaped"] = "square-shaped"
+
+    @staticmethod
+    def apply(total, here, p):
+        return np.stack([total[0], total[0]]), total[1]
+
+
+class Varies(Sound):
+    """Contributes more from some neighbours than from others."""
+
+    type: Literal["varies"] = "varies"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return (d.x, d.y, 1.0) if r.x > 0 else (d.x, d.y, 1.0, 1.0)
+
+
+class ClaimsLinear(Sound):
+    """Declares that displacements superpose, and squares them."""
+
+    type: Literal["claims-linear"] = "claims-linear"
+    linear: ClassVar[bool] = True
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x * d.x, d.y, 1.0
+
+
+class HoldsOn(Sound):
+    """Pulls particles back to their sites, and does not say so."""
+
+    type: Literal["holds-on"] = "holds-on"
+
+    @staticmethod
+    def apply(total, here, p):
+        return -0.5 * here.u.x, total[1] / total[2]
+
+
+class Unlike(Sound):
+    """Multiplies whole numbers beyond 63 bits, which wrap around in compiled code."""
+
+    type: Literal["unlike"] = "unlike"
+
+    @staticmethod
+    def apply(total, here, p):
+        side = 3037000500
+        return side * side / 2.0**63 * total[0] / total[2], total[1] / total[2]
+
+
+class Restarts(Sound):
+    """Draws a number when it is made, which is not among its parameters."""
+
+    type: Literal["restarts"] = "restarts"
+    _share: float = PrivateAttr(default_factory=random.random)
+
+    def parameters(self, setting) -> dict[str, float]:
+        return {"share": self._share}
+
+    @staticmethod
+    def apply(total, here, p):
+        return p.share * total[0], total[1]
+
+
+class Raises(Sound):
+    """Asks for a parameter that it does not have."""
+
+    type: Literal["raises"] = "raises"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return p.strength * d.x, d.y, 1.0
+
+
+class Undescribed(Sound):
+    """Has a parameter that nobody explains."""
+
+    type: Literal["undescribed"] = "undescribed"
+    strength: float = 1.0
+
+
+class Undocumented(Sound):
+    type: Literal["undocumented"] = "undocumented"
+
+
+class AnyName(Sound):
+    """Goes by any name."""
+
+    type: str = "any-name"
+
+
+class CapitalName(Sound):
+    """Is spelt as a class is."""
+
+    type: Literal["CapitalName"] = "CapitalName"
+
+
+class Thawed(Sound):
+    """Can be changed after it is made."""
+
+    model_config = ConfigDict(frozen=False)
+    type: Literal["thawed"] = "thawed"
+    strength: float = Field(1.0, description="Can be set.")
+
+
+class Unhashable(Sound):
+    """Has a parameter that cannot be hashed."""
+
+    type: Literal["unhashable"] = "unhashable"
+    shares: dict[str, float] = Field({"x": 1.0}, description="Can be changed from within.")
+
+
+class Lenient(Sound):
+    """Takes any key."""
+
+    model_config = ConfigDict(extra="allow")
+    type: Literal["lenient"] = "lenient"
+
+    @classmethod
+    def known_keys(cls) -> list[str]:
+        return ["type", "no_such_parameter"]
+
+
+class Forgets(Sound):
+    """Leaves a parameter out of its JSON."""
+
+    type: Literal["forgets"] = "forgets"
+    strength: float = Field(1.0, description="Lost on the way.", exclude=True)
+
+
+class Chooses(Sound):
+    """Refuses every lattice."""
+
+    type: Literal["chooses"] = "chooses"
+
+    def parameters(self, setting) -> dict[str, float]:
+        raise pbdkit.ExperimentError("'chooses' works on no lattice at all")
+
+
+def homeless() -> Any:
+    """A rule whose class stands where nothing can import it from."""
+
+    class Homeless(Sound):
+        """Is defined within a function."""
+
+        type: Literal["homeless"] = "homeless"
+
+    return Homeless()

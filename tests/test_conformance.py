@@ -1,0 +1,242 @@
+"""The conformance suite: the built-in components pass it, and it finds and names every fault."""
+
+import json
+import re
+import subprocess
+import sys
+from typing import Literal
+
+import pytest
+from faulty import others, rules
+from faulty.kagome import Kagome, OnKagome
+from pydantic import Field
+
+import pbdkit
+from pbdkit.components import pbdkit_components
+from pbdkit.components.rules import MixedCoordinate
+from pbdkit.interfaces import INTERFACES
+from pbdkit.testing import PROPERTIES, Examination, conformance, examine, examine_all, examples_of
+
+test_built_in_components_conform = conformance(*pbdkit_components())
+
+SOUND = [rules.Sound(), others.Following(), others.Strain(), others.Extent()]
+
+FAULTS = [
+    (rules.WritesInput, "changes-no-input", "`gather` writes into `d0.x`"),
+    (rules.CountsPlaces, "takes-particles-in-any-order", "another answer where it stands"),
+    (rules.SumsInOrder, "takes-particles-in-any-order", "order in which neighbours are summed"),
+    (rules.Doubles, "keeps-single-precision", "`apply` returns float64 for float32"),
+    (rules.LooksAround, "is-local", "another answer alone than among others"),
+    (rules.NeedsArrays, "is-local", "fails with plain numbers in the place of arrays"),
+    (rules.Remembers, "remembers-nothing", "keeps `SEEN` from call to call"),
+    (rules.Counts, "remembers-nothing", "keeps `Counts.calls` from call to call"),
+    (rules.Throws, "answers-the-same", "otherwise the second time"),
+    (rules.Drifts, "rests", "a body at rest moves by 1e-09 in step 1 on the square lattice"),
+    (rules.DriftsByRounding, "rests", "a body at rest moves by"),
+    (rules.Divides, "is-finite", "where all neighbours meet in the particle"),
+    (rules.Square, "returns-a-value-a-particle", "returns the shape (2, 4, 3)"),
+    (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 3, now 4 values"),
+    (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
+    (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
+    (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
+    (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
+    (rules.Raises, "changes-no-input", "has no attribute 'strength'"),
+    (rules.Undescribed, "is-documented", "the parameter `strength` has no description"),
+    (rules.Undocumented, "is-documented", "Undocumented has no docstring"),
+    (rules.AnyName, "names-itself", 'declare it as `type: Literal["any-name"] = "any-name"`'),
+    (rules.CapitalName, "names-itself", "the type 'CapitalName' is not in lower case"),
+    (rules.Thawed, "is-frozen", "`type` can be set"),
+    (rules.Unhashable, "is-frozen", "take tuples for lists and named fields for dicts"),
+    (rules.Lenient, "refuses-unknown-keys", "it takes any key"),
+    (rules.Forgets, "survives-json", "`strength` is 2.0, and 1.0 after JSON"),
+    (rules.homeless, "survives-pickling", "define the class at the top of a module"),
+    (rules.Chooses, "takes-part", "name the parts that go with it"),
+    (others.Twins, "has-a-sound-cell", "(0, 0) and (0, 1) lie at one place, (0.0, 0.0)"),
+    (others.Flat, "has-a-sound-cell", "span no area"),
+    (others.Rooted, "keeps-its-cell-wherever-it-lies", "leave `self.origin` out of `cell`"),
+    (others.OneSided, "is-mutual", "'one-sided' is not mutual"),
+    (others.Approximate, "takes-offsets-of-the-cell", "is none of the cell's"),
+    (others.Favours, "takes-sublattices-in-any-order", "where the sites are listed backwards"),
+    (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
+    (others.Alternates, "takes-every-point-alone", "follows somebody else where fewer points"),
+    (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),
+    (others.SaysItAnchors, "follows-translations", "and follows every translation"),
+    (others.WritesSites, "changes-no-input", "`follow` writes into `site`"),
+    (others.Lopsided, "is-seen-alike-from-both-ends", "otherwise for (-d, -r) than for (d, r)"),
+    (others.Directed, "is-seen-alike-from-both-ends", "take lengths and shells, not directions"),
+    (others.DeniesBreaking, "breaks-as-declared", "and `breaks` says yes"),
+    (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
+    (others.Measures, "returns-a-value-a-particle", "`breaks` returns float64: compare"),
+    (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
+    (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
+    (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
+    (others.FromFirstRow, "takes-rows-in-any-order", "ask `now.rows(numbers)`"),
+    (others.KeepsLargest, "remembers-nothing", "keeps `KeepsLargest.largest` from call to call"),
+]
+
+
+def made(faulty):
+    return faulty(strength=2.0) if faulty is rules.Forgets else faulty()
+
+
+@pytest.mark.parametrize("component", SOUND, ids=lambda c: c.type)
+def test_the_faulty_ones_are_sound_but_for_their_fault(component):
+    report = examine(component)
+    assert report.holds, str(report)
+
+
+@pytest.mark.parametrize(
+    ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
+)
+def test_every_fault_is_found_and_named(faulty, name, words):
+    report = examine(made(faulty))
+    assert [outcome.property for outcome in report.failed] == [name], str(report)
+    assert words in report.failed[0].reason
+
+
+def test_every_property_finds_a_fault():
+    assert {p.name for p in PROPERTIES} == {name for _, name, _ in FAULTS}
+
+
+def test_every_property_says_what_it_asks_and_of_whom():
+    for asked in PROPERTIES:
+        assert len(asked.asks) > 30, asked.name
+        assert asked.interfaces
+        assert set(asked.interfaces) <= set(INTERFACES.values())
+
+
+def test_nobody_is_excused():
+    """Every property of an interface is asked of everybody; the built-in ones are tried above."""
+    for component in pbdkit_components():
+        asked = [p.name for p in PROPERTIES if issubclass(component, p.interfaces)]
+        for example in examples_of(component):
+            assert [p.name for p in Examination(example).properties] == asked
+
+
+def test_a_report_tells_what_ran_and_why_not():
+    text = str(examine(rules.Sound()))
+    assert text.startswith(
+        "FollowerRule sound: 19 properties ran, 0 failed; 1 skipped: it does not"
+    )
+    assert "  held     rests" in text
+
+
+def test_after_a_fault_nothing_is_judged_that_means_nothing():
+    report = examine(rules.WritesInput())
+    assert {o.reason for o in report.skipped} == {"not judged while changes-no-input fails"}
+
+
+def test_pbdkits_own_words_compile():
+    """A function that says `pbdkit.where` is compiled as one that imports it."""
+    report = examine(others.Strain())
+    assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
+
+
+def test_examples_come_from_defaults_and_from_fields():
+    made = examples_of(MixedCoordinate)
+    assert [(e.K, e.axis) for e in made] == [(-0.004, "x"), (-0.004, "y")]
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        (Field(description="k"), "Needy.k has neither default nor example: write `k: ... = Field("),
+        (Field(1.0, examples=["a"]), "Needy refuses its examples {'k': 'a'}: k: Input should be"),
+    ],
+)
+def test_a_class_without_usable_examples_is_told(field, words):
+    annotations = {"type": Literal["needy"], "k": float}
+    needy = type(
+        "Needy", (rules.Sound,), {"type": "needy", "k": field, "__annotations__": annotations}
+    )
+    with pytest.raises(pbdkit.PluginError, match=re.escape(words)):
+        examples_of(needy)
+    (report,) = examine_all([needy])
+    assert not report.holds
+    assert words in report.failed[0].reason
+
+
+def test_what_goes_with_its_own_lattice_alone_is_tried_on_that():
+    reports = list(examine_all([Kagome, OnKagome]))
+    assert [report.holds for report in reports] == [True, True], "\n".join(map(str, reports))
+    assert "takes-part" in [outcome.property for outcome in examine(OnKagome()).failed]
+    assert examine(OnKagome(), lattice=Kagome()).holds
+
+
+def test_without_a_component_there_is_nothing_to_conform():
+    with pytest.raises(ValueError, match="given no component"):
+        conformance()
+
+
+ONE_LINE = """
+from my_rules import Mine
+from pbdkit.testing import conformance
+
+test_conformance = conformance(Mine())
+"""
+SOURCE = """
+from typing import Literal
+import pbdkit
+
+class Mine(pbdkit.FollowerRule):
+    "Half of the mean displacement."
+    type: Literal["mine"] = "mine"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d.x, d.y, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return SHARE * total[0] / total[2], total[1] / total[2]
+
+@pbdkit.hookimpl
+def pbdkit_components():
+    return [Mine]
+"""
+
+
+@pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
+def test_one_line_is_enough_for_pytest(tmp_path, share, code):
+    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "1e-9 + ")
+    (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
+    (tmp_path / "test_mine.py").write_text(ONE_LINE)
+    call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code, done.stdout
+    assert f"FollowerRule mine: 19 properties ran, {code} failed; 1 skipped" in done.stdout
+    assert "does not declare `linear`" in done.stdout
+    if code:
+        assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
+
+
+def test_plugins_check_tries_a_distribution(install, call):
+    install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
+    install("pbdkit-bad", SOURCE.replace("SHARE *", "1e-9 +").replace("mine", "bad"))
+    good = call("plugins", "check", "pbdkit_good")
+    assert good.code == 0
+    assert "FollowerRule mine: 19 properties ran, 0 failed; 1 skipped: it does not" in good.out
+    assert "all properties hold for 1 example of its components" in good.out
+    both = call("plugins", "check")
+    assert both.code == 3
+    assert "failed  rests: a body at rest moves by 1e-09" in both.out
+    assert "mine: 19 properties ran, 0 failed" in both.out
+
+
+def test_plugins_check_as_json_and_in_full(install, call):
+    install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
+    answer = json.loads(call("plugins", "check", "pbdkit-good", "--json").out)
+    assert answer["holds"] is True
+    assert {o["state"] for o in answer["reports"][0]["outcomes"]} == {"held", "skipped"}
+    assert "  held     rests" in call("plugins", "check", "pbdkit-good", "--verbose").out
+
+
+def test_plugins_check_tells_what_cannot_be_tried(install, call):
+    nothing = call("plugins", "check")
+    assert (nothing.code, "no plugin is installed" in nothing.err) == (3, True)
+    unknown = call("plugins", "check", "pbdkot")
+    assert (unknown.code, "did you mean 'pbdkit'?" in unknown.err) == (3, True)
+    install("pbdkit-torn", "import there_is_no_such_module")
+    torn = call("plugins", "check", "pbdkit-torn")
+    assert (torn.code, "pbdkit-torn 1.0 is broken: " in torn.err) == (3, True)
+    assert "hold" not in torn.out
