@@ -107,3 +107,10 @@ class FollowerRule(Component):
         in the lattice's units, from the sums. Calibrated rules have it; it vanishes in
         equilibrium."""
         raise NotImplementedError("the rule is not calibrated to a material: it knows no forces")
+
+    @staticmethod
+    def energy(d: Vector, r: Vector, w: Any, p: Any) -> Any:
+        """The half of a bond's strain energy that falls to this end, over Young's modulus and
+        thickness, elementwise, for calibrated rules that are not linear. A rule that does not write
+        it is taken as linear, with the energy -½ Σ u·force."""
+        raise NotImplementedError("the rule has no energy of its own")

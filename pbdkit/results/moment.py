@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Moment, Slot, Vector
+from pbdkit.experiment.leaders import Selection
+from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, Vector
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leading import kinds_at
+from pbdkit.registry.blame import blaming
+from pbdkit.results.gradient import displacement_gradient
+from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.shares import cells_with_shares
 from pbdkit.stepping.fracturing import Fracturing
+from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.sums import difference, presence, sum_over_slots
 
@@ -46,6 +52,16 @@ class Tables:
     def fracturing(self) -> Fracturing | None:
         """The planes of bonds, where bonds can break."""
         return Fracturing(self.scene) if self.scene.has_fracture else None
+
+    @cached_property
+    def followers(self) -> SlotFollowers:
+        """The rule on the scene, which knows forces and energy."""
+        return SlotFollowers(self.scene, self.fracturing)
+
+    @cached_property
+    def shares(self) -> list[tuple[Patch, NDArray[np.float64]]]:
+        """The cells of the body with the share of each."""
+        return list(cells_with_shares(self.raster, self.scene.cells))
 
     @cached_property
     def blocks(self) -> list[tuple[Any, ...]]:
@@ -144,6 +160,58 @@ class StateMoment(Moment):
             values = function(self.corners(patch), patch.cell.rest)
             found.append(np.broadcast_to(values, counted.shape)[counted])
         return np.concatenate(found)
+
+    def stiffness(self) -> Stiffness:
+        """The rule's."""
+        stiffness = self._tables.scene.experiment.rule.stiffness()
+        assert stiffness is not None, "the scene refuses such rules"
+        return stiffness
+
+    def displacement_gradient(self) -> Floats:
+        """Once a moment, whoever asks."""
+        return self._gradient
+
+    @cached_property
+    def _gradient(self) -> Floats:
+        whole = (
+            (patch, share * self._intact(patch) if self._state.broken_step is not None else share)
+            for patch, share in self._tables.shares
+        )
+        planes = displacement_gradient(self._state.u.astype(float, copy=False), whole)
+        return self._tables.raster.table(planes).reshape(-1, 2, 2)
+
+    def forces(self) -> Floats:
+        """Once a moment, whoever asks."""
+        return self._forces
+
+    @cached_property
+    def _forces(self) -> Floats:
+        u, broken = self._state.u.astype(float, copy=False), self._state.broken_step
+        with self._blaming_rule():
+            forces = self._tables.followers.forces(u, broken)
+        return self._tables.raster.table(forces)
+
+    def energy(self) -> float:
+        """The rule's."""
+        u, broken = self._state.u.astype(float, copy=False), self._state.broken_step
+        with self._blaming_rule():
+            return self._tables.followers.energy(u, broken)
+
+    def _blaming_rule(self) -> AbstractContextManager[None]:
+        rule = self._tables.scene.experiment.rule
+        return blaming(rule, f"when asked for forces at step {self.step}", "rule")
+
+    def leader_groups(self) -> tuple[LeaderRows, ...]:
+        """At time 0 those of step 1 lead."""
+        step = max(self.step, 1)
+        return tuple(
+            LeaderRows(each.rows, each.group.leads(step)) for each in self._tables.scene.leading
+        )
+
+    def nearest(self, points: tuple[Pair, ...]) -> Indices:
+        """As leaders are selected."""
+        rows = [select(self._tables.raster, Selection(nearest=(point,)), ()) for point in points]
+        return np.concatenate(rows)
 
     def patches(self, *, intact_only: bool = False) -> Iterator[tuple[Patch, NDArray[np.bool_]]]:
         """The cells of the body, and which of them count."""

@@ -72,6 +72,8 @@ class Recorder:
         diagnostics = scene.experiment.diagnostics
         self._recorded = [d for d in diagnostics if not d.every_step]
         self._stepped = [d for d in diagnostics if d.every_step]
+        wanted = {dim for d in diagnostics for v in d.variables() for dim in v.dims}
+        self._shows_leaders = "leader_group" in wanted
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
@@ -80,6 +82,8 @@ class Recorder:
         sizes = {"particle": self._scene.raster.count, "axis": 2, "index": 2}
         if self._scene.shows_bonds:
             sizes |= {"bond": len(self._scene.bonds.ends), "end": 2}
+        if self._shows_leaders:
+            sizes["leader_group"] = len(self._scene.leading)
         for diagnostic in experiment.diagnostics:
             sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
@@ -101,6 +105,8 @@ class Recorder:
         }
         if scene.shows_bonds:
             known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
+        if self._shows_leaders:
+            known["leader_group"] = lambda: np.arange(len(scene.leading))
         for diagnostic in scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 known[name] = partial(np.asarray, values)
@@ -167,6 +173,8 @@ class Recorder:
             columns.append(layout.broken_column())
         if self._stepped:
             columns.append(layout.step_column())
+        if self._shows_leaders:
+            columns.append(layout.leader_column())
         for diagnostic in self._scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 columns.append(layout.own_coordinate(name, values.dtype.str[1:]))
@@ -188,7 +196,8 @@ class Recorder:
     def _measured(self, diagnostics: list[Diagnostic], moment: StateMoment) -> Values:
         values: Values = {}
         for diagnostic in diagnostics:
-            with blaming(diagnostic, f"at step {moment.step}"):
+            place = self._scene.experiment.diagnostics.index(diagnostic)
+            with blaming(diagnostic, f"at step {moment.step}", "diagnostics", place):
                 measured = diagnostic.measure(moment)
                 for variable, value in zip(diagnostic.variables(), measured, strict=True):
                     _refuse_unfit(variable, value, self._shapes[variable.name], moment.step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
-from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.interfaces import FollowerRule, Here, Slot, Vector
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
@@ -65,18 +66,45 @@ class SlotFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, broken_step: NDArray[np.int32] | None) -> None:
         """Every block from m alone: their order does not matter."""
-        seen = self._inner.moves(m) if self._inner else m
+        seen = self._seen(m)
         for part in self._parts:
             self._place(part, self._moves(part, seen, broken_step), m, new)
 
     def moves(self, m: Floats) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        seen, out = self._inner.moves(m) if self._inner else m, np.zeros_like(m)
+        seen, out = self._seen(m), np.zeros_like(m)
         for part in self._parts:
-            moves = self._moves(part, seen, None)
-            for move, plane in zip(moves, planes(out, part.block), strict=True):
-                plane[...] = move if part.movable is None else np.where(part.movable, move, 0.0)
+            _write(self._moves(part, seen, None), part, out)
         return out
+
+    def forces(self, m: Floats, broken_step: NDArray[np.int32] | None) -> Floats:
+        """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
+        zero where there is no neighbour."""
+        seen, out = self._seen(m), np.zeros_like(m)
+        for part in self._parts:
+            total = self._sums(part, seen, broken_step, self._rule.gather)
+            here = Here(read_only(planes(seen, part.block)), part.X)
+            _write(self._rule.force(total, here, self._parameters), part, out)
+        return out
+
+    def energy(self, m: Floats, broken_step: NDArray[np.int32] | None) -> float:
+        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
+        if self._rule.energy is FollowerRule.energy:
+            return self._work(m, self.forces(m, broken_step))
+        seen, out = self._seen(m), np.zeros_like(m[:1])
+        for part in self._parts:
+            (energy,) = self._sums(part, seen, broken_step, self._energy_of_a_bond)
+            _write((energy,), part, out)
+        return float(out.sum())
+
+    def _work(self, u: Floats, forces: Floats) -> float:
+        """-½ Σ u·force over the body. Where the forces have no resultant, u counts from its mean,
+        so that no digit depends on where the body has gone."""
+        place = self._scene.raster.place_of(self._scene.raster.body_rows)
+        u, forces = u.reshape(2, -1)[:, place], forces.reshape(2, -1)[:, place]
+        if self._scene.frame is None and self._fracturing is None:
+            u = u - u.mean(axis=1, keepdims=True)
+        return -0.5 * float((u * forces).sum())
 
     def _cut(self, sublattice: int) -> list[_Part]:
         whole = self._scene.raster.body_block(sublattice)
@@ -96,19 +124,37 @@ class SlotFollowers(Followers):
             None if movable.all() else movable,
         )
 
+    def _seen(self, m: Floats) -> Floats:
+        """What the rule works on: displacements, or the moves of its inner rule."""
+        return self._inner.moves(m) if self._inner else m
+
     def _moves(
         self, part: _Part, m: Floats, broken_step: NDArray[np.int32] | None
     ) -> tuple[Any, Any]:
+        total = self._sums(part, m, broken_step, self._rule.gather)
+        here = Here(read_only(planes(m, part.block)), part.X)
+        return self._rule.apply(total, here, self._parameters)
+
+    def _energy_of_a_bond(self, d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any]:
+        return (self._rule.energy(d, r, w, p),)
+
+    def _sums(
+        self,
+        part: _Part,
+        m: Floats,
+        broken_step: NDArray[np.int32] | None,
+        function: Callable[[Vector, Vector, Any, Any], tuple[Any, ...]],
+    ) -> tuple[Any, ...]:
+        """Σ function(d, r, w, p) over the neighbours, or what stands in for them."""
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
             if self._fracturing and broken_step is not None:
                 d = self._fracturing.seen(d, u, part.block, slot, broken_step)
-            return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
+            return function(d, slot.rest, part.weights[slot], self._parameters)
 
-        total = sum_over_slots(part.slots, part.present, contribution)
-        return self._rule.apply(total, Here(u, part.X), self._parameters)
+        return sum_over_slots(part.slots, part.present, contribution)
 
     def _place(self, part: _Part, move: tuple[Any, Any], m: Floats, new: Floats) -> None:
         """Writes where the particles of a block go."""
@@ -116,3 +162,10 @@ class SlotFollowers(Followers):
         for here, step, plane in zip(u, move, out, strict=True):
             moved = target(here, step, plane, self._solver)
             plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)
+
+
+def _write(values: tuple[Any, ...], part: _Part, out: Floats) -> None:
+    """The values of the particles that have neighbours, a plane each."""
+    _, rows, columns = part.block.slices()
+    for value, plane in zip(values, out[:, part.block.sublattice, rows, columns], strict=True):
+        plane[...] = value if part.movable is None else np.where(part.movable, value, 0.0)
