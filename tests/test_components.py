@@ -37,6 +37,8 @@ REQUIRED = {
     "modulus_ratio": 0.5,
     "shear_ratio": 0.4,
     "length": 0.1,
+    "youngs_modulus": 7.0,
+    "width": 2.0,
 }
 
 

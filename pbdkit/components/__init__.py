@@ -18,6 +18,8 @@ COMPONENTS = {
     "free_edges": "Natural TractionFree",
     "fracture": "NoFracture Threshold",
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea",
+    "fields": "Strain Rotation Stress",
+    "forces": "StrainEnergy Reaction StressStrain",
 }
 """By module of this folder the classes that it offers."""
 
