@@ -21,7 +21,8 @@ from pbdkit.interfaces import (
     Slot,
     Vector,
 )
-from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.framing import sites_of_frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.stepper import Stepper

@@ -18,7 +18,8 @@ from pbdkit.interfaces import (
     Lattice,
     NeighbourMetric,
 )
-from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.engine import Engine
