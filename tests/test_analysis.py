@@ -225,16 +225,17 @@ def test_a_mode_that_never_decays_is_found():
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_predictions_for_shipped_experiments_are_borne_out(name):
-    """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are."""
+    """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
+    are made of steps, and those that go straight to equilibrium stay there too."""
     experiment = pbdkit.load(name)
-    analysis = pbdkit.analyse(experiment)
-    assert analysis.stable is not False
+    straight = experiment.solver.type == "equilibrium"
+    assert straight or pbdkit.analyse(experiment).stable is not False
     settings = ["steps=400", "record={every: 50}", "diagnostics=[{type: displacement}]"]
     ds = pbdkit.run(pbdkit.load(name, settings=settings), progress=False)
     assert ds.attrs["status"] == "complete"
     assert abs(ds.u).max() < 100
     predicted = json.loads(ds.attrs["prediction"])
-    assert predicted.get("stable", True)
+    assert straight or predicted.get("stable", True)
 
 
 def test_a_run_that_can_diverge_is_warned_of_and_says_so_in_the_dataset(tmp_path, monkeypatch):

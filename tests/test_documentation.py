@@ -27,8 +27,17 @@ def blocks(language):
     ]
 
 
+def save_experiments(page):
+    """The page's own experiments, each as NAME.yaml in the current folder."""
+    for code in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S):
+        (name,) = re.findall(r"^name: (\S+)", code, re.M)
+        Path(f"{name}.yaml").write_text(code)
+
+
 @pytest.mark.parametrize(("page", "code"), blocks("python"))
-def test_python_runs(page, code):
+def test_python_runs(page, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_experiments(page)
     names = {}
     exec(compile(code, page.name, "exec"), names)
     if "ds" in names:
@@ -47,6 +56,7 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (experiment,) = (c for p, c in (b.values for b in blocks("yaml")) if p.name == "README.md")
     Path("tensile.yaml").write_text(experiment)
+    save_experiments(page)
     if "plot" in code:
         assert "pbdkit run" in code
     for line in code.splitlines():

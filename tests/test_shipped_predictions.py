@@ -13,6 +13,7 @@ from property_cases import body_of
 
 import pbdkit
 from pbdkit.analysis.operator import step_operator
+from pbdkit.analysis.region import modes, slowest_swing
 from pbdkit.analysis.spectrum import spectrum
 from pbdkit.equilibrium.loading import equilibrium_state
 from pbdkit.experiment.shipped import shipped_names
@@ -21,17 +22,25 @@ from pbdkit.stepping.state import initial_state
 from pbdkit.stepping.stepper import Stepper
 
 TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
+STEPPED = "solver={type: stepping, relaxation: 0.2}"
 SMALLER = {
+    "material/bar": ["lattice.a=0.2"],
+    "material/cantilever": ["lattice.a=0.25"],
+    "material/hole": ["lattice.a=0.2"],
+    "material/gradient-layer": ["lattice.a=0.1", STEPPED],
     "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
     + [
         f"leaders.{n}.select={{nearest: [[{x}, {y}]]}}"
         for n, (x, y) in enumerate([(9, 9), (9, 10), (10, 9), (10, 10)])
-    ]
+    ],
 }
-"""Settings of shorter variants where the experiment itself would take minutes to settle."""
+"""Settings of shorter variants where the experiment itself would take minutes to settle, and of
+stable steps where they are not those of the file, which goes straight to equilibrium."""
 LONG = ["steps=100000", "record={at: [100000]}"]
-STRAIGHT = ["solver={type: equilibrium, tolerance: 1.0e-12}"]
+STRAIGHT = ["solver={type: equilibrium, tolerance: 1.0e-10}"]
 SHAKEN = 0.1
+HANGING = 1e-5
+"""So near to 1 are the modes of what hangs by a line of springs, in tension or compression."""
 
 
 def scene_with(name, *settings):
@@ -46,9 +55,10 @@ def at_rest(scene):
 
 
 def shaken(scene, state):
-    """The state with its followers a little off."""
+    """The state with its followers a little off; less so where there may be other equilibria."""
     rows = np.setdiff1d(scene.raster.body_rows, np.concatenate([x.rows for x in scene.leading]))
-    noise = SHAKEN * np.random.default_rng(0).uniform(-1, 1, (2, len(rows)))
+    size = SHAKEN if scene.experiment.rule.linear else SHAKEN / 10
+    noise = size * np.random.default_rng(0).uniform(-1, 1, (2, len(rows)))
     state.u.reshape(2, -1)[:, scene.raster.place_of(rows)] += noise
     return state
 
@@ -65,6 +75,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
     assert said["stable"]
     steps, radius = said["steps_to"]["1e-3"], said["spectral_radius"]
     window = max(2, math.ceil(said["period"] / 2)) if said["period"] else 2
+    window = min(window, steps)  # near critical damping nothing is left of a swing
 
     scene = scene_with(name, *whole)
     straight = scene_with(name, *whole, *STRAIGHT)
@@ -82,19 +93,38 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
 
 @pytest.mark.parametrize("name", TORN)
 def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
-    """check speaks of the whole body, and says so; the operator of the torn one has the rate."""
+    """check speaks of the whole body, and says so; the operator of the torn one has the rate.
+
+    Memory leaves no mode faster than √b. A particle that hangs by springs in one line is free to
+    swing across: its mode neither grows nor shrinks, and it does not move.
+    """
     said = json.loads(call("check", name, "--json").out)
     assert "as long as no bond breaks" in call("check", name).out
     scene = scene_with(name)
     stepper = Stepper(scene)
     state = stepper.advance(initial_state(scene), at_rest(scene) + 400)
-    assert (state.broken_step >= 0).any()
-    torn = spectrum(step_operator(scene, state).augmented().matrix()).radius
-    assert said["spectral_radius"] < torn < 1.0
+    assert (state.broken_step > 0).any()
+    found = torn_modes(name, state)
+    torn, swing = abs(found).max(), slowest_swing(found)
+    hangs = scene.experiment.rule.type == "springs" and torn > 1.0 - HANGING
+    assert said["spectral_radius"] - 1e-9 < torn < (1.0 + HANGING if hangs else 1.0)
+    window = math.ceil(swing.period) if swing else 1
     moves = []
-    for _ in range(2):
+    for _ in range(200 + window):
         before = body_of(scene, state)
         state = stepper.advance(state)
         moves.append(np.abs(body_of(scene, state) - before).max())
-        state = stepper.advance(state, 199)
-    assert math.log(moves[1] / moves[0]) / 200 == pytest.approx(math.log(torn), rel=0.05)
+    shrunk = max(moves[200:]) / max(moves[:window])
+    if hangs:
+        assert shrunk < 0.5
+    else:
+        assert math.log(shrunk) / 200 == pytest.approx(math.log(torn), rel=0.05)
+
+
+def torn_modes(name, state):
+    """The eigenvalues of the torn body's step, from those of the rule's own."""
+    solver = scene_with(name).experiment.solver
+    forgetful = ["solver.memory=0.0", "solver.relaxation=1.0"]
+    operator = step_operator(scene_with(name, *forgetful), state)
+    own = spectrum(operator.augmented().matrix())
+    return modes(own.eigenvalues, solver.relaxation, solver.memory)
