@@ -11,7 +11,14 @@ from pydantic import Field
 from pbdkit.interfaces import Diagnostic, Moment, Variable
 
 Floats = NDArray[np.floating[Any]]
-Measure = Literal["small", "green-lagrange"]
+Measure = Annotated[
+    Literal["small", "green-lagrange"],
+    Field(
+        alias="measure",
+        description="Small strain, or that of finite deformation.",
+        examples=["green-lagrange"],
+    ),
+]
 Positive = Annotated[float, Field(gt=0.0)]
 Modulus = Annotated[
     float, Field(gt=0.0, description="E, in the units that stresses shall have.", examples=[210e9])
@@ -29,12 +36,7 @@ class Strain(Diagnostic):
     """
 
     type: Literal["strain"] = "strain"
-    measure_: Measure = Field(
-        "small",
-        alias="measure",
-        description="Small strain, or that of finite deformation.",
-        examples=["green-lagrange"],
-    )
+    measure_: Measure = "small"
 
     uses_cells: ClassVar[bool] = True
 
@@ -81,12 +83,7 @@ class Stress(Diagnostic):
 
     type: Literal["stress"] = "stress"
     youngs_modulus: Modulus
-    measure_: Measure = Field(
-        "small",
-        alias="measure",
-        description="Small strain, or that of finite deformation.",
-        examples=["green-lagrange"],
-    )
+    measure_: Measure = "small"
 
     uses_cells: ClassVar[bool] = True
     uses_material: ClassVar[bool] = True
