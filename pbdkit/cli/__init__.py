@@ -79,6 +79,9 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
     except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
+        if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(0)  # whoever read our words has had enough of them
         if isinstance(error, SystemExit) and COMPLETING in os.environ:
             raise
         if debug:
