@@ -47,6 +47,16 @@ class Commands(click.Group):
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
         return with_no_plugins(command)
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Ends quietly where whoever reads the output has had enough of it, as `head` has."""
+        try:
+            return super().invoke(ctx)
+        except (BrokenPipeError, SystemExit) as error:  # rich makes the one of the other
+            if not isinstance(error if isinstance(error, OSError) else error.__context__, OSError):
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+
 
 @with_no_plugins
 @click.group(
@@ -79,9 +89,6 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
     except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
-        if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(0)  # whoever read our words has had enough of them
         if isinstance(error, SystemExit) and COMPLETING in os.environ:
             raise
         if debug:
