@@ -52,7 +52,8 @@ class Commands(click.Group):
         try:
             return super().invoke(ctx)
         except (BrokenPipeError, SystemExit) as error:  # rich makes the one of the other
-            if not isinstance(error if isinstance(error, OSError) else error.__context__, OSError):
+            cause = error if isinstance(error, BrokenPipeError) else error.__context__
+            if not isinstance(cause, BrokenPipeError):
                 raise
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
