@@ -91,16 +91,16 @@ class StressStrain(Diagnostic):
     width: Positive = Field(
         description="Of the initial cross-section (lattice units).", examples=[2.5]
     )
-    axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["y"])
-    group: Group = Field(1, description="The leader group that pulls, from 0.", examples=[0])
-    against: Group = Field(0, description="The group that it pulls away from.", examples=[1])
+    axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["x"])
+    group: Group = Field(1, description="The leader group that pulls, from 0.", examples=[1])
+    against: Group = Field(0, description="The group that it pulls away from.", examples=[0])
     points: TwoPoints | None = Field(
         None,
         description="Ends of the gauge length; the nearest particles count.",
         examples=[((0.0, 0.0), (1.0, 0.0))],
     )
     numbers: TwoNumbers | None = Field(
-        None, description="Ends of the gauge length by number.", examples=[(1, 2)]
+        None, description="Ends of the gauge length by number.", examples=[(1, 30)]
     )
 
     uses_forces: ClassVar[bool] = True

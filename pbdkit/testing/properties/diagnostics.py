@@ -36,7 +36,7 @@ def measures_what_it_declares(subject: Subject) -> None:
     """`measure` returns one array for each of its variables, shaped as their `dims` say, of numbers
     that go into the declared dtype without loss of kind."""
     diagnostic, scene = _diagnostic(subject), subject.scene()
-    sizes = {"particle": scene.raster.count, "axis": 2}
+    sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     variables, measured = diagnostic.variables(), diagnostic.measure(moment_of(scene, 0))
     if len(variables) != len(measured):
