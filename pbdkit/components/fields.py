@@ -11,8 +11,18 @@ from pydantic import Field
 from pbdkit.interfaces import Diagnostic, Moment, Variable
 
 Floats = NDArray[np.floating[Any]]
-Measure = Literal["small", "green-lagrange"]
+Measure = Annotated[
+    Literal["small", "green-lagrange"],
+    Field(
+        alias="measure",
+        description="Small strain, or that of finite deformation.",
+        examples=["green-lagrange"],
+    ),
+]
 Positive = Annotated[float, Field(gt=0.0)]
+Modulus = Annotated[
+    float, Field(gt=0.0, description="E, in the units that stresses shall have.", examples=[210e9])
+]
 COMPONENTS = ("xx", "yy", "xy")
 
 
@@ -26,7 +36,7 @@ class Strain(Diagnostic):
     """
 
     type: Literal["strain"] = "strain"
-    measure_: Annotated[Measure, Field(alias="measure")] = "small"
+    measure_: Measure = "small"
 
     uses_cells: ClassVar[bool] = True
 
@@ -72,8 +82,8 @@ class Stress(Diagnostic):
     """
 
     type: Literal["stress"] = "stress"
-    youngs_modulus: Positive
-    measure_: Annotated[Measure, Field(alias="measure")] = "small"
+    youngs_modulus: Modulus
+    measure_: Measure = "small"
 
     uses_cells: ClassVar[bool] = True
     uses_material: ClassVar[bool] = True

@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pbdkit.components.fields import Positive
+from pbdkit.components.fields import Modulus, Positive
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Diagnostic, Moment, Pair, Variable
 
 Floats = NDArray[np.floating[Any]]
 FORCE = "unit of youngs_modulus * unit of thickness * lattice unit"
+Thickness = Annotated[
+    float, Field(gt=0.0, description="Of the body, out of its plane.", examples=[2.0])
+]
 Group = Annotated[int, Field(ge=0)]
 TwoNumbers = Annotated[
     tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)
@@ -29,8 +32,8 @@ class StrainEnergy(Diagnostic):
     """
 
     type: Literal["strain-energy"] = "strain-energy"
-    youngs_modulus: Positive
-    thickness: Positive = 1.0
+    youngs_modulus: Modulus
+    thickness: Thickness = 1.0
 
     uses_forces: ClassVar[bool] = True
 
@@ -53,8 +56,8 @@ class Reaction(Diagnostic):
     """
 
     type: Literal["reaction"] = "reaction"
-    youngs_modulus: Positive
-    thickness: Positive = 1.0
+    youngs_modulus: Modulus
+    thickness: Thickness = 1.0
 
     uses_forces: ClassVar[bool] = True
 
@@ -84,13 +87,21 @@ class StressStrain(Diagnostic):
     """
 
     type: Literal["stress-strain"] = "stress-strain"
-    youngs_modulus: Positive
-    width: Positive
-    axis: Literal["x", "y"] = "x"
-    group: Group = 1
-    against: Group = 0
-    points: TwoPoints | None = None
-    numbers: TwoNumbers | None = None
+    youngs_modulus: Modulus
+    width: Positive = Field(
+        description="Of the initial cross-section (lattice units).", examples=[2.5]
+    )
+    axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["x"])
+    group: Group = Field(1, description="The leader group that pulls, from 0.", examples=[1])
+    against: Group = Field(0, description="The group that it pulls away from.", examples=[0])
+    points: TwoPoints | None = Field(
+        None,
+        description="Ends of the gauge length; the nearest particles count.",
+        examples=[((0.0, 0.0), (1.0, 0.0))],
+    )
+    numbers: TwoNumbers | None = Field(
+        None, description="Ends of the gauge length by number.", examples=[(1, 30)]
+    )
 
     uses_forces: ClassVar[bool] = True
 

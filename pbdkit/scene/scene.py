@@ -132,6 +132,7 @@ def _inner(scene: Scene) -> Scene | None:
         (scene.frame, "frame", "{type: natural}, which has no points"),
         (scene.has_fracture, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
+        (rule.particle_state() or inner.particle_state(), "rule", "one that remembers nothing"),
     ):
         if unfit:
             raise ExperimentError(
@@ -141,7 +142,8 @@ def _inner(scene: Scene) -> Scene | None:
             )
     experiment = experiment.model_copy(update={"rule": inner})
     constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    return replace(scene, experiment=experiment, constants=constants)
+    scene = replace(scene, experiment=experiment, constants=constants)
+    return replace(scene, inner=_inner(scene))
 
 
 def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:

@@ -18,10 +18,15 @@ from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.remembering import changing, renew, shown
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import Present, difference, planes, presence, read_only, sum_over_slots
-
-BLOCK_CELLS = 16384
-"""Places a block: small enough for its temporaries to stay in the cache."""
+from pbdkit.stepping.sums import (
+    BLOCK_CELLS,
+    Present,
+    difference,
+    planes,
+    presence,
+    read_only,
+    sum_over_slots,
+)
 
 
 @dataclass(frozen=True)
