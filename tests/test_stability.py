@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from property_cases import BOTH_ENDS_HELD, advanced, body_sites, scene_of
 
+from pbdkit.analysis.forecast import forecast, quick_warnings
 from pbdkit.components.neighbours import Chebyshev, Coordination
 from pbdkit.scene.neighbourhood import build_neighbourhood
 
@@ -105,3 +106,22 @@ def test_neighbourhoods_have_the_diffusivity_and_smallest_eigenvalue_of_the_tabl
     symbol = np.cos(waves @ rest.T).mean(axis=-1)
     # Near its smallest value the symbol is a parabola: the spacing 0.03 of k costs < 3e-4.
     assert symbol.min() == pytest.approx(lambda_min, abs=1e-3)
+
+
+def test_an_equilibrium_that_smaller_steps_reach_is_not_warned_of():
+    """It makes no steps; where no relaxation leads there, it is."""
+    gradient = {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 2.0}
+    parts = {
+        "neighbours": "chebyshev-1",
+        "rule": gradient,
+        "frame": {"type": "natural"},
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+    }
+    stepping, straight = {"type": "stepping"}, {"type": "equilibrium"}
+    warned = [
+        [w for w in forecast(scene_of(**parts, solver=solver)).warnings if "diverges" in w]
+        for solver in (stepping, straight)
+    ]
+    assert len(warned[0]) == 1
+    assert warned[1] == []
+    assert not any("diverge" in w for w in quick_warnings(scene_of(**parts, solver=straight)))

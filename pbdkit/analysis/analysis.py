@@ -193,7 +193,10 @@ class Analysis:
                 f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
                 "nothing holds it"
             )
-        if self.stable is False:
+        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        if straight and self.largest_stable_relaxation:
+            pass  # it makes no steps, and steps with that relaxation would lead there too
+        elif self.stable is False:
             bound = self.largest_stable_relaxation
             remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
             found.append(

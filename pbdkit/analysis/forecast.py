@@ -11,6 +11,7 @@ from pbdkit.analysis.analysis import NO_REMEDY, Analysis
 from pbdkit.analysis.region import NEUTRAL
 from pbdkit.analysis.symbol import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import FOLLOWER
@@ -119,6 +120,8 @@ def _growing_waves(scene: Scene) -> list[str]:
     if bound is None or bound.radius <= 1.0 + NEUTRAL:
         return []
     stable = bound.largest_stable_relaxation(solver.memory)
+    if stable and isinstance(solver, Equilibrium):
+        return []
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
     return [
         f"solver.relaxation: {solver.relaxation:g} can diverge, some waves grow by "
