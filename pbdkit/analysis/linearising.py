@@ -6,13 +6,15 @@ particles with the same neighbours present answer alike, and one of each kind is
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.derivatives import derivative
+from pbdkit.analysis.derivatives import derivatives
 from pbdkit.interfaces import Here, Slot, Vector, where
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming
@@ -26,6 +28,9 @@ from pbdkit.stepping.sums import sum_over_slots
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
+VALUES_AT_ONCE = 2000
+"""Derivatives are taken in several directions at once for up to so many values together: fewer
+calls, as long as what stands still costs nothing beside them."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,9 @@ def _respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Res
     if same and not state.u.any():
         kinds, place = _alike(scene, state, steps, place)
     some = _Followers(scene, state, steps, place)
-    neighbours = {slot: some.derivative(slot) for slot in slots}
-    return Response(neighbours, some.derivative(None), some.move(), kinds, steps)
+    answers = some.derivatives()
+    neighbours = {slot: answers[slot] for slot in slots}
+    return Response(neighbours, answers[None], some.move(), kinds, steps)
 
 
 def slot_step(scene: Scene, slot: Slot) -> int:
@@ -206,25 +212,35 @@ class _Followers:
         moved = self._applied(self._total, self._u)
         return np.stack([np.broadcast_to(m, self._u.x.shape) for m in moved], axis=-1)
 
-    def derivative(self, of: Slot | None) -> Floats:
-        """∂move/∂u_k through a slot, or ∂move/∂u_j with all neighbours where they are."""
-        columns = []
-        for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+    def derivatives(self) -> dict[Slot | None, Floats]:
+        """∂move/∂u_k through every slot and, under None, ∂move/∂u_j with all neighbours where they
+        are; (place, axis of the move, axis of u). Few places are asked for many at once."""
+        wanted = [(of, axis) for of in (*self._slots, None) for axis in (0, 1)]
+        at_once = max(1, VALUES_AT_ONCE // max(1, self._u.x.size))
+        found: list[Floats] = []
+        for first in range(0, len(wanted), at_once):
+            some = wanted[first : first + at_once]
+            found.extend(derivatives(partial(self._moved, some), len(some), self._u.x.shape))
+        pairs = zip(found[::2], found[1::2], strict=True)
+        both = (np.moveaxis(np.array(pair), (0, 1), (2, 1)) for pair in pairs)
+        return dict(zip((*self._slots, None), both, strict=True))
 
-            def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
-                nudge = Vector(step * along.x, step * along.y)
-                return self._moved_with_neighbour(of, nudge) if of else self._moved_by(nudge)
-
-            columns.append(derivative(moved, self._u.x.shape))
-        return np.moveaxis(np.array(columns), (0, 1), (2, 1))
-
-    def _moved_with_neighbour(self, slot: Slot, nudge: Vector) -> tuple[Any, Any]:
-        contributions = self._still | {slot: self._contribution(slot, self._u, nudge)}
-        return self._applied(self._sum(contributions), self._u)
-
-    def _moved_by(self, nudge: Vector) -> tuple[Any, Any]:
-        here, back = Vector(self._u.x + nudge.x, self._u.y + nudge.y), Vector(-nudge.x, -nudge.y)
-        contributions = {slot: self._contribution(slot, here, back) for slot in self._slots}
+    def _moved(self, along: Sequence[tuple[Slot | None, int]], step: complex) -> tuple[Any, Any]:
+        """The moves (direction, place) after steps of neighbours, or of one's own, along axes."""
+        own = (
+            step * _column(1.0 * (of is None and axis == 0) for of, axis in along),
+            step * _column(1.0 * (of is None and axis == 1) for of, axis in along),
+        )
+        moves_itself = any(of is None for of, _ in along)
+        here = Vector(self._u.x + own[0], self._u.y + own[1]) if moves_itself else self._u
+        contributions = dict(self._still)
+        for slot in self._slots:
+            if moves_itself or any(of == slot for of, _ in along):
+                nudge = (
+                    step * _column(_way(of, slot) * (axis == n) for of, axis in along)
+                    for n in (0, 1)
+                )
+                contributions[slot] = self._contribution(slot, here, Vector(*nudge))
         return self._applied(self._sum(contributions), here)
 
     def _contribution(self, slot: Slot, here: Vector, nudge: Vector | None) -> Contributions:
@@ -241,3 +257,12 @@ class _Followers:
     def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
         with np.errstate(all="ignore"):
             return self._rule.apply(total, Here(here, self._X, self._own), self._constants.rule)
+
+
+def _way(of: Slot | None, slot: Slot) -> float:
+    """How the difference along a slot changes with its neighbour's step, or with one's own."""
+    return -1.0 if of is None else 1.0 * (of == slot)
+
+
+def _column(values: Iterable[float]) -> Floats:
+    return np.array(list(values))[:, None]
