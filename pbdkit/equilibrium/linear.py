@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 LARGEST_LU = 30_000
 """Unknowns up to which `auto` takes an LU factorisation (measured: multigrid, with the import of
 pyamg, takes as long there)."""
+STURDY = 0.1
+"""Diagonal entries that are this share of the largest of their columns serve as pivots."""
 SAME = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
 
@@ -42,7 +44,8 @@ class Dense(LinearSolver):
 
 
 class SparseLU(LinearSolver):
-    """SuperLU; symmetric matrices without pivoting, which fills in less."""
+    """SuperLU; symmetric matrices without pivoting, which fills in less, and those of a symmetric
+    pattern, as rules on a lattice have it, with little of it."""
 
     name = "lu"
 
@@ -56,6 +59,8 @@ class SparseLU(LinearSolver):
                 "diag_pivot_thresh": 0.0,
                 "options": {"SymmetricMode": True},
             }
+        elif has_symmetric_pattern(matrix):
+            how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": STURDY}
         try:
             self._factors = splu(matrix.tocsc(), **how)
         except RuntimeError as error:  # "Factor is exactly singular"
@@ -110,3 +115,11 @@ def is_symmetric(matrix: Any) -> bool:
     """Whether a matrix equals its transpose, up to rounding."""
     difference = abs(matrix - matrix.T)
     return bool(difference.max() <= SAME * max(1.0, abs(matrix).max()))
+
+
+def has_symmetric_pattern(matrix: Any) -> bool:
+    """Whether a sparse matrix in rows has entries where its transpose has them."""
+    turned = matrix.T.tocsr()
+    return np.array_equal(matrix.indptr, turned.indptr) and np.array_equal(
+        matrix.indices, turned.indices
+    )
