@@ -28,7 +28,7 @@ from pbdkit.stepping.sums import sum_over_slots
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
-VALUES_AT_ONCE = 2000
+VALUES_AT_ONCE = 6000
 """Derivatives are taken in several directions at once for up to so many values together: fewer
 calls, as long as what stands still costs nothing beside them."""
 
