@@ -37,7 +37,7 @@ class Solved:
         """That of the bilinear interpolation between sites, at the sites of the finest lattice:
         what finite elements are measured by. Square lattices only."""
         fine = load(self.problem.name, FINEST)
-        return relative_l2(interpolated(self.u, FINEST // self.cells), fine)
+        return relative_l2(interpolated(self.u, self.cells), fine)
 
 
 def experiment(problem: Problem, cells: int, **parts: Any) -> dict[str, Any]:
@@ -103,7 +103,8 @@ def on_grid(problem: Problem, cells: int, X: Any, u: Any) -> np.ndarray:
     row = problem.height * FINEST / problem.rows / cells
     if not np.allclose(X[:, 1] / row, np.rint(X[:, 1] / row), atol=1e-6):
         return on_grid(problem, 2 * cells, X, u)
-    found = np.full_like(load(problem.name, cells).u, np.nan)
+    columns = round(problem.length * cells)
+    found = np.full((2, columns + 1, round(problem.height / row) + 1), np.nan)
     j = np.rint(X[:, 1] / row).astype(int)
     shift = j % 2 / 2 if problem.hexagonal else 0.0
     i = np.rint(X[:, 0] * cells - shift).astype(int)
@@ -120,13 +121,13 @@ def error_at(problem: Problem, found: np.ndarray, cells: int) -> float:
     return float(np.sqrt((weights * off).sum() / (weights * exact).sum()))
 
 
-def interpolated(u: np.ndarray, parts: int) -> np.ndarray:
-    """Bilinear between the sites of a grid, each spacing cut in so many parts."""
+def interpolated(u: np.ndarray, cells: int) -> np.ndarray:
+    """At the sites of the finest lattice, bilinear between those of the grid of `cells`."""
     u = continued(u)
     for axis in (1, 2):
         n = u.shape[axis]
-        place = np.arange((n - 1) * parts + 1) / parts
-        first = np.minimum(place.astype(int), n - 2)
+        place = np.arange(round((n - 1) * FINEST / cells) + 1) * (cells / FINEST)
+        first = np.minimum((place + 1e-9).astype(int), n - 2)
         share = (place - first).reshape(-1, 1) if axis == 1 else place - first
         u = (1 - share) * u.take(first, axis) + share * u.take(first + 1, axis)
     return u
