@@ -22,6 +22,9 @@ Floats = NDArray[np.float64]
 
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
+NEAREST = 0.6
+"""No point of a triangle is farther from its nearest corner than 1/√3 of the longest side, so that
+an outline that passes through a cell passes that near to a corner."""
 SMALLEST = 0.02
 """Cells with a smaller share than this are left out: corners that hang on a sliver of the body move
 as little else does, and say little about it."""
@@ -108,8 +111,8 @@ class _Cutter:
         share = (distance <= 0).all(axis=0).astype(float)
         if not self._of_sites:
             x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
-            reach = np.hypot(x - x[0], y - y[0]).max()
-            cut = np.abs(distance).min(axis=0) <= reach
+            widths = 1.0 if self._body.exaggerates() else NEAREST
+            cut = np.abs(distance).min(axis=0) <= widths * _width(x, y)
             share[cut] = self._cut_shares(x[:, cut], y[:, cut])
         some = share > SMALLEST
         return i[some], j[some], share[some]
@@ -135,6 +138,12 @@ class _Cutter:
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+
+
+def _width(x: Floats, y: Floats) -> float:
+    """The largest distance between corners (corner, cell) of a cell; all are alike."""
+    x, y = x[:, :1], y[:, :1]
+    return float(np.hypot(x - x.T, y - y.T).max(initial=0.0))
 
 
 @cache
