@@ -37,10 +37,8 @@ def stepped(
     problem: Problem, cells: int, share: float, repeats: int = 3, memory: float = 0.0
 ) -> Steps:
     """By the compiled engine on one thread, from rest, with the kernel made beforehand."""
-    solver = {"type": "stepping", "engine": "compiled", "threads": 1, "memory": memory}
-    asked = experiment(problem, cells)
-    exact = equilibrium_state(build_scene(pbdkit.Experiment(**asked)))[0].u
-    scene = build_scene(pbdkit.Experiment(**asked | {"solver": solver, "steps": 10**9}))
+    exact = equilibrium_state(build_scene(_experiment(problem, cells, None)))[0].u
+    scene = build_scene(_experiment(problem, cells, memory))
     engine = make_engine(scene, choose(scene))[0]
     count, rate = _count(scene, engine, exact, share)
     seconds, state = best(1, lambda: engine.advance(initial_state(scene), count))
@@ -49,6 +47,26 @@ def stepped(
     rows = scene.raster.body_rows
     u = state.u.reshape(2, -1)[:, scene.raster.place_of(rows)].T
     return Steps(count, rate, seconds, on_grid(problem, cells, scene.raster.reference(rows), u))
+
+
+def setting_up(problem: Problem, cells: int, memory: float, repeats: int) -> Seconds:
+    """What scene and engine take, the kernel made beforehand."""
+    asked = _experiment(problem, cells, memory)
+
+    def set_up():
+        scene = build_scene(asked)
+        return make_engine(scene, choose(scene))
+
+    return best(repeats, set_up)[0]
+
+
+def _experiment(problem: Problem, cells: int, memory: float | None) -> pbdkit.Experiment:
+    """To be stepped with a memory, or to be taken to equilibrium."""
+    asked = experiment(problem, cells)
+    if memory is not None:
+        solver = {"type": "stepping", "engine": "compiled", "threads": 1, "memory": memory}
+        asked |= {"solver": solver, "steps": 10**9}
+    return pbdkit.Experiment(**asked)
 
 
 def _count(scene: Scene, engine, exact: np.ndarray, share: float) -> tuple[int, float]:
