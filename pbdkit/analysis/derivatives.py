@@ -20,7 +20,8 @@ Moved = Callable[[complex], tuple[Any, Any]]
 
 def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
     """(component, *shape): the derivative at a step of zero."""
-    return derivatives(lambda step: [c[None] for c in _array(moved(step), shape)], 1, shape)[0]
+    found: NDArray[np.float64] = derivatives(moved, 1, shape)[0]
+    return found
 
 
 def derivatives(moved: Moved, directions: int, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
