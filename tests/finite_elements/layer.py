@@ -29,7 +29,7 @@ def experiment(cells: int, rows: int = 3) -> dict[str, Any]:
             {"select": {"box": ends[1]}, "motion": pull},
         ],
         "steps": 1,
-        "solver": {"type": "equilibrium"},
+        "solver": {"type": "equilibrium", "tolerance": 1e-6},
     }
 
 

@@ -18,8 +18,6 @@ from pbdkit.stepping.state import initial_state
 
 FINER = 50
 """Looks lie apart by this part of the steps so far: steps are counted to 2 %."""
-LONG_S = 1.0
-"""Runs this long are made once."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,7 @@ def stepped(
     scene = build_scene(_experiment(problem, cells, memory))
     engine = make_engine(scene, choose(scene))[0]
     count, rate = _count(scene, engine, exact, share)
-    seconds, state = best(1, lambda: engine.advance(initial_state(scene), count))
-    if seconds.wall < LONG_S:
-        seconds, state = best(repeats, lambda: engine.advance(initial_state(scene), count))
+    seconds, state = best(repeats, lambda: engine.advance(initial_state(scene), count))
     rows = scene.raster.body_rows
     u = state.u.reshape(2, -1)[:, scene.raster.place_of(rows)].T
     return Steps(count, rate, seconds, on_grid(problem, cells, scene.raster.reference(rows), u))
