@@ -1,4 +1,7 @@
-"""Orders of elimination by where unknowns lie, and derivatives in several directions at once."""
+"""What is done at once, once, or not at all, with the same result.
+
+Orders of elimination, derivatives, cut cells, kernels.
+"""
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from pbdkit.analysis.derivatives import derivative, derivatives
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium import linear
 from pbdkit.equilibrium.dissection import FEWEST, dissected
+from pbdkit.scene import cutting
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -122,3 +126,43 @@ def test_operators_do_not_depend_on_how_many_directions_go_together(rule, monkey
     for other in found[1:]:
         assert np.array_equal(found[0].entries_now.values, other.entries_now.values)
         assert np.array_equal(found[0].source, other.source)
+
+
+BODIES = [
+    {"type": "rectangle", "width": 2.0, "height": 1.03, "origin": [0.01, 0.02]},
+    {"type": "ring", "inner": 0.3, "outer": 0.77, "centre": [0.1, 0.2]},
+    {"type": "polygon", "vertices": [[0, 0], [2, 0.3], [1.7, 1.9], [0.8, 0.6], [0.1, 1.4]]},
+    {"type": "dogbone", "length": 3, "width": 1, "gauge_length": 1, "gauge_width": 0.4,
+     "radius": 0.5},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+@pytest.mark.parametrize("body", BODIES, ids=lambda body: body["type"])
+def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch):
+    """Shares are the same where far more cells are looked at."""
+    near = "chebyshev" if lattice == "square" else "coordination"
+    given = {
+        "name": "cut",
+        "lattice": {"type": lattice, "a": 0.1},
+        "neighbours": {"type": near, "shells": 1},
+        "body": body,
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "steps": 1,
+    }
+    found = build_scene(pbdkit.Experiment(**given)).cells.share
+    if body["type"] != "dogbone":  # whose distance says more than the way to its fillets
+        monkeypatch.setattr(cutting, "NEAREST", 3.0)
+    else:
+        monkeypatch.setattr(cutting, "_width", lambda x, y: 0.15)
+    assert np.array_equal(found, build_scene(pbdkit.Experiment(**given)).cells.share)
+
+
+def test_a_process_reads_a_kernel_once():
+    pytest.importorskip("numba")
+    from pbdkit.stepping.compiled.stepper import CompiledStepper
+
+    given = experiment(HEXAGONAL_BAR, 20, solver={"type": "stepping"})
+    scene = build_scene(pbdkit.Experiment(**given))
+    assert CompiledStepper(scene)._run is CompiledStepper(scene)._run
