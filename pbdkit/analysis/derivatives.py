@@ -20,17 +20,29 @@ Moved = Callable[[complex], tuple[Any, Any]]
 
 def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
     """(component, *shape): the derivative at a step of zero."""
+    found: NDArray[np.float64] = derivatives(moved, 1, shape)[0]
+    return found
+
+
+def derivatives(moved: Moved, directions: int, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+    """(direction, component, *shape): the derivatives of a function that steps along several
+    directions at once, (direction, *shape) in each component."""
+    whole = (directions, *shape)
     with np.errstate(all="ignore"):
-        ahead, behind = _array(moved(SMALL), shape), _array(moved(-SMALL), shape)
+        ahead, behind = _array(moved(SMALL), whole), _array(moved(-SMALL), whole)
         difference: NDArray[np.float64] = (ahead - behind).real / (2 * SMALL)
+        difference = difference.swapaxes(0, 1)
         try:
-            exact: NDArray[np.float64] = _array(moved(1j * TINY), shape).imag / TINY
+            exact: NDArray[np.float64] = _array(moved(1j * TINY), whole).imag / TINY
         except (TypeError, ValueError):  # a function that takes no complex numbers
             return difference
+    exact = exact.swapaxes(0, 1)
     known = np.isfinite(exact) & np.isfinite(difference)
-    scale = max(1.0, float(np.abs(difference[known]).max(initial=0.0)))
-    agree = np.abs(exact - difference)[known].max(initial=0.0) <= 1e-4 * scale
-    return exact if agree else difference
+    within = tuple(range(1, exact.ndim))
+    scale = np.abs(difference).max(axis=within, initial=1.0, where=known)
+    off = np.abs(exact - difference).max(axis=within, initial=0.0, where=known)
+    agree = (off <= 1e-4 * scale).reshape(-1, *(1 for _ in within))
+    return np.where(agree, exact, difference)
 
 
 def _array(components: tuple[Any, Any], shape: tuple[int, ...]) -> NDArray[Any]:

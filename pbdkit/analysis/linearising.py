@@ -6,26 +6,31 @@ particles with the same neighbours present answer alike, and one of each kind is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.derivatives import derivative
-from pbdkit.interfaces import Here, Slot, Vector, where
+from pbdkit.analysis.changed_bonds import ChangedBonds
+from pbdkit.analysis.derivatives import derivatives
+from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import EMPTY, positions
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.state import State
 from pbdkit.stepping.sums import sum_over_slots
 
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
+VALUES_AT_ONCE = 6000
+"""Derivatives are taken in several directions at once for up to so many values together: fewer
+calls, as long as what stands still costs nothing beside them."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,9 @@ def _respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Res
     if same and not state.u.any():
         kinds, place = _alike(scene, state, steps, place)
     some = _Followers(scene, state, steps, place)
-    neighbours = {slot: some.derivative(slot) for slot in slots}
-    return Response(neighbours, some.derivative(None), some.move(), kinds, steps)
+    answers = some.derivatives()
+    neighbours = {slot: answers[slot] for slot in slots}
+    return Response(neighbours, answers[None], some.move(), kinds, steps)
 
 
 def slot_step(scene: Scene, slot: Slot) -> int:
@@ -103,7 +109,7 @@ def _alike(
 ) -> tuple[Indices, Indices]:
     """(kind, place): which kind each place is of, and one place of each; those of a kind have the
     same neighbours, the same shares of cells around them and the same broken bonds."""
-    code, bonds = np.zeros(len(place), np.int64), _Bonds(scene, state)
+    code, bonds = np.zeros(len(place), np.int64), ChangedBonds(scene, state)
     if scene.cells:
         left = np.array([_shares_beside(scene, slot, place)[0] for slot in steps])
         cut = (left != 1.0).any(axis=0)
@@ -131,50 +137,12 @@ def _shares_beside(scene: Scene, slot: Slot, place: Indices) -> tuple[Floats, Fl
     return found[0], found[1]
 
 
-class _Bonds:
-    """Which bonds are broken or softened, by the place of one end."""
-
-    def __init__(self, scene: Scene, state: State) -> None:
-        self._steps, self._values = state.broken_step, state.bond_values
-        self.any_broken = self._steps is not None and bool((self._steps >= 0).any())
-        self._model, self._parameters = scene.experiment.fracture, scene.constants.fracture
-        self._limits, self._softens = scene.constants.limits, self._model.softens()
-        self.any_changed = self.any_broken or (self._steps is not None and self._softens)
-        self._fracturing = Fracturing(scene) if self.any_changed else None
-        self._cells = scene.raster.shape[1] * scene.raster.shape[2]
-
-    def broken(self, slot: Slot, step: int, place: Indices) -> Present:
-        """Whether the bond along a slot is broken, for each place."""
-        assert self._steps is not None
-        broken: Present = self._at_home(self._steps, slot, step, place) >= 0
-        return broken
-
-    def constants(self, slot: Slot, step: int, place: Indices) -> tuple[Any, ...]:
-        """The constants of the bonds along a slot and what is remembered of them."""
-        own = (self._at_home(value, slot, step, place) for value in self._values)
-        return (*self._limits[slot], *own)
-
-    def seen(self, d: Vector, u: Vector, slot: Slot, broken: Present, c: Any) -> Vector:
-        """The difference that the rule sees."""
-        if not (broken.any() or self._softens):
-            return d
-        lost = self._model.fictitious(u, slot.rest, self._parameters)
-        d = self._model.seen(d, lost, slot.rest, c, self._parameters)
-        return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
-
-    def _at_home(self, planes: Any, slot: Slot, step: int, place: Indices) -> Any:
-        assert self._fracturing is not None
-        plane, positive = self._fracturing.plane_of(slot)
-        start = place if positive else place + step
-        return planes[plane].ravel()[start % self._cells]
-
-
 class _Followers:
     """The rule's chain of functions on some places, with differences that can be nudged."""
 
     def __init__(self, scene: Scene, state: State, steps: dict[Slot, int], place: Indices) -> None:
         self._rule, self._constants = scene.experiment.rule, scene.constants
-        self._bonds = _Bonds(scene, state)
+        self._bonds = ChangedBonds(scene, state)
         self._slots = tuple(steps)
         kind, u = scene.raster.kind.ravel(), state.u.reshape(2, -1)
         there = [kind[place + step] != EMPTY for step in steps.values()]
@@ -206,25 +174,28 @@ class _Followers:
         moved = self._applied(self._total, self._u)
         return np.stack([np.broadcast_to(m, self._u.x.shape) for m in moved], axis=-1)
 
-    def derivative(self, of: Slot | None) -> Floats:
-        """∂move/∂u_k through a slot, or ∂move/∂u_j with all neighbours where they are."""
-        columns = []
-        for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+    def derivatives(self) -> dict[Slot | None, Floats]:
+        """∂move/∂u_k through every slot and, under None, ∂move/∂u_j with all neighbours where they
+        are; (place, axis of the move, axis of u). Few places are asked for many at once."""
+        movers = (*self._slots, None)
+        at_once = max(1, VALUES_AT_ONCE // (2 * self._u.x.size))
+        found = {}
+        for first in range(0, len(movers), at_once):
+            some = movers[first : first + at_once]
+            moved = partial(self._moved, _Nudges(some, self._slots))
+            answers = derivatives(moved, 2 * len(some), self._u.x.shape)
+            for n, mover in enumerate(some):
+                found[mover] = np.moveaxis(answers[2 * n : 2 * n + 2], (0, 1), (2, 1))
+        return found
 
-            def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
-                nudge = Vector(step * along.x, step * along.y)
-                return self._moved_with_neighbour(of, nudge) if of else self._moved_by(nudge)
-
-            columns.append(derivative(moved, self._u.x.shape))
-        return np.moveaxis(np.array(columns), (0, 1), (2, 1))
-
-    def _moved_with_neighbour(self, slot: Slot, nudge: Vector) -> tuple[Any, Any]:
-        contributions = self._still | {slot: self._contribution(slot, self._u, nudge)}
-        return self._applied(self._sum(contributions), self._u)
-
-    def _moved_by(self, nudge: Vector) -> tuple[Any, Any]:
-        here, back = Vector(self._u.x + nudge.x, self._u.y + nudge.y), Vector(-nudge.x, -nudge.y)
-        contributions = {slot: self._contribution(slot, here, back) for slot in self._slots}
+    def _moved(self, nudges: _Nudges, step: complex) -> tuple[Any, Any]:
+        """The moves (direction, place) after steps of neighbours, or of one's own."""
+        here, contributions = self._u, dict(self._still)
+        if nudges.own:
+            here = Vector(self._u.x + step * nudges.own.x, self._u.y + step * nudges.own.y)
+        for slot, nudge in nudges.along.items():
+            steps = Vector(step * nudge.x, step * nudge.y)
+            contributions[slot] = self._contribution(slot, here, steps)
         return self._applied(self._sum(contributions), here)
 
     def _contribution(self, slot: Slot, here: Vector, nudge: Vector | None) -> Contributions:
@@ -241,3 +212,25 @@ class _Followers:
     def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
         with np.errstate(all="ignore"):
             return self._rule.apply(total, Here(here, self._X, self._own), self._constants.rule)
+
+
+class _Nudges:
+    """What unit steps of some neighbours, by slot, or of oneself (None) along x and y do: to
+    oneself, `own`, and to the differences `along` slots, (direction, 1) each. What stays as it is
+    has none."""
+
+    def __init__(self, movers: Sequence[Slot | None], slots: Sequence[Slot]) -> None:
+        count = 2 * len(movers)
+
+        def unit(n: int, length: float) -> Vector:
+            planes = np.zeros((2, count, 1))
+            planes[0, 2 * n] = planes[1, 2 * n + 1] = length
+            return Vector(*planes)
+
+        self.own = unit(movers.index(None), 1.0) if None in movers else None
+        self.along = {slot: unit(n, 1.0) for n, slot in enumerate(movers) if slot is not None}
+        if self.own:
+            for slot in slots:
+                back = unit(movers.index(None), -1.0)
+                forth = self.along.get(slot, Vector(0.0, 0.0))
+                self.along[slot] = Vector(back.x + forth.x, back.y + forth.y)

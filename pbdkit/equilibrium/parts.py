@@ -68,6 +68,7 @@ class Held(Part):
         method: str,
         near_kernel: Floats | None = None,
         watch: Watch | None = None,
+        places: Floats | None = None,
     ) -> None:
         if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
             from scipy.sparse import csr_array
@@ -76,8 +77,14 @@ class Held(Part):
         self._matrix, self._symmetric = matrix, is_symmetric(matrix)
         self._watch = watch or Watch()
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
+        self._places = places
         self._solver: LinearSolver = linear_solver(
-            matrix, method, symmetric=self._symmetric, near_kernel=near_kernel, watch=self._watch
+            matrix,
+            method,
+            symmetric=self._symmetric,
+            near_kernel=near_kernel,
+            places=places,
+            watch=self._watch,
         )
 
     @property
@@ -97,7 +104,9 @@ class Held(Part):
         if isinstance(self._solver, Krylov) and self._has_choice:
             left = float(np.linalg.norm(r - self._matrix @ x))
             if left > 100 * accuracy * float(np.linalg.norm(r)):  # the iteration got stuck
-                self._solver = linear_solver(self._matrix, "lu", symmetric=self._symmetric)
+                self._solver = linear_solver(
+                    self._matrix, "lu", symmetric=self._symmetric, places=self._places
+                )
                 x = self._solver.solve(r, accuracy)
         return x
 

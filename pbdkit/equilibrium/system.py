@@ -38,8 +38,7 @@ class _Stage:
 class System:
     """A c = move for the followers of an operator, by one of the solver's methods.
 
-    `X` are the followers' reference positions (follower, axis), for the coarser grids of multigrid.
-    """
+    `X` are their reference positions (follower, axis), which solvers for both axes go by."""
 
     def __init__(self, operator: StepOperator, method: str, X: Floats, watch: Watch) -> None:
         self._operator, self._method, self._X = operator, method, X
@@ -194,11 +193,12 @@ class System:
 
     def _part(self, matrix: Any, axes: tuple[int, ...], unknowns: Indices | None) -> Part:
         """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
-        kernel = self._rigid_modes()[unknowns] if len(axes) == 2 and unknowns is not None else None
-        if len(axes) == 2 and kernel is None:
-            kernel = self._rigid_modes()
+        kernel = places = None
+        if len(axes) == 2:
+            some = slice(None) if unknowns is None else unknowns
+            kernel, places = (v[some] for v in (self._rigid_modes(), self._X.repeat(2, axis=0)))
         try:
-            part = Held(matrix, self._method, kernel, self._watch)
+            part = Held(matrix, self._method, kernel, self._watch, places)
             if part.conditioned:
                 return part
         except np.linalg.LinAlgError:

@@ -27,6 +27,10 @@ class Union(Body):
         """The smallest."""
         return reduce(np.minimum, (part.distance(at) for part in self.of))
 
+    def exaggerates(self) -> bool:
+        """Where a part does."""
+        return any(part.exaggerates() for part in self.of)
+
 
 class Intersection(Body):
     """All that lies in every part."""
@@ -49,6 +53,10 @@ class Intersection(Body):
         """The largest."""
         return reduce(np.maximum, (part.distance(at) for part in self.of))
 
+    def exaggerates(self) -> bool:
+        """Where a part does."""
+        return any(part.exaggerates() for part in self.of)
+
 
 class Difference(Body):
     """The first part less the others; sites on the outline of what is cut out stay."""
@@ -64,6 +72,10 @@ class Difference(Body):
         """The largest of the first distance and the others' negatives."""
         first, *others = (part.distance(at) for part in self.of)
         return reduce(np.maximum, (-other for other in others), first)
+
+    def exaggerates(self) -> bool:
+        """Where a part does."""
+        return any(part.exaggerates() for part in self.of)
 
 
 def _hull(boxes: list[Box]) -> Box:

@@ -51,6 +51,10 @@ class Body(Component):
         """The signed distance to the outline, negative inside; only its sign and its value near
         zero need be right."""
 
+    def exaggerates(self) -> bool:
+        """Whether `distance` can be more than the way to the outline."""
+        return False
+
 
 class Grid(Body):
     """`columns` × `rows` sites from (0, 0)."""

@@ -158,6 +158,10 @@ class Dogbone(Body):
         beyond: Floats = np.maximum(y - half, x - self.length / 2)
         return beyond
 
+    def exaggerates(self) -> bool:
+        """It is taken along y, across steep fillets too."""
+        return True
+
 
 def _square(centre: Pair, radius: float) -> Box:
     x, y = centre

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
-from pbdkit.interfaces import Lattice
+from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.cells import Cells, Corners, Tiling
@@ -25,6 +25,9 @@ FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
 CELLS_AT_ONCE = 512
 """Cut cells that are looked at together: what that takes does not grow with the body."""
+NEAREST = 0.6
+"""No point of a triangle is farther from its nearest corner than 1/√3 of the longest side, so that
+an outline that passes through a cell passes that near to a corner."""
 SMALLEST = 0.02
 """Cells with a smaller share than this are left out: corners that hang on a sliver of the body move
 as little else does, and say little about it."""
@@ -112,7 +115,7 @@ class _Cutter:
             share[distance > 0.0] = 0.0
             nearest = np.minimum(nearest, np.abs(distance))
         if not self._of_sites:
-            reach = max(0.0 if slot is None else math.hypot(*slot.rest) for slot in corners)
+            reach = (1.0 if self._body.exaggerates() else NEAREST) * _width(corners)
             cut = np.flatnonzero(nearest <= reach)
             for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
                 at = [(i[some] + m, j[some] + n) for m, n in steps]
@@ -142,6 +145,12 @@ class _Cutter:
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+
+
+def _width(corners: Corners) -> float:
+    """The largest distance between corners of a cell."""
+    places = [Vector(0.0, 0.0) if slot is None else slot.rest for slot in corners]
+    return max(math.hypot(a.x - b.x, a.y - b.y) for a in places for b in places)
 
 
 @cache

@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from finite_elements.elasticity import find, plane_stress, values
 from finite_elements.errors import load, relative_l2
 from finite_elements.problems import BAR, CANTILEVER, HOLE, Problem
+from finite_elements.timing import best
 
 ELEMENTS = {
     "P1": (skfem.ElementTriP1, 1),
@@ -38,17 +38,22 @@ SMALL, LARGE = 2_000, 300_000
 
 @dataclass(frozen=True)
 class Row:
-    """One solution: `resolution` in elements per unit length, the best seconds of all repeats."""
+    """One solution: `resolution` in elements per unit length, the best seconds of all repeats;
+    `setup_s` is meshing and what scikit-fem prepares for assembly (Basis), `processor_s` the
+    processor time of assembly and solving, `setup_processor_s` that of preparing."""
 
     problem: str
     element: str
     resolution: int
     unknowns: int
+    setup_s: float
     assembly_s: float
     solve_s: float
     solver: str
     error: float
     reaction: float
+    processor_s: float
+    setup_processor_s: float
 
 
 def measure(
@@ -61,16 +66,18 @@ def measure(
     """Errors are those at the sites of the lattice of `cells` per unit length, wherever the nodes
     lie: what is interpolated between nodes counts."""
     for resolution in resolutions:
-        basis = basis_of(problem, element, resolution)
+        setup, basis = best(repeats, lambda n=resolution: basis_of(problem, element, n))
         held, u = _held(problem, basis)
-        assembly_s, K = _best(repeats, lambda basis=basis: plane_stress().assemble(basis))
-        solve_s, solver, u = _fastest(repeats, basis, K, held, u)
+        assembly, K = best(repeats, lambda basis=basis: plane_stress().assemble(basis))
+        solving, solver, u = _fastest(repeats, basis, K, held, u)
         forces = K @ u
         right = basis.get_dofs(lambda x: np.isclose(x[0], problem.length))
         reaction = float(forces[right.all(f"u^{problem.pulled + 1}")].sum())
         error = relative_l2(at_sites(problem, basis, u, cells), load(problem.name, cells))
         sizes = (problem.name, element, resolution, K.shape[0])
-        yield Row(*sizes, assembly_s, solve_s, solver, error, reaction)
+        walls = (setup.wall, assembly.wall, solving.wall)
+        processor_s = assembly.plus(solving).processor
+        yield Row(*sizes, *walls, solver, error, reaction, processor_s, setup.processor)
 
 
 def basis_of(problem: Problem, element: str, resolution: int) -> Basis:
@@ -142,10 +149,10 @@ def _fastest(repeats: int, basis: Basis, K, held, u):
     """Seconds, name and solution of the faster of the solvers worth trying at this size."""
     tried = []
     if K.shape[0] <= LARGE:
-        tried.append((*_best(repeats, lambda: _solved(_direct, basis, K, held, u)), "direct"))
+        tried.append((*best(repeats, lambda: _solved(_direct, basis, K, held, u)), "direct"))
     if K.shape[0] >= SMALL:
-        tried.append((*_best(repeats, lambda: _solved(_multigrid, basis, K, held, u)), "multigrid"))
-    seconds, solution, name = min(tried, key=lambda result: result[0])
+        tried.append((*best(repeats, lambda: _solved(_multigrid, basis, K, held, u)), "multigrid"))
+    seconds, solution, name = min(tried, key=lambda result: result[0].wall)
     return seconds, name, solution
 
 
@@ -176,22 +183,13 @@ def _multigrid(K, load, basis, free):
     return found
 
 
-def _best(repeats: int, work: Callable):
-    """The least seconds, and what came out."""
-    times = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        result = work()
-        times.append(time.perf_counter() - begun)
-    return min(times), result
-
-
 if __name__ == "__main__":
     for problem in (BAR, CANTILEVER, HOLE):
         for element in ELEMENTS:
             for row in measure(problem, element):
                 print(
                     f"{row.problem:10} {row.element} {row.resolution:3} {row.unknowns:7} unknowns, "
+                    f"set-up {row.setup_s * 1e3:7.2f} ms, "
                     f"assembly {row.assembly_s * 1e3:8.2f} ms, solve {row.solve_s * 1e3:8.2f} ms "
                     f"({row.solver}), error {row.error:.2e}, reaction {row.reaction:.8f}",
                     flush=True,

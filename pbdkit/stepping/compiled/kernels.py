@@ -18,6 +18,9 @@ import numpy as np
 from pbdkit.interfaces import FollowerRule, FractureModel, Here, Vector, length
 from pbdkit.stepping.compiled.functions import compiled, source_key
 
+_loaded: dict[Path, Any] = {}
+"""Kernels of this process, by their files: reading one again takes several milliseconds."""
+
 
 def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None) -> Any:
     """The function `run` of a kernel with this source, compiled before or now.
@@ -31,6 +34,8 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
     parts = [source, source_key(*functions), numba.__version__, np.__version__, sys.version]
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
     path = cache_folder() / f"kernel_{key}.py"
+    if path in _loaded:
+        return _loaded[path]
     if not path.exists():
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
         temporary.write_text(source, encoding="utf-8")
@@ -42,7 +47,8 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
         "fictitious": compiled(fracture.fictitious) if fracture else None,
         "length": compiled(length),
     }
-    return _module(path, names).run
+    _loaded[path] = _module(path, names).run
+    return _loaded[path]
 
 
 def cache_folder() -> Path:

@@ -1,0 +1,168 @@
+"""What is done at once, once, or not at all, with the same result.
+
+Orders of elimination, derivatives, cut cells, kernels.
+"""
+
+import numpy as np
+import pytest
+from finite_elements.lattices import experiment
+from finite_elements.problems import HEXAGONAL_BAR
+from scipy import sparse
+
+import pbdkit
+from pbdkit.analysis import linearising
+from pbdkit.analysis.derivatives import derivative, derivatives
+from pbdkit.analysis.operator import step_operator
+from pbdkit.equilibrium import linear
+from pbdkit.equilibrium.dissection import FEWEST, dissected
+from pbdkit.scene import cutting
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+
+
+def plane(columns, rows, far=1):
+    """(matrix, places): every place coupled with those up to `far` away along both axes, and a
+    little more to the right than to the left."""
+    i, j = (a.ravel() for a in np.indices((columns, rows)))
+    number = np.arange(columns * rows).reshape(columns, rows)
+    found = [(number.ravel(), number.ravel(), np.full(columns * rows, 9.0 * far))]
+    for axis, place in enumerate((i, j)):
+        for step in range(1, far + 1):
+            first = np.flatnonzero(place < (columns, rows)[axis] - step)
+            second = first + step * (rows, 1)[axis]
+            found += [(first, second, np.full(len(first), -1.1)),
+                      (second, first, np.full(len(first), -0.9))]  # fmt: skip
+    row, column, value = (np.concatenate(part) for part in zip(*found, strict=True))
+    return sparse.csr_array((value, (row, column))), np.stack([i, j], axis=1) * 0.1
+
+
+@pytest.mark.parametrize("far", [1, 2])
+def test_dissection_puts_strips_last_that_nothing_leaps_over(far):
+    matrix, places = plane(60, 25, far)
+    order = dissected(matrix, places)
+    assert np.array_equal(np.sort(order), np.arange(len(places)))
+    rank = np.argsort(order)
+    # The first strip lies across the long side, in the middle: to its left and right nothing
+    # couples with what lies on the other side.
+    strip = order[-25 * far :]
+    x = places[:, 0]
+    low, high = x[strip].min(), x[strip].max()
+    assert high - low == pytest.approx(0.1 * (far - 1))
+    assert 2.5 < low < 3.5
+    left, right = np.flatnonzero(x < low - 1e-9), np.flatnonzero(x > high + 1e-9)
+    assert matrix[left][:, right].nnz == 0
+    assert rank[strip].min() > max(rank[left].max(), rank[right].max())
+
+
+def test_unknowns_of_one_place_stay_together():
+    matrix, places = plane(40, 30)
+    both = sparse.csr_array(sparse.kron(matrix, np.ones((2, 2))))
+    order = dissected(both, np.repeat(places, 2, axis=0))
+    assert np.array_equal(order[0::2] + 1, order[1::2])
+    assert np.array_equal(order[0::2] // 2, dissected(matrix, places))
+
+
+def test_few_places_and_couplings_that_reach_far_are_not_dissected():
+    assert dissected(*plane(FEWEST // 10, 10)) is None
+    matrix, places = plane(60, 25)
+    matrix = matrix.tolil()
+    matrix[0, len(places) - 1] = 0.1
+    assert dissected(matrix.tocsr(), places) is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e6], ids=["here", "far away"])
+def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
+    scene = build_scene(pbdkit.Experiment(**experiment(HEXAGONAL_BAR, 40)))
+    operator = step_operator(scene)
+    both = sparse.csr_array(sparse.eye_array(operator.now.shape[0]) - operator.now)
+    places = np.repeat(scene.raster.reference(operator.followers) + shift, 2, axis=0)
+    plain = linear.SparseLU(both, symmetric=False)
+    found = linear.SparseLU(both, symmetric=False, places=places)
+    assert found._factors.nnz < 0.7 * plain._factors.nnz
+    b = np.random.default_rng(0).normal(size=len(places))
+    for x, of in ((found.solve(b, 0.0), both), (found.solve_transposed(b, 0.0), both.T)):
+        assert np.abs(of @ x - b).max() < 1e-10
+
+
+def test_matrices_without_a_symmetric_pattern_are_told_apart():
+    matrix, _ = plane(30, 20)
+    assert linear.is_nearly_symmetric(matrix)
+    assert not linear.is_nearly_symmetric(sparse.csr_array(sparse.triu(matrix)))
+
+
+def test_derivatives_at_once_are_those_one_by_one_to_the_last_bit():
+    at = np.array([0.3, -0.7, 2.0])
+
+    def moved(x, y):
+        return np.sqrt(x * x + y * y) * x, np.abs(y) + x / y  # |y| is not analytic
+
+    along = np.array([[1.0, 0.0], [0.0, 1.0], [0.6, -0.8]])
+    together = derivatives(
+        lambda step: moved(at + step * along[:, :1], 1.5 + at + step * along[:, 1:]), 3, at.shape
+    )
+    for n, (x, y) in enumerate(along):
+        alone = derivative(lambda s, x=x, y=y: moved(at + s * x, 1.5 + at + s * y), at.shape)
+        assert np.array_equal(alone, together[n])
+
+
+@pytest.mark.parametrize("rule", [{"type": "elastic", "poisson_ratio": 0.3}, {"type": "springs"}])
+def test_operators_do_not_depend_on_how_many_directions_go_together(rule, monkeypatch):
+    given = {
+        "name": "noisy",
+        "lattice": {"type": "square", "a": 0.5},
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "body": {"type": "grid", "columns": 7, "rows": 5},
+        "rule": rule,
+        "frame": {"type": "natural"},
+        "initial": {"type": "noise", "amplitude": 0.05},
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+        "steps": 1,
+    }
+    scene = build_scene(pbdkit.Experiment(**given))
+    found = []
+    for values in (1, 150, 10**6):
+        monkeypatch.setattr(linearising, "VALUES_AT_ONCE", values)
+        found.append(step_operator(scene, initial_state(scene)))
+    for other in found[1:]:
+        assert np.array_equal(found[0].entries_now.values, other.entries_now.values)
+        assert np.array_equal(found[0].source, other.source)
+
+
+BODIES = [
+    {"type": "rectangle", "width": 2.0, "height": 1.03, "origin": [0.01, 0.02]},
+    {"type": "ring", "inner": 0.3, "outer": 0.77, "centre": [0.1, 0.2]},
+    {"type": "polygon", "vertices": [[0, 0], [2, 0.3], [1.7, 1.9], [0.8, 0.6], [0.1, 1.4]]},
+    {"type": "dogbone", "length": 3, "width": 1, "gauge_length": 1, "gauge_width": 0.4,
+     "radius": 0.5},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+@pytest.mark.parametrize("body", BODIES, ids=lambda body: body["type"])
+def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch):
+    """Shares are the same where far more cells are looked at."""
+    near = "chebyshev" if lattice == "square" else "coordination"
+    given = {
+        "name": "cut",
+        "lattice": {"type": lattice, "a": 0.1},
+        "neighbours": {"type": near, "shells": 1},
+        "body": body,
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "steps": 1,
+    }
+    found = build_scene(pbdkit.Experiment(**given)).cells.share
+    if body["type"] != "dogbone":  # whose distance says more than the way to its fillets
+        monkeypatch.setattr(cutting, "NEAREST", 3.0)
+    else:
+        monkeypatch.setattr(cutting, "_width", lambda corners: 0.15)
+    assert np.array_equal(found, build_scene(pbdkit.Experiment(**given)).cells.share)
+
+
+def test_a_process_reads_a_kernel_once():
+    pytest.importorskip("numba")
+    from pbdkit.stepping.compiled.stepper import CompiledStepper
+
+    given = experiment(HEXAGONAL_BAR, 20, solver={"type": "stepping"})
+    scene = build_scene(pbdkit.Experiment(**given))
+    assert CompiledStepper(scene)._run is CompiledStepper(scene)._run
