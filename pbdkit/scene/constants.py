@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import namedtuple
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from pbdkit.experiment.model import Experiment
@@ -42,7 +43,13 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
 
 
 def _named(values: dict[str, float]) -> Any:
-    return namedtuple("Parameters", values)(**{k: float(value) for k, value in values.items()})
+    return _kind(tuple(values))(*map(float, values.values()))
+
+
+@cache
+def _kind(names: tuple[str, ...]) -> Any:
+    """Making a kind of tuple takes as long as many a part of a scene."""
+    return namedtuple("Parameters", names)
 
 
 def _numbers(values: Iterable[float]) -> Constants:

@@ -7,6 +7,7 @@ import inspect
 import types
 import uuid
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 import numba
@@ -52,7 +53,7 @@ def source_key(*functions: Function) -> str:
     for function in functions:
         for reached in _reached(function):
             digest.update(f"{reached.__module__}.{reached.__qualname__}".encode())
-            digest.update(_source(reached).encode())
+            digest.update(_source(reached.__code__).encode())
             digest.update(repr((reached.__defaults__, reached.__kwdefaults__)).encode())
             for name, value in sorted(_names(reached).items()):
                 digest.update(f"{name}={_content(value)}".encode())
@@ -71,11 +72,11 @@ def _content(value: Any) -> str:
     return uuid.uuid4().hex
 
 
-def _source(function: Function) -> str:
+@cache
+def _source(code: types.CodeType) -> str:
     try:
-        return inspect.getsource(function)
+        return inspect.getsource(code)
     except (OSError, TypeError):  # written where no file is, as at a prompt
-        code = function.__code__
         return repr((code.co_code, code.co_consts, code.co_names))
 
 

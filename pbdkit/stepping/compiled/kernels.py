@@ -18,8 +18,8 @@ import numpy as np
 from pbdkit.interfaces import FollowerRule, FractureModel, Here, Vector, length
 from pbdkit.stepping.compiled.functions import compiled, source_key
 
-_loaded: dict[Path, Any] = {}
-"""Kernels of this process, by their files: reading one again takes several milliseconds."""
+_loaded: dict[tuple[Path, str], Any] = {}
+"""Kernels of this process, by folder and key: reading one again takes several milliseconds."""
 
 
 def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None) -> Any:
@@ -33,9 +33,9 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
         functions += [fracture.breaks, fracture.fictitious, length]
     parts = [source, source_key(*functions), numba.__version__, np.__version__, sys.version]
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+    if (known := (_asked_folder(), key)) in _loaded:
+        return _loaded[known]
     path = cache_folder() / f"kernel_{key}.py"
-    if path in _loaded:
-        return _loaded[path]
     if not path.exists():
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
         temporary.write_text(source, encoding="utf-8")
@@ -47,21 +47,25 @@ def load_kernel(source: str, rule: FollowerRule, fracture: FractureModel | None)
         "fictitious": compiled(fracture.fictitious) if fracture else None,
         "length": compiled(length),
     }
-    _loaded[path] = _module(path, names).run
-    return _loaded[path]
+    _loaded[known] = _module(path, names).run
+    return _loaded[known]
 
 
 def cache_folder() -> Path:
     """PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; a temporary one where neither
     can be written."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(os.environ.get("PBDKIT_CACHE_DIR") or Path(home) / "pbdkit")
+    folder = _asked_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
         return Path(tempfile.mkdtemp(prefix="pbdkit-"))
+
+
+def _asked_folder() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get("PBDKIT_CACHE_DIR") or Path(home) / "pbdkit")
 
 
 def _module(path: Path, names: dict[str, Any]) -> ModuleType:
