@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector, where
+from pbdkit.interfaces.answers import as_move, as_vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.constants import WHOLE_CELLS
@@ -158,8 +159,9 @@ class _Bonds:
         """The difference that the rule sees."""
         if not (broken.any() or self._softens):
             return d
-        lost = self._model.fictitious(u, slot.rest, self._parameters)
-        d = self._model.seen(d, lost, slot.rest, c, self._parameters)
+        with blaming(self._model, "when linearised"):
+            lost = as_vector(self._model.fictitious(u, slot.rest, self._parameters), "fictitious")
+            d = as_vector(self._model.seen(d, lost, slot.rest, c, self._parameters), "seen")
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
 
     def _at_home(self, planes: Any, slot: Slot, step: int, place: Indices) -> Any:
@@ -238,6 +240,7 @@ class _Followers:
     def _sum(self, contributions: dict[Slot, Contributions]) -> Contributions:
         return sum_over_slots(self._slots, self._present, contributions.__getitem__)
 
-    def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
+    def _applied(self, total: Contributions, here: Vector) -> Any:
         with np.errstate(all="ignore"):
-            return self._rule.apply(total, Here(here, self._X, self._own), self._constants.rule)
+            standing = Here(here, self._X, self._own)
+            return as_move(self._rule.apply(total, standing, self._constants.rule))
