@@ -213,18 +213,18 @@ class _Followers:
         columns = []
         for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
 
-            def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
+            def moved(step: complex, along: Vector = along) -> Any:
                 nudge = Vector(step * along.x, step * along.y)
                 return self._moved_with_neighbour(of, nudge) if of else self._moved_by(nudge)
 
             columns.append(derivative(moved, self._u.x.shape))
         return np.moveaxis(np.array(columns), (0, 1), (2, 1))
 
-    def _moved_with_neighbour(self, slot: Slot, nudge: Vector) -> tuple[Any, Any]:
+    def _moved_with_neighbour(self, slot: Slot, nudge: Vector) -> Any:
         contributions = self._still | {slot: self._contribution(slot, self._u, nudge)}
         return self._applied(self._sum(contributions), self._u)
 
-    def _moved_by(self, nudge: Vector) -> tuple[Any, Any]:
+    def _moved_by(self, nudge: Vector) -> Any:
         here, back = Vector(self._u.x + nudge.x, self._u.y + nudge.y), Vector(-nudge.x, -nudge.y)
         contributions = {slot: self._contribution(slot, here, back) for slot in self._slots}
         return self._applied(self._sum(contributions), here)
