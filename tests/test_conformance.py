@@ -75,6 +75,7 @@ FAULTS = [
     (others.DeniesBreaking, "breaks-as-declared", "and `breaks` says yes"),
     (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
     (others.Measures, "returns-a-value-a-particle", "`breaks` returns float64: compare"),
+    (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return `pbdkit.Vector"),
     (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
     (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
     (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),

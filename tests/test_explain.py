@@ -102,6 +102,16 @@ def test_the_whole_run(explain):
     assert answer.out.splitlines()[-1].startswith("nearest to breaking: 1-2: intact, strain 0 in")
 
 
+def test_a_run_of_a_model_that_does_not_say_when_it_breaks(explain, monkeypatch):
+    silent = staticmethod(lambda r, c, p: None)
+    monkeypatch.setattr("pbdkit.components.fracture.Threshold.breaking_strain", silent)
+    lines = explain(fracture={"type": "threshold", "thresholds": [1.3]}).out.splitlines()
+    assert lines[3].endswith("not known")
+    assert lines[6] == (
+        "threshold does not say above which strain a bond breaks: a model does by `breaking_strain`"
+    )
+
+
 def test_json_tells_the_same(explain):
     found = json.loads(explain("--bond", "1", "3", "--json").out)
     assert (found["fracture"], found["broken_in_all"]) == ("strain", 1)

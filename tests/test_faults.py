@@ -50,6 +50,7 @@ EDITS = {
     "no is a word": (A, "a: no", "e.yaml:3:25: lattice.a: should be a valid number, got 'no'"),
     "inf": (A, "a: .inf", "e.yaml:3:25: lattice.a: should be a finite number, got inf"),
     "nan": (A, "a: .nan", "e.yaml:3:25: lattice.a: should be a finite number, got nan"),
+    "a bound of many digits": (A, "a: -1", "e.yaml:3:25: lattice.a: should be greater than or equal to 1e-100, got -1"),
     "overflow": (A, "a: 1e400", "e.yaml:3:25: lattice.a: should be a finite number, got inf"),
     "nan in a list": ("0.1,", ".nan,", "e.yaml:11:65: leaders.1.motion.velocity.0: should be a finite..."),
     "text in a list": ("0.1,", "'0.1',", "e.yaml:11:65: leaders.1.motion.velocity.0: should be a valid..."),

@@ -30,11 +30,13 @@ WRONG = {
     "gather exits": (GATHER, "raise SystemExit(4)", "SystemExit: 4 (pbdkit_odd.py, line 11)"),
     "gather gives one": (GATHER, "return d.x", "ValueError: "),
     "gather varies": (GATHER, "return (d.x, d.y, 1.0) if r.x > 0 else (d.x, d.y)", "ValueError: "),
-    "apply gives nothing": (APPLY, "return None", "TypeError: "),
-    "apply gives three": (APPLY, "return dx, dx, dx", "ValueError: "),
+    "apply gives nothing": (APPLY, "return None", "`apply` returned None, not the move (x, y)"),
+    "apply gives one": (APPLY, "return dx", "`apply` returned ndarray, not the move (x, y)"),
+    "apply gives three": (APPLY, "return dx, dx, dx", "`apply` returned 3 values, not the move (x, y)"),
+    "apply gives a number": (APPLY, "return 0.0", "`apply` returned float, not the move (x, y)"),
     "apply gives text": (APPLY, "return 'ab'", ""),
-    "unknown parameter": ("p.strength * dx", "p.strenth * dx", "AttributeError: 'Parameters' object has no attribute 'strenth' (pbdkit_odd.py, line 16)"),
-    "constants are none": (*method("def weights(self, slot, setting): return None"), "TypeError: "),
+    "unknown parameter": ("p.strength * dx", "p.strenth * dx", "AttributeError: 'Parameters' object has no attribute 'strenth'; did you mean 'strength'? (pbdkit_odd.py, line 16)"),
+    "constants are none": (*method("def weights(self, slot, setting): return None"), "`weights` returned None, not a tuple: write `(value,)`"),
     "parameters are none": (*method("def parameters(self, setting): return None"), "TypeError: "),
 }  # fmt: skip
 
@@ -56,6 +58,7 @@ def test_run_and_check_name_the_rule_that_fails(
 
 NOT_REAL = {
     "a shape of its own": (GATHER, "return d.x[..., 0], d.y[..., 0], 1.0", "ValueError: it returned the shape (4,) for particles of shape (4, 3): it is not elementwise"),
+    "apply asks": (APPLY, "return (dx / n / 2, dy / n / 2) if (dx > 0) | (dx <= 0) else (0.0, 0.0)", "ValueError: The truth value of an array with more than one element is ambiguous. Use a.any() or a.all(); choose with `pbdkit.where` in the place of `if`, `and` and `or` (pbdkit_odd.py, line 16)"),
     "complex numbers": (APPLY, "return dx * 1j, dy", "ValueError: it returned values of complex128, not real numbers"),
 }  # fmt: skip
 

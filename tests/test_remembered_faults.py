@@ -87,6 +87,54 @@ class Generous(Keeping):
         return c[0] + 1, c[0]
 
 
+class Bare(Keeping):
+    @staticmethod
+    def update(d, r, c, p):
+        return c[0] + 1
+
+
+class Loose(Plain):
+    def bond_state(self):
+        return Remembered("age", "age", "step")
+
+
+class Tangled(Plain):
+    """Breaks at once, so that fictitious points are asked for."""
+
+    type: str = "tangled"
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x * d.x > 1e-9
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return 0.0, 0.0
+
+
+class Measured(Plain):
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x
+
+
+class Silent(Plain):
+    @staticmethod
+    def breaks(d, r, c, p):
+        pass
+
+
+class Misshapen(Plain):
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x[..., :-1] > 0.0
+
+
+class Constant(Plain):
+    def constants(self, slot):
+        return 1.0
+
+
 class Fractional(Keeping):
     def bond_state(self):
         return (Remembered("age", "age", "step", dtype="i4"),)
@@ -119,7 +167,17 @@ class Writing(Keeping):
         (Taken, "a part remembers 'shell' of each bond, and that name is taken in the dataset"),
         (Worded, "'the age' is no name for a variable: letters, digits and _ only"),
         (Typed, "'age' has the dtype 'f4', not f8, i1, i2, i4, i8"),
-        (Generous, "it returned 2 values, and it remembers 1 that change"),
+        (Generous, "it returned 2 values, and it remembers 1 that change: declare `changes=False`"),
+        (Bare, "step 1: `update` returned ndarray, not a tuple: write `\\(value,\\)`"),
+        (Loose, "asked what it remembers: `bond_state` returned Remembered, not a tuple"),
+        (
+            Tangled,
+            "'tangled' failed to place .*: `fictitious` returned tuple: return `pbdkit.Vector",
+        ),
+        (Measured, "'plain' failed at step 1: `breaks` returned float64: compare, as in"),
+        (Silent, "'plain' failed at step 1: `breaks` returned None: compare, as in"),
+        (Misshapen, "'plain' failed at step 1: ValueError: operands could not be broadcast"),
+        (Constant, "asked for its constants: `constants` returned float, not a tuple"),
         (Fractional, "failed at step 1.*same_kind"),
         (Writing, "failed at step 1.*read-only"),
     ],

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot, Vector, where
+from pbdkit.interfaces.answers import as_vector
 from pbdkit.interfaces.frame import Indices
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.state import State
@@ -43,8 +45,9 @@ class ChangedBonds:
         """The difference that the rule sees."""
         if not (broken.any() or self._softens):
             return d
-        lost = self._model.fictitious(u, slot.rest, self._parameters)
-        d = self._model.seen(d, lost, slot.rest, c, self._parameters)
+        with blaming(self._model, "when linearised"):
+            lost = as_vector(self._model.fictitious(u, slot.rest, self._parameters), "fictitious")
+            d = as_vector(self._model.seen(d, lost, slot.rest, c, self._parameters), "seen")
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))
 
     def _at_home(self, planes: Any, slot: Slot, step: int, place: Indices) -> Any:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.changed_bonds import ChangedBonds
 from pbdkit.analysis.derivatives import derivatives
 from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.interfaces.answers import as_move
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.constants import WHOLE_CELLS
@@ -188,7 +189,7 @@ class _Followers:
                 found[mover] = np.moveaxis(answers[2 * n : 2 * n + 2], (0, 1), (2, 1))
         return found
 
-    def _moved(self, nudges: _Nudges, step: complex) -> tuple[Any, Any]:
+    def _moved(self, nudges: _Nudges, step: complex) -> Any:
         """The moves (direction, place) after steps of neighbours, or of one's own."""
         here, contributions = self._u, dict(self._still)
         if nudges.own:
@@ -209,9 +210,10 @@ class _Followers:
     def _sum(self, contributions: dict[Slot, Contributions]) -> Contributions:
         return sum_over_slots(self._slots, self._present, contributions.__getitem__)
 
-    def _applied(self, total: Contributions, here: Vector) -> tuple[Any, Any]:
+    def _applied(self, total: Contributions, here: Vector) -> Any:
         with np.errstate(all="ignore"):
-            return self._rule.apply(total, Here(here, self._X, self._own), self._constants.rule)
+            standing = Here(here, self._X, self._own)
+            return as_move(self._rule.apply(total, standing, self._constants.rule))
 
 
 class _Nudges:

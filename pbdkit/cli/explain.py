@@ -85,6 +85,11 @@ def _run_in_words(found: dict[str, Any]) -> Iterator[str]:
         bond = "-".join(map(str, s.bond))
         strain, limit = _number(s.strain_at_break), _number(s.breaks_above)
         yield f"{s.order:>5}  {s.step:>4}  {bond:<13}  {strain:<11}  {limit}"
+    if rows and all(s.breaks_above is None for s in rows):
+        yield (
+            f"{found['fracture']} does not say above which strain a bond breaks: a model does by "
+            "`breaking_strain`"
+        )
     if len(rows) > SHOWN:
         yield f"and {len(rows) - SHOWN} more: --json lists all"
     if found["nearest"]:

@@ -21,6 +21,8 @@ PLAIN = {
     "model_type": "should be a map of keys, got {got}",
 }
 """Where pydantic speaks of Python's types, the words of an experiment file."""
+_LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20})[-\d.]+")
+"""A bound that pydantic writes out in full, as 1e-100."""
 
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
@@ -47,6 +49,7 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
     if fault["type"] == "value_error":
         return where, message
+    message = _LONG.sub(lambda number: f"{_bound(context):g}", message)
     hint = ""
     if (
         fault["type"] == "int_type"
@@ -57,6 +60,10 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "literal_error" and isinstance(fault["input"], str):
         hint = did_you_mean(fault["input"], re.findall(r"'([^']*)'", context["expected"]))
     return where, f"{message}, got {brief(fault['input'])}{hint}"
+
+
+def _bound(context: Any) -> float:
+    return next(float(context[k]) for k in ("gt", "ge", "lt", "le") if k in context)
 
 
 def _follows(fault: Any, found: list[Any]) -> bool:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import traceback
 
+from pbdkit.interfaces.answers import AnswerError
+from pbdkit.interfaces.naming import did_you_mean
+
 LONGEST = 400
 
 
@@ -17,7 +20,19 @@ def worded(error: BaseException, package: str = "") -> str:
     except Exception:  # a plugin's own error class can fail to say what it is
         message = "(its message cannot be had)"
     kind = type(error).__name__
-    return one_line(f"{kind}: {message}" if message else kind) + _place(error, package)
+    if isinstance(error, AnswerError):
+        return one_line(message)
+    told = one_line(f"{kind}: {message}" if message else kind)
+    return told + remedy(error) + _place(error, package)
+
+
+def remedy(error: BaseException) -> str:
+    """What elementwise functions are to do instead, where the fault is a frequent one."""
+    if isinstance(error, ValueError) and "truth value of an array" in str(error):
+        return "; choose with `pbdkit.where` in the place of `if`, `and` and `or`"
+    if isinstance(error, AttributeError) and type(error.obj).__name__ == "Parameters":
+        return did_you_mean(str(error.name), getattr(error.obj, "_fields", ()))
+    return ""
 
 
 def one_line(text: str) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Slot
+from pbdkit.interfaces.answers import as_values
 from pbdkit.registry.blame import blaming
 
 Constants = tuple[float, ...]
@@ -34,11 +34,14 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     with blaming(experiment.rule, "when asked for its constants", "rule"):
         rule = _named(experiment.rule.parameters(setting))
         sides = WHOLE_CELLS if experiment.rule.uses_cells else ()
-        weights = {s: (*_numbers(experiment.rule.weights(s, setting)), *sides) for s in slots}
+        weights = {
+            s: (*_numbers(experiment.rule.weights(s, setting), "weights"), *sides) for s in slots
+        }
     fracture = experiment.fracture
     with blaming(fracture, "when asked for its constants", "fracture"):
         parameters = _named(fracture.parameters())
-        limits = {s: _numbers(fracture.constants(s)) for s in slots} if fracture.can_break else {}
+        asked = slots if fracture.can_break else []
+        limits = {s: _numbers(fracture.constants(s), "constants") for s in asked}
     return SceneConstants(rule, weights, parameters, limits)
 
 
@@ -52,6 +55,6 @@ def _kind(names: tuple[str, ...]) -> Any:
     return namedtuple("Parameters", names)
 
 
-def _numbers(values: Iterable[float]) -> Constants:
+def _numbers(answer: Any, what: str) -> Constants:
     """Plain numbers: those of numpy would raise single precision to double."""
-    return tuple(map(float, values))
+    return tuple(map(float, as_values(answer, what)))

@@ -7,6 +7,7 @@ from collections import Counter
 from pbdkit.errors import PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Remembered
+from pbdkit.interfaces.answers import as_values
 from pbdkit.registry.blame import blaming
 
 Declared = tuple[Remembered, ...]
@@ -17,13 +18,13 @@ def bond_numbers(experiment: Experiment) -> Declared:
     if not experiment.fracture.can_break:
         return ()
     with blaming(experiment.fracture, "when asked what it remembers", "fracture"):
-        return tuple(experiment.fracture.bond_state())
+        return as_values(experiment.fracture.bond_state(), "bond_state")
 
 
 def particle_numbers(experiment: Experiment) -> Declared:
     """What the rule remembers of each particle."""
     with blaming(experiment.rule, "when asked what it remembers", "rule"):
-        return tuple(experiment.rule.particle_state())
+        return as_values(experiment.rule.particle_state(), "particle_state")
 
 
 def remembered_names(experiment: Experiment) -> dict[str, str]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import FractureModel, Slot, Vector, length, where
+from pbdkit.interfaces.answers import as_values, as_vector, as_verdict
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.raster import Block
@@ -88,9 +89,9 @@ class Fracturing:
             with np.errstate(all="ignore"), blaming(self._model, when):
                 if self._updates:
                     fresh = self._model.update(d, r, c, self._parameters)
-                    renew(changing(self._numbers, own), fresh, intact)
-                breaks = self._model.breaks(d, r, c, self._parameters)
-            yield (n, rows, columns), d, r, intact & breaks
+                    renew(changing(self._numbers, own), as_values(fresh, "update"), intact)
+                breaks = intact & as_verdict(self._model.breaks(d, r, c, self._parameters))
+            yield (n, rows, columns), d, r, breaks
 
     def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, state: State) -> Vector:
         """The difference that the rule sees: softened, or that of the fictitious point where the
@@ -102,11 +103,11 @@ class Fracturing:
         if not (any_broken or self._softens):
             return d
         with blaming(self._model, "to place a fictitious point"):
-            lost = self._model.fictitious(u, slot.rest, self._parameters)
+            lost = as_vector(self._model.fictitious(u, slot.rest, self._parameters), "fictitious")
         if self._softens:
             c = (*self._limits[slot], *(v[n, rows, columns] for v in shown(state.bond_values)))
             with blaming(self._model, "to soften a bond"):
-                d = self._model.seen(d, lost, slot.rest, c, self._parameters)
+                d = as_vector(self._model.seen(d, lost, slot.rest, c, self._parameters), "seen")
         if not any_broken:
             return d
         return Vector(where(broken, lost.x, d.x), where(broken, lost.y, d.y))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import Here, Nearness, Vector
+from pbdkit.interfaces.answers import as_move, as_values
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
@@ -50,7 +51,7 @@ class GatheringFollowers(Followers):
         )
         own = tuple(value.ravel()[self._place] for value in state.particle_values)
         here = Here(Vector(*u), Vector(*self._X), own)
-        move = self._rule.apply(total, here, self._parameters)
+        move = as_move(self._rule.apply(total, here, self._parameters))
         movable = self._body[np.bincount(j, minlength=count)[self._body] > 0]
         place = self._place[movable]
         if self._rule.remembers():
@@ -66,7 +67,8 @@ class GatheringFollowers(Followers):
         """`here` holds copies, so that what is written is not read again."""
         numbers, place = particle_numbers(self._scene.experiment), self._place[movable]
         fresh = changing(numbers, here.own)
-        renew(fresh, self._rule.remember(total, here, self._parameters), None)
+        new = as_values(self._rule.remember(total, here, self._parameters), "remember")
+        renew(fresh, new, None)
         for plane, values in zip(changing(numbers, state.particle_values), fresh, strict=True):
             plane.reshape(-1)[place] = values[movable]
 

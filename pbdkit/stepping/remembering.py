@@ -66,7 +66,10 @@ def renew(old: Sequence[Array], new: Sequence[Any], where: Array | None) -> None
     Raises ValueError for another number of values, TypeError for fractions of an integer.
     """
     if len(new) != len(old):
-        raise ValueError(f"it returned {len(new)} values, and it remembers {len(old)} that change")
+        raise ValueError(
+            f"it returned {len(new)} value{'s' * (len(new) != 1)}, and it remembers {len(old)} "
+            "that change: declare `changes=False` for those that stay"
+        )
     fresh = [
         np.array(value) if where is None else np.where(where, value, plane)
         for plane, value in zip(old, new, strict=True)

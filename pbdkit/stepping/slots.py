@@ -10,6 +10,7 @@ import numpy as np
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import FollowerRule, Here, Slot, Vector
+from pbdkit.interfaces.answers import as_move, as_values
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.remembering import particle_numbers
@@ -76,11 +77,11 @@ class SlotFollowers(Followers):
         seen = self._seen(m, state)
         for part in self._parts:
             total, here = self._sums(part, seen, state), self._here(part, seen, state)
-            move = self._rule.apply(total, here, self._parameters)
+            move = as_move(self._rule.apply(total, here, self._parameters))
             self._place(part, move, m, new)
             if self._rule.remembers():
                 own = [value[part.block.slices()] for value in state.particle_values]
-                fresh = self._rule.remember(total, here, self._parameters)
+                fresh = as_values(self._rule.remember(total, here, self._parameters), "remember")
                 renew(changing(self._numbers, own), fresh, part.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
@@ -88,7 +89,7 @@ class SlotFollowers(Followers):
         seen, out = self._seen(m, state), np.zeros_like(m)
         for part in self._parts:
             total, here = self._sums(part, seen, state), self._here(part, seen, state)
-            _write(self._rule.apply(total, here, self._parameters), part, out)
+            _write(as_move(self._rule.apply(total, here, self._parameters)), part, out)
         return out
 
     def forces(self, m: Floats, state: State) -> Floats:

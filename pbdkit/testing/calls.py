@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import FollowerRule, FractureModel, Here, Slot, Vector
+from pbdkit.interfaces.answers import as_move, as_values, as_vector
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.numbers import (
     SHAPE,
@@ -59,7 +60,7 @@ def summed(contributions: list[tuple[Any, ...]]) -> list[Any]:
 
 def applied(rule: FollowerRule, scene: Scene, totals: list[Any], arrays: Arrays) -> Arrays:
     """The move."""
-    x, y = rule.apply(tuple(totals), _standing(rule, arrays), scene.constants.rule)
+    x, y = as_move(rule.apply(tuple(totals), _standing(rule, arrays), scene.constants.rule))
     return {"move.x": x, "move.y": y}
 
 
@@ -87,7 +88,7 @@ def ask_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
 
     def remember(arrays: Arrays) -> Arrays:
         total = tuple(arrays[name] for name in named)
-        return _counted(rule.remember(total, _standing(rule, arrays), p))
+        return _counted(as_values(rule.remember(total, _standing(rule, arrays), p), "remember"))
 
     def force(arrays: Arrays) -> Arrays:
         total = tuple(arrays[name] for name in named)
@@ -121,7 +122,7 @@ def updated(
 ) -> tuple[Any, ...]:
     """The new values of the numbers that change."""
     c, p = (*model.constants(slot), *own), scene.constants.fracture
-    return tuple(model.update(d, r or slot.rest, c, p))
+    return as_values(model.update(d, r or slot.rest, c, p), "update")
 
 
 def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Question]:
@@ -146,14 +147,16 @@ def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         }
 
     def fictitious(arrays: Arrays) -> Arrays:
-        return _at_slots(model.fictitious(vector(arrays, "u"), slot.rest, p) for slot in slots)
+        u = vector(arrays, "u")
+        return _at_slots("fictitious", (model.fictitious(u, slot.rest, p) for slot in slots))
 
     def seen(arrays: Arrays) -> Arrays:
         lost = vector(arrays, "lost")
-        return _at_slots(
+        found = (
             model.seen(vector(arrays, f"d{k}"), lost, s.rest, constants(model, s, arrays), p)
             for k, s in enumerate(slots)
         )
+        return _at_slots("seen", found)
 
     bonds = differences(scene, seed, share=2.0) | remembered_of_bonds(scene, seed)
     questions = [
@@ -171,11 +174,11 @@ def _each(what: str, inputs: Arrays, ask: Callable[[Arrays], Arrays]) -> Questio
     return Question(what, inputs, ask, elementwise=True)
 
 
-def _at_slots(found: Iterable[Vector]) -> Arrays:
+def _at_slots(what: str, found: Iterable[Vector]) -> Arrays:
     return {
         f"{c} at slot {k}": value
         for k, answer in enumerate(found)
-        for c, value in zip("xy", answer, strict=True)
+        for c, value in zip("xy", as_vector(answer, what), strict=True)
     }
 
 

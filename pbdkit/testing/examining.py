@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from pbdkit.interfaces import Component
+from pbdkit.interfaces.answers import AnswerError
+from pbdkit.registry.wording import remedy
 from pbdkit.testing.properties import properties_of
 from pbdkit.testing.property import NotAskedError, Property, PropertyError
 from pbdkit.testing.report import Outcome, Report
@@ -51,7 +53,7 @@ class Examination:
             asked.check(self._subject)
         except NotAskedError as reason:
             return Outcome(asked.name, "skipped", str(reason))
-        except PropertyError as fault:
+        except (PropertyError, AnswerError) as fault:
             return Outcome(asked.name, "failed", str(fault))
         except Exception as error:
             return Outcome(asked.name, "failed", _told(error))
@@ -69,4 +71,5 @@ def _told(error: Exception) -> str:
     cause = error.__cause__ or error
     frames = traceback.extract_tb(cause.__traceback__)
     own = [f for f in frames if "/pbdkit/" not in f.filename.replace("\\", "/")] or frames
-    return f"{type(error).__name__}: {error} ({own[-1].filename}, line {own[-1].lineno})"
+    told = f"{type(error).__name__}: {error}{remedy(error)}"
+    return f"{told} ({own[-1].filename}, line {own[-1].lineno})"

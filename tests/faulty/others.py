@@ -204,6 +204,16 @@ class Measures(Strain):
         return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) - c[0]
 
 
+class Tupled(Strain):
+    """Puts a plain tuple where a vector is asked."""
+
+    type: Literal["tupled"] = "tupled"
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return 0.0, 0.0
+
+
 class Extent(pbdkit.Diagnostic):
     """How far each particle has moved: what the others would be without their fault."""
 

@@ -88,8 +88,9 @@ def renews_what_it_remembers(subject: Subject) -> None:
     for values in _by_slot(asked[0].answer()):
         if len(values) != len(changing):
             raise PropertyError(
-                f"`{asked[0].what}` returns {len(values)} values, and {len(changing)} of the "
-                "numbers change: declare `changes=False` for those that stay"
+                f"`{asked[0].what}` returns {len(values)} value{'s' * (len(values) != 1)}, and "
+                f"{len(changing)} of the numbers change: declare `changes=False` for those that "
+                "stay"
             )
         for number, value in zip(changing, values, strict=True):
             if not np.can_cast(value.dtype, number.dtype, "same_kind"):
