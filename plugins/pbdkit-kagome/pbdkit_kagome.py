@@ -23,14 +23,13 @@ class _Vacant(pbdkit.Lattice):
 
     def _cell(self, period: tuple[int, int], kept: Sequence[tuple[int, int]]) -> pbdkit.Cell:
         """The rectangle of `period` sites of the hexagonal lattice, with those that are `kept`."""
-        a = _with_exact_multiples(self.a)
-        half_row = _height_of_triangle(a)
+        a, row = _triangle(self.a)
         columns, rows = period
         return pbdkit.Cell(
-            vectors=(pbdkit.Vector(columns * a, 0.0), pbdkit.Vector(0.0, rows * half_row)),
+            vectors=(pbdkit.Vector(columns * a, 0.0), pbdkit.Vector(0.0, rows * row)),
             sites=tuple(
                 pbdkit.BasisSite(
-                    pbdkit.Vector((i + j % 2 / 2) * a, j * half_row), (i, j), (i - j // 2, j)
+                    pbdkit.Vector((i + j % 2 / 2) * a, j * row), (i, j), (i - j // 2, j)
                 )
                 for i, j in kept
             ),
@@ -108,24 +107,25 @@ def _nearest(cell: pbdkit.Cell) -> list[list[pbdkit.Offset]]:
     return [[o for o in own if o.length <= shortest * (1 + 1e-6)] for own in around]
 
 
-def _with_exact_multiples(length: float) -> float:
-    """The length to 48 of its 53 binary digits, so that small multiples of it have no rounding.
+def _triangle(side: float) -> tuple[float, float]:
+    """Side and height of the equilateral triangle, the side changed by less than 1e-13 of it.
 
-    The three bonds of a honeycomb's site then add up to zero exactly, as opposite ones do by
-    themselves, and a body at rest stays.
+    So rounded that a body at rest stays on the honeycomb lattice too, where no bond has an opposite
+    one: the side has 48 of the 53 binary digits, so that its small multiples are exact and three
+    bonds add up to zero; and the three sides have one length to the last digit, so that rules that
+    weigh neighbours by their distance weigh them alike.
     """
-    digits, exponent = math.frexp(length)
-    return math.ldexp(round(math.ldexp(digits, 48)), exponent - 48)
+    digits, exponent = math.frexp(side)
+    whole = round(math.ldexp(digits, 48))
+    sides = (math.ldexp(whole + n, exponent - 48) for n in range(16))
+    return next((a, h) for a in sides for h in _heights(a))
 
 
-def _height_of_triangle(side: float) -> float:
-    """The height of the equilateral triangle, so rounded that its three sides have one length.
-
-    Rules that weigh neighbours by their distance then weigh all of them alike at rest.
-    """
+def _heights(side: float) -> list[float]:
+    """Floating-point numbers around side · √3/2 that pbdkit.length finds to be the height."""
     height = side * math.sqrt(3.0) / 2
-    near = (height + n * math.ulp(height) for n in (0, 1, -1, 2, -2, 3, -3))
-    return next((h for h in near if math.sqrt(side / 2 * (side / 2) + h * h) == side), height)
+    near = (height + n * math.ulp(height) for n in range(-4, 5))
+    return [h for h in near if pbdkit.length(pbdkit.Vector(side / 2, h)) == side]
 
 
 @pbdkit.hookimpl
