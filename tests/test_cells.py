@@ -11,7 +11,8 @@ import pbdkit
 from pbdkit.components.diagnostics import smallest_corner_area
 from pbdkit.interfaces import BasisSite, Cell, Vector
 from pbdkit.results.inversion import inside_out
-from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.mesh import lattice_cells
 from pbdkit.stepping.state import initial_state
 

@@ -152,6 +152,17 @@ def test_a_wrong_setting(call: Call, setting: str, message: str) -> None:
 BLOWN = ["--set=solver.relaxation=50", "--set=steps=300", "--set=diagnostics=[{type: pe1}]"]
 
 
+@pytest.mark.parametrize("arguments", [["identify", "paper/a"], ["schema", "experiment"]])
+def test_a_reader_who_has_had_enough_is_no_error(arguments: list[str]) -> None:
+    command = [sys.executable, "-m", "pbdkit", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
 def test_a_run_that_diverges_keeps_what_was_finite(call: Call) -> None:
     result = python("-m", "pbdkit", "run", "e.json", *BLOWN)
     assert (result.returncode, left()) == (4, ["tensile.nc"])

@@ -21,7 +21,7 @@ from pbdkit.components.rules import (
     MixedCoordinate,
 )
 from pbdkit.components.springs import Springs
-from pbdkit.components.straining import Strain
+from pbdkit.components.straining import StrainFracture
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
 from pbdkit.scene.neighbourhood import build_neighbourhood
@@ -40,6 +40,8 @@ REQUIRED = {
     "modulus_ratio": 0.5,
     "shear_ratio": 0.4,
     "length": 0.1,
+    "youngs_modulus": 7.0,
+    "width": 2.0,
 }
 
 
@@ -171,8 +173,8 @@ def test_zero_differences_of_opposite_pairs_mean_rest(rule):
         Threshold(thresholds=(1.5,)),
         Threshold(thresholds=(1.5,), placement=1.2),
         Threshold(thresholds=(1.5,), fictitious="reference"),
-        Strain(failure=0.5),
-        Strain(failure=0.5, fictitious="reference"),
+        StrainFracture(failure=0.5),
+        StrainFracture(failure=0.5, fictitious="reference"),
     ],
     ids=["none", "cell", "loosened", "reference", "strain", "strain, reference"],
 )

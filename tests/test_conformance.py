@@ -7,7 +7,7 @@ import sys
 from typing import Literal
 
 import pytest
-from faulty import others, rules
+from faulty import others, remembering, rules
 from faulty.kagome import Kagome, OnKagome
 from pydantic import Field
 
@@ -19,7 +19,15 @@ from pbdkit.testing import PROPERTIES, Examination, conformance, examine, examin
 
 test_built_in_components_conform = conformance(*pbdkit_components())
 
-SOUND = [rules.Sound(), others.Following(), others.Strain(), others.Extent()]
+SOUND = [
+    rules.Sound(),
+    others.Following(),
+    others.Strain(),
+    others.Extent(),
+    remembering.Wearing(),
+    remembering.Tired(),
+    remembering.LastOnes(),
+]
 
 FAULTS = [
     (rules.WritesInput, "changes-no-input", "`gather` writes into `d0.x`"),
@@ -72,6 +80,33 @@ FAULTS = [
     (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
     (others.FromFirstRow, "takes-rows-in-any-order", "ask `now.rows(numbers)`"),
     (others.KeepsLargest, "remembers-nothing", "keeps `KeepsLargest.largest` from call to call"),
+    (remembering.TakesAName, "declares-what-it-remembers", "every dataset has a 'shell'"),
+    (remembering.Shouts, "declares-what-it-remembers", "'WEAR' is not named as `my_number` is"),
+    (remembering.OfNoUnit, "declares-what-it-remembers", "'wear' has no units"),
+    (remembering.StartsHalfway, "declares-what-it-remembers", "starts at 0.5, which i4 does not"),
+    (remembering.Misnames, "draws-what-it-remembers", "gives 'strengths'; what it remembers is"),
+    (remembering.DrawsOne, "draws-what-it-remembers", "with the shape (), not ("),
+    (remembering.DrawsNothingFinite, "draws-what-it-remembers", "'strength' that is not finite"),
+    (remembering.Overflows, "draws-what-it-remembers", "which i1 does not hold"),
+    (remembering.DrawsElsewhere, "answers-the-same", "`draw` answers the same question otherwise"),
+    (remembering.DrawsAgain, "answers-the-same", "at random that nobody gave it"),
+    (remembering.DrawsOnItsOwn, "continues-where-it-stopped", "a run made anew gives another"),
+    (remembering.WritesBonds, "changes-no-input", "`draw` writes into `shell`"),
+    (remembering.WritesWear, "changes-no-input", "`update` writes into `own1`"),
+    (remembering.WritesTheWay, "changes-no-input", "`remember` writes into `own0`"),
+    (remembering.OneTooMany, "renews-what-it-remembers", "returns 3 values, and 2 of the numbers"),
+    (remembering.ForgetsTheWay, "renews-what-it-remembers", "`remember` returns 0 values, and 1"),
+    (remembering.WayAndMove, "renews-what-it-remembers", "`remember` returns 2 values, and 1 of"),
+    (remembering.CountsHalves, "renews-what-it-remembers", "declared as i4: fractions would be"),
+    (remembering.WearsTogether, "is-local", "`update` gives a particle another answer alone"),
+    (remembering.SharesTheWay, "is-local", "`remember` gives a particle another answer alone"),
+    (remembering.WearsInOrder, "takes-particles-in-any-order", "`update` gives a particle another"),
+    (remembering.WearsInDoubles, "keeps-single-precision", "`update` returns float64 for float32"),
+    (remembering.WearsOneWay, "is-seen-alike-from-both-ends", "`update` answers otherwise for"),
+    (remembering.Misstates, "breaks-beyond-its-strain", "`breaking_strain` and `breaks` disagree"),
+    (remembering.Sags, "rests", "a body at rest moves by"),
+    (remembering.Ragged, "measures-what-it-declares", "'last_square' has the shape"),
+    (remembering.Untimely, "measures-what-it-declares", "a length only where it declares `at_end`"),
 ]
 
 
@@ -116,14 +151,17 @@ def test_nobody_is_excused():
 def test_a_report_tells_what_ran_and_why_not():
     text = str(examine(rules.Sound()))
     assert text.startswith(
-        "FollowerRule sound: 19 properties ran, 0 failed; 1 skipped: it does not"
+        "FollowerRule sound: 19 properties ran, 0 failed; 3 skipped: it remembers nothing"
     )
     assert "  held     rests" in text
 
 
 def test_after_a_fault_nothing_is_judged_that_means_nothing():
     report = examine(rules.WritesInput())
-    assert {o.reason for o in report.skipped} == {"not judged while changes-no-input fails"}
+    assert {o.reason for o in report.skipped} == {
+        "not judged while changes-no-input fails",
+        "it remembers nothing of particles",
+    }
 
 
 def test_pbdkits_own_words_compile():
@@ -204,7 +242,7 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == code, done.stdout
-    assert f"FollowerRule mine: 19 properties ran, {code} failed; 1 skipped" in done.stdout
+    assert f"FollowerRule mine: 19 properties ran, {code} failed; 3 skipped: it" in done.stdout
     assert "does not declare `linear`" in done.stdout
     if code:
         assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
@@ -215,7 +253,7 @@ def test_plugins_check_tries_a_distribution(install, call):
     install("pbdkit-bad", SOURCE.replace("SHARE *", "1e-9 +").replace("mine", "bad"))
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0
-    assert "FollowerRule mine: 19 properties ran, 0 failed; 1 skipped: it does not" in good.out
+    assert "FollowerRule mine: 19 properties ran, 0 failed; 3 skipped: it remembers" in good.out
     assert "all properties hold for 1 example of its components" in good.out
     both = call("plugins", "check")
     assert both.code == 3

@@ -65,20 +65,32 @@ def test_a_page_gives_the_signatures(interface):
         assert [p for p in parameters if p != "self"] == re.findall(r"\w+", arguments), name
 
 
-@EVERY
-def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
-    (code,) = blocks(text_of(interface))
-    module = f"page_of_{interface.__name__.lower()}"
+def reports_on(interface, code, tmp_path, monkeypatch):
+    """The example's own run, and what the suite says of its component."""
+    module = f"page_of_{interface.__name__.lower()}_{len(sys.modules)}"
     (tmp_path / f"{module}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     page = importlib.import_module(module)
     found = vars(page).values()
     (component,) = (c for c in found if inspect.isclass(c) and issubclass(c, interface))
-    for example in examples_of(component):
-        report = examine(example)
+    return [examine(example) for example in examples_of(component)]
+
+
+@EVERY
+def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
+    code = blocks(text_of(interface))[0]
+    for report in reports_on(interface, code, tmp_path, monkeypatch):
         assert report.holds, str(report)
         if interface in (pbdkit.FollowerRule, pbdkit.FractureModel):
             assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
+
+
+@pytest.mark.parametrize("interface", [pbdkit.FollowerRule, pbdkit.FractureModel])
+def test_the_example_that_remembers_conforms(interface, tmp_path, monkeypatch):
+    _, code = blocks(text_of(interface))
+    for report in reports_on(interface, code, tmp_path, monkeypatch):
+        assert report.holds, str(report)
+        assert "declares-what-it-remembers" in [outcome.property for outcome in report.ran]
 
 
 @EVERY

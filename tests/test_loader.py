@@ -22,13 +22,14 @@ Call = Callable[..., Any]
 
 HEALTHY = "--set=rule={type: zz-healthy}"
 """Found among the installed ones, so that all of them are loaded."""
+TEARING = "--set=fracture={type: strain, failure: 0.05}"
 EVERY_COMMAND = {
-    "run": ["run", "e.json", HEALTHY],
+    "run": ["run", "e.json", HEALTHY, TEARING, "-o", "torn.nc"],
     "check": ["check", "e.json", HEALTHY],
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
     "plot": ["plot", "made.nc"],
-    "explain": ["explain", "made.nc"],
+    "explain": ["explain", "torn.nc"],
     "identify": ["identify", "e.json", HEALTHY],
     "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
     "plugins": ["plugins", "list"],

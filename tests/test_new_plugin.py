@@ -61,6 +61,12 @@ def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> 
     tests["test_the_example_runs_with_this_plugin"]()
 
 
+def test_bonds_break_in_the_example_of_a_fracture_model(new: New) -> None:
+    folder = new("pbdkit-brand-new", "FractureModel")
+    broken = pbdkit.run(folder / "example.yaml", progress=False).broken_step > 0
+    assert 0 < broken.sum() < broken.size
+
+
 @pytest.mark.parametrize("interface", OFFERED)
 def test_the_project_conforms(new: New, interface: str) -> None:
     new("pbdkit-brand-new", interface)

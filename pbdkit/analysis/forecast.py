@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.analysis.analysis import NO_REMEDY, Analysis
 from pbdkit.analysis.region import NEUTRAL
-from pbdkit.analysis.symbol import wave_bound
+from pbdkit.analysis.symbol import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leading import kinds_at
@@ -84,12 +84,13 @@ def quick_warnings(scene: Scene) -> tuple[str, ...]:
 
 
 def prediction(scene: Scene) -> dict[str, Any]:
-    """What the dataset keeps of the bound from plane waves; empty where there is none."""
+    """What the dataset keeps of the bound from plane waves; empty where there is none. `stable` is
+    None where no wave grows and waves do not bound the body."""
     bound, memory = wave_bound(scene), scene.experiment.solver.memory
     if bound is None:
         return {}
     return {
-        "stable": bound.radius <= 1.0 + NEUTRAL,
+        "stable": bound.radius <= 1.0 + NEUTRAL and (bounds_the_body(scene) or None),
         "largest_stable_relaxation": bound.largest_stable_relaxation(memory),
         "smallest_eigenvalue": bound.smallest,
     }

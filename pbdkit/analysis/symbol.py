@@ -19,6 +19,10 @@ WAVES = 48
 """Wave numbers along each axis; an even number, so that the shortest waves are among them."""
 
 
+LITTLE_MEMORY = 0.9
+"""Up to which plane waves were seen to bound random bodies (tests/test_predictions.py)."""
+
+
 @dataclass(frozen=True)
 class Bound:
     """Over all waves: the smallest and largest real part and the largest imaginary part of the
@@ -59,6 +63,14 @@ def wave_bound(scene: Scene) -> Bound | None:
         float(np.abs(eigenvalues.imag).max()),
         float(np.abs(modes(eigenvalues, solver.relaxation, solver.memory)).max()),
     )
+
+
+def bounds_the_body(scene: Scene) -> bool:
+    """Whether no mode of the body can grow where no wave does: particles with fewer neighbours have
+    modes of their own, and with much memory so have frames on leaning lattices."""
+    reach = scene.neighbourhood.reach
+    whole = scene.experiment.frame.depth(reach) >= reach
+    return whole and abs(scene.experiment.solver.memory) <= LITTLE_MEMORY
 
 
 def _eigenvalues(matrices: Complex) -> Complex:

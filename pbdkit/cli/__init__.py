@@ -47,6 +47,17 @@ class Commands(click.Group):
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
         return with_no_plugins(command)
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Ends quietly where whoever reads the output has had enough of it, as `head` has."""
+        try:
+            return super().invoke(ctx)
+        except (BrokenPipeError, SystemExit) as error:  # rich makes the one of the other
+            cause = error if isinstance(error, BrokenPipeError) else error.__context__
+            if not isinstance(cause, BrokenPipeError):
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+
 
 @with_no_plugins
 @click.group(

@@ -17,8 +17,10 @@ COMPONENTS = {
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame",
     "free_edges": "Natural TractionFree",
     "fracture": "NoFracture Threshold",
-    "straining": "Strain Damage",
+    "straining": "StrainFracture Damage",
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
+    "fields": "Strain Rotation Stress",
+    "forces": "StrainEnergy Reaction StressStrain",
 }
 """By module of this folder the classes that it offers."""
 

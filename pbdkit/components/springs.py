@@ -68,3 +68,11 @@ class Springs(FollowerRule):
     def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
         """Σ k e n."""
         return total[0], total[1]
+
+    @staticmethod
+    def energy(d: Vector, r: Vector, w: Any, p: Any) -> Any:
+        """Half of ½ k e²."""
+        half, rest, left, right = w
+        v = Vector(r.x + d.x, r.y + d.y)
+        elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (length(v) + rest)
+        return half * (left + right) * elongation * elongation / 4

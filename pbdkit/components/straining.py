@@ -21,7 +21,7 @@ def _factors(bonds: Bonds, scatter: float, generator: np.random.Generator) -> An
     return 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
 
 
-class Strain(Parting):
+class StrainFracture(Parting):
     """A bond breaks when its strain |r + d| / |r| - 1 exceeds `failure`, whatever its shell; bonds
     that are pressed together never break.
 

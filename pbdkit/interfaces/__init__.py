@@ -2,7 +2,7 @@
 
 from pbdkit.interfaces.arithmetic import Vector, length, squared_length, where
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.diagnostic import Diagnostic, Moment, Variable
+from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
 from pbdkit.interfaces.fracture import FractureModel
 from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
@@ -34,6 +34,7 @@ __all__ = [
     "FrameSites",
     "Here",
     "Lattice",
+    "LeaderRows",
     "Moment",
     "Nearness",
     "NeighbourMetric",

@@ -5,14 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.arithmetic import Vector
-from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.remembered import Bonds
+from pbdkit.interfaces.rule import Stiffness
 
 Floats = NDArray[np.floating[Any]]
 
@@ -31,6 +32,13 @@ class Variable:
     units: str
     dtype: str = "f8"
     attributes: dict[str, Any] = field(default_factory=dict)
+
+
+class LeaderRows(NamedTuple):
+    """The rows of a leader group's particles, and whether it leads during this step."""
+
+    rows: NDArray[np.intp]
+    leads: bool
 
 
 class Moment(ABC):
@@ -81,6 +89,39 @@ class Moment(ABC):
         """
 
     @abstractmethod
+    def displacement_gradient(self) -> Floats:
+        """H = ∂u/∂X at every body particle, (particle, component of u, axis); F = 1 + H.
+
+        The mean over the cells that meet there, by the share of each that belongs to the body,
+        carried on from the middle of those cells to the particle. Cells with a broken bond between
+        corners do not count. Zero at frame points and where there is no cell.
+        """
+
+    @abstractmethod
+    def stiffness(self) -> Stiffness:
+        """The material that the rule is calibrated to."""
+
+    @abstractmethod
+    def forces(self) -> Floats:
+        """The forces of the neighbours on every body particle, leaders too, over Young's modulus
+        and thickness, (particle, axis), lattice units; zero at frame points. Of broken bonds they
+        are what the rule sees."""
+
+    @abstractmethod
+    def energy(self) -> float:
+        """The strain energy over Young's modulus and thickness, lattice units squared: ½ uᵀK u,
+        which is -½ Σ u·force, or that of the rule's own bonds where it is not linear."""
+
+    @abstractmethod
+    def leader_groups(self) -> tuple[LeaderRows, ...]:
+        """The leader groups in the order of the experiment."""
+
+    @abstractmethod
+    def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
+        """The row of the body particle that is nearest to each point at rest, the lowest number on
+        ties."""
+
+    @abstractmethod
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
@@ -116,6 +157,10 @@ class Diagnostic(Component):
     uses_cells: ClassVar[bool] = False
     """Whether it makes no sense without cells (`Moment.over_cells`); a body that has none, a single
     row for instance, is then refused."""
+    uses_material: ClassVar[bool] = False
+    """Whether it asks for `Moment.stiffness`; rules that are not calibrated are then refused."""
+    uses_forces: ClassVar[bool] = False
+    """Whether it asks for `Moment.forces` or `Moment.energy`; the same are refused."""
     every_step: ClassVar[bool] = False
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
     at_end: ClassVar[bool] = False
@@ -133,6 +178,11 @@ class Diagnostic(Component):
 
     def check(self, particles: int) -> None:
         """Raise ExperimentError where it does not go with a scene of so many particles."""
+        return
+
+    def check_leaders(self, groups: int) -> None:
+        """Raise ExperimentError where it does not go with so many leader groups. A variable can
+        have a dimension `leader_group`, an entry a group."""
         return
 
     @abstractmethod

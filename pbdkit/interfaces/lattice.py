@@ -100,14 +100,16 @@ class Cell:
         # vectors all pairs would be too many.
         m_max, half = math.ceil(spread * math.hypot(*b) / area), spread / math.hypot(*b)
         tilt = (a.x * b.x + a.y * b.y) / (b.x * b.x + b.y * b.y)
-        found = [
-            self.offset(source, target, (m, n))
-            for m in range(-m_max, m_max + 1)
-            for n in range(math.floor(-m * tilt - half), math.ceil(-m * tilt + half) + 1)
-            for target in range(len(self.sites))
-        ]
-        inside = [o for o in found if o.site != (0, 0) and o.length <= radius]
-        return sorted(inside, key=lambda o: (o.length, o.site))
+        here = self.sites[source].at
+        steps = [(t, s.at.x - here.x, s.at.y - here.y) for t, s in enumerate(self.sites)]
+        found = []
+        for m in range(-m_max, m_max + 1):
+            for n in range(math.floor(-m * tilt - half), math.ceil(-m * tilt + half) + 1):
+                x, y = m * a.x + n * b.x, m * a.y + n * b.y
+                near = [t for t, dx, dy in steps if math.hypot(dx + x, dy + y) <= radius]
+                found += [self.offset(source, target, (m, n)) for target in near]
+        others = [offset for offset in found if offset.site != (0, 0)]
+        return sorted(others, key=lambda o: (o.length, o.site))
 
 
 class Lattice(Component):

@@ -147,3 +147,10 @@ class FollowerRule(Component):
     def draws(self) -> bool:
         """Whether particles differ from the start."""
         return is_own(self, FollowerRule, "draw")
+
+    @staticmethod
+    def energy(d: Vector, r: Vector, w: Any, p: Any) -> Any:
+        """The half of a bond's strain energy that falls to this end, over Young's modulus and
+        thickness, elementwise, for calibrated rules that are not linear. A rule that does not write
+        it is taken as linear, with the energy -½ Σ u·force."""
+        raise NotImplementedError("the rule has no energy of its own")

@@ -108,6 +108,12 @@ def step_column() -> Column:
     return Column("step", ("step",), "i8", When.STEP, _described("step", "step"), True)
 
 
+def leader_column() -> Column:
+    """The coordinate of what is measured of each leader group."""
+    meaning = "leader group, by its place among the experiment's leaders, from 0"
+    return Column("leader_group", ("leader_group",), "i8", When.START, _described(meaning), True)
+
+
 def own_coordinate(name: str, dtype: str) -> Column:
     """The coordinate of a dimension that a diagnostic brings along."""
     return Column(name, (name,), dtype, When.START, _described(name), True)

@@ -3,63 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Bonds, Moment, Slot, Vector, length
+from pbdkit.experiment.leaders import Selection
+from pbdkit.interfaces import Bonds, LeaderRows, Moment, Pair, Slot, Stiffness, Vector, length
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.naming import did_you_mean
-from pbdkit.scene.leading import kinds_at
+from pbdkit.registry.blame import blaming
+from pbdkit.results.gradient import displacement_gradient
+from pbdkit.results.tables import Tables
+from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
-from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.remembering import describe_bonds
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import difference, presence, sum_over_slots
-
-
-class Tables:
-    """What every moment of a scene shares: the reference, and who is present around whom."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self.raster = scene.raster
-
-    def add_reference(self, u: Floats) -> Floats:
-        """X + u, (particle, axis), in place; X is kept where it is wanted more than twice."""
-        experiment = self.scene.experiment
-        if experiment.recording.count(experiment.steps) > 2:
-            u += self.reference
-            return u
-        for rows in self.raster.chunks():
-            u[rows[0] : rows[-1] + 1] += self.raster.reference(rows)
-        return u
-
-    @cached_property
-    def reference(self) -> Floats:
-        """X, (particle, axis)."""
-        return self.raster.reference()
-
-    @cached_property
-    def fracturing(self) -> Fracturing | None:
-        """The planes of bonds, where bonds can break."""
-        return Fracturing(self.scene) if self.scene.has_fracture else None
-
-    @cached_property
-    def blocks(self) -> list[tuple[Any, ...]]:
-        """(block, slots, presence) of the body's particles of each sublattice."""
-        slots = self.scene.neighbourhood.slots
-        blocks = [self.raster.body_block(s) for s in range(self.raster.shape[0])]
-        return [
-            (b, slots[b.sublattice], presence(self.raster, b, slots[b.sublattice]))
-            for b in blocks
-            if b
-        ]
+from pbdkit.stepping.sums import difference, sum_over_slots
 
 
 class StateMoment(Moment):
@@ -182,6 +146,58 @@ class StateMoment(Moment):
             values = function(self.corners(patch), patch.cell.rest)
             found.append(np.broadcast_to(values, counted.shape)[counted])
         return np.concatenate(found)
+
+    def stiffness(self) -> Stiffness:
+        """The rule's."""
+        stiffness = self._tables.scene.experiment.rule.stiffness()
+        assert stiffness is not None, "the scene refuses such rules"
+        return stiffness
+
+    def displacement_gradient(self) -> Floats:
+        """Once a moment, whoever asks."""
+        return self._gradient
+
+    @cached_property
+    def _gradient(self) -> Floats:
+        whole = (
+            (patch, share * self._intact(patch) if self._state.broken_step is not None else share)
+            for patch, share in self._tables.shares
+        )
+        planes = displacement_gradient(self._state.u.astype(float, copy=False), whole)
+        return self._tables.raster.table(planes).reshape(-1, 2, 2)
+
+    def forces(self) -> Floats:
+        """Once a moment, whoever asks."""
+        return self._forces
+
+    @cached_property
+    def _forces(self) -> Floats:
+        u = self._state.u.astype(float, copy=False)
+        with self._blaming_rule():
+            forces = self._tables.followers.forces(u, self._state)
+        return self._tables.raster.table(forces)
+
+    def energy(self) -> float:
+        """The rule's."""
+        u = self._state.u.astype(float, copy=False)
+        with self._blaming_rule():
+            return self._tables.followers.energy(u, self._state)
+
+    def _blaming_rule(self) -> AbstractContextManager[None]:
+        rule = self._tables.scene.experiment.rule
+        return blaming(rule, f"when asked for forces at step {self.step}", "rule")
+
+    def leader_groups(self) -> tuple[LeaderRows, ...]:
+        """At time 0 those of step 1 lead."""
+        step = max(self.step, 1)
+        return tuple(
+            LeaderRows(each.rows, each.group.leads(step)) for each in self._tables.scene.leading
+        )
+
+    def nearest(self, points: tuple[Pair, ...]) -> Indices:
+        """As leaders are selected."""
+        rows = [select(self._tables.raster, Selection(nearest=(point,)), ()) for point in points]
+        return np.concatenate(rows)
 
     def patches(self, *, intact_only: bool = False) -> Iterator[tuple[Patch, NDArray[np.bool_]]]:
         """The cells of the body, and which of them count."""

@@ -20,8 +20,9 @@ from pbdkit.results import layout
 from pbdkit.results.inversion import inside_out
 from pbdkit.results.layout import Column
 from pbdkit.results.measuring import measured_at_end, refuse_unfit, refuse_unknown
-from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.moment import StateMoment
 from pbdkit.results.remembered import RememberedColumns
+from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -75,6 +76,8 @@ class Recorder:
         self._recorded = [d for d in diagnostics if not (d.every_step or d.at_end)]
         self._stepped = [d for d in diagnostics if d.every_step]
         self._last = [d for d in diagnostics if d.at_end]
+        wanted = {dim for d in diagnostics for v in d.variables() for dim in v.dims}
+        self._shows_leaders = "leader_group" in wanted
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
@@ -83,6 +86,8 @@ class Recorder:
         sizes = {"particle": self._scene.raster.count, "axis": 2, "index": 2}
         if self._scene.shows_bonds:
             sizes |= {"bond": len(self._scene.bonds.ends), "end": 2}
+        if self._shows_leaders:
+            sizes["leader_group"] = len(self._scene.leading)
         for diagnostic in experiment.diagnostics:
             sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
         self._shapes = {c.name: tuple(sizes[d] for d in c.dims[1:]) for c in columns if c.grows}
@@ -105,6 +110,8 @@ class Recorder:
         }
         if scene.shows_bonds:
             known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
+        if self._shows_leaders:
+            known["leader_group"] = lambda: np.arange(len(scene.leading))
         for diagnostic in scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 known[name] = partial(np.asarray, values)
@@ -177,6 +184,8 @@ class Recorder:
         columns += self._remembered.checked({c.name for c in columns})
         if self._stepped:
             columns.append(layout.step_column())
+        if self._shows_leaders:
+            columns.append(layout.leader_column())
         for diagnostic in self._scene.experiment.diagnostics:
             for name, values in diagnostic.coordinates().items():
                 columns.append(layout.own_coordinate(name, values.dtype.str[1:]))
@@ -198,7 +207,8 @@ class Recorder:
     def _measured(self, diagnostics: list[Diagnostic], moment: StateMoment) -> Values:
         values: Values = {}
         for diagnostic in diagnostics:
-            with blaming(diagnostic, f"at step {moment.step}"):
+            place = self._scene.experiment.diagnostics.index(diagnostic)
+            with blaming(diagnostic, f"at step {moment.step}", "diagnostics", place):
                 measured = diagnostic.measure(moment)
                 for variable, value in zip(diagnostic.variables(), measured, strict=True):
                     refuse_unfit(variable, value, self._shapes[variable.name], moment.step)

@@ -23,6 +23,7 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
     """What a dataset holds; without `installed`, of the built-in diagnostics alone."""
     base = layout.base_columns()
     optional = [*layout.bond_columns(), *layout.broken_columns(), layout.step_column()]
+    optional.append(layout.leader_column())
     for diagnostic in registry.components(Diagnostic, installed=installed).values():
         optional += _columns_of(diagnostic)
     columns = base + optional

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -22,6 +23,8 @@ Floats = NDArray[np.float64]
 
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
+CELLS_AT_ONCE = 512
+"""Cut cells that are looked at together: what that takes does not grow with the body."""
 SMALLEST = 0.02
 """Cells with a smaller share than this are left out: corners that hang on a sliver of the body move
 as little else does, and say little about it."""
@@ -103,16 +106,20 @@ class _Cutter:
         ends = np.array(self.shape) - high
         near = self._sublattice[-low[0] : ends[0], -low[1] : ends[1]] == sublattice
         i, j = (n - lowest for n, lowest in zip(np.nonzero(near), low, strict=True))
-        at = [(i + m, j + n) for m, n in steps]
-        distance = np.array([self._distance[there] for there in at])
-        share = (distance <= 0).all(axis=0).astype(float)
+        share, nearest = np.ones(len(i)), np.full(len(i), np.inf)
+        for m, n in steps:
+            distance = self._distance[i + m, j + n]
+            share[distance > 0.0] = 0.0
+            nearest = np.minimum(nearest, np.abs(distance))
         if not self._of_sites:
-            x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
-            reach = np.hypot(x - x[0], y - y[0]).max()
-            cut = np.abs(distance).min(axis=0) <= reach
-            share[cut] = self._cut_shares(x[:, cut], y[:, cut])
-        some = share > SMALLEST
-        return i[some], j[some], share[some]
+            reach = max(0.0 if slot is None else math.hypot(*slot.rest) for slot in corners)
+            cut = np.flatnonzero(nearest <= reach)
+            for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
+                at = [(i[some] + m, j[some] + n) for m, n in steps]
+                x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
+                share[some] = self._cut_shares(x, y)
+        counted = share > SMALLEST
+        return i[counted], j[counted], share[counted]
 
     def _cut_shares(self, x: Floats, y: Floats) -> Floats:
         """The share inside of cells with corners (corner, cell): the mean over its triangles, cut

@@ -29,7 +29,7 @@ class MeshCell:
     """
 
     source: int
-    corners: tuple[Offset, ...]
+    corners: tuple[Offset | Slot, ...]
 
     @cached_property
     def rest(self) -> tuple[Vector, ...]:
@@ -91,6 +91,11 @@ def patches(raster: Raster, cells: tuple[MeshCell, ...]) -> Iterator[Patch]:
             corners = tuple(part.seen_through(corner) for corner in cell.corners)
             inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
             yield Patch(cell, corners, np.logical_and.reduce(inside))
+
+
+def body_cells(raster: Raster) -> tuple[Patch, ...]:
+    """The places with cells whose corners are all of the body."""
+    return tuple(p for p in patches(raster, lattice_cells(raster.lattice.cell())) if p.whole.any())
 
 
 def _within(raster: Raster, cell: MeshCell) -> Block | None:

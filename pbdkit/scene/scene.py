@@ -18,11 +18,11 @@ from pbdkit.scene.cutting import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
-from pbdkit.scene.mesh import Patch, lattice_cells, patches
+from pbdkit.scene.measuring import check_diagnostics
+from pbdkit.scene.mesh import Patch, body_cells
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
-from pbdkit.scene.remembering import remembered_names
 from pbdkit.scene.sizes import refuse_too_large
 
 FLAT = 0.05
@@ -72,7 +72,7 @@ class Scene:
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
         """The cells of the body."""
-        return _body_cells(self.raster)
+        return body_cells(self.raster)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -103,7 +103,7 @@ def _build(experiment: Experiment) -> Scene:
         body, first = fill(experiment.body, experiment.lattice)
     warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
-    _check_diagnostics(experiment, raster)
+    warnings += check_diagnostics(experiment, raster)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
@@ -132,6 +132,7 @@ def _inner(scene: Scene) -> Scene | None:
         (scene.frame, "frame", "{type: natural}, which has no points"),
         (scene.has_fracture, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
+        (rule.particle_state() or inner.particle_state(), "rule", "one that remembers nothing"),
     ):
         if unfit:
             raise ExperimentError(
@@ -141,7 +142,8 @@ def _inner(scene: Scene) -> Scene | None:
             )
     experiment = experiment.model_copy(update={"rule": inner})
     constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    return replace(scene, experiment=experiment, constants=constants)
+    scene = replace(scene, experiment=experiment, constants=constants)
+    return replace(scene, inner=_inner(scene))
 
 
 def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:
@@ -200,25 +202,3 @@ def _edge_effects(experiment: Experiment) -> list[str]:
         "(copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); take "
         "{type: natural} or {type: traction-free}"
     ]
-
-
-def _body_cells(raster: Raster) -> tuple[Patch, ...]:
-    return tuple(p for p in patches(raster, lattice_cells(raster.lattice.cell())) if p.whole.any())
-
-
-def _check_diagnostics(experiment: Experiment, raster: Raster) -> None:
-    taken = remembered_names(experiment)
-    for n, diagnostic in enumerate(experiment.diagnostics):
-        with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
-            diagnostic.check(raster.count)
-            diagnostic.coordinates()
-            if diagnostic.uses_cells and not _body_cells(raster):
-                raise ExperimentError(
-                    f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
-                    "belong to the body; make it wider, or leave the diagnostic out"
-                )
-            for variable in diagnostic.variables():
-                if variable.name in taken:
-                    other = f"{taken[variable.name]} does too"
-                    raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
-                taken[variable.name] = f"diagnostics.{n}"

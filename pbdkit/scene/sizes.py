@@ -21,6 +21,9 @@ WORKSPACE_BYTES = 100
 BOND_BYTES = 74
 """Per bond, the table of bonds and the making of it (measured)."""
 
+CELL_BYTES = 60
+"""Per particle, the shares of the cells and the making of them (measured)."""
+
 
 @dataclass(frozen=True)
 class Sizes:
@@ -55,6 +58,7 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
         + 2 * 4
         + experiment.rule.uses_reference * 16
         + experiment.shows_bonds * planes * BOND_BYTES
+        + experiment.frame.weighs_cells * CELL_BYTES
     )
     memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
     return Sizes(particles, memory, _output(experiment, particles, planes))

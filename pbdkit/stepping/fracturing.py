@@ -16,7 +16,7 @@ from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.remembering import changing, renew, shown
 from pbdkit.stepping.state import State
-from pbdkit.stepping.sums import difference
+from pbdkit.stepping.sums import BLOCK_CELLS, difference
 
 Steps = NDArray[np.int32]
 Home = tuple[int, slice, slice]
@@ -39,19 +39,21 @@ class Fracturing:
         frame_too = self._model.breaks_frame_bonds()
         for n, plane in enumerate(scene.neighbourhood.planes):
             self._plane_of |= {plane.slot: (n, True), plane.opposite: (n, False)}
-            if block := plane_block(scene.raster, plane):
-                where_ = bonds_in(scene.raster, block, plane, frame_too)
-                self._breakable.append((n, plane.slot, block, where_))
+            block = plane_block(scene.raster, plane)
+            for part in block.rows(BLOCK_CELLS) if block else ():
+                where_ = bonds_in(scene.raster, part, plane, frame_too)
+                self._breakable.append((n, plane.slot, part, where_))
 
     def break_bonds(self, m: NDArray[Any], state: State, step: int) -> None:
         """Renews, in place, what is remembered of the bonds in the intermediate configuration m,
         and marks those that break, with their length."""
         assert state.broken_step is not None
         assert state.broken_length is not None
-        for place, v, breaks in self._judged(m, state, f"at step {step}"):
+        for place, d, r, breaks in self._judged(m, state, f"at step {step}"):
             if breaks.any():
                 state.broken_step[place][breaks] = step
-                state.broken_length[place][breaks] = length(v)[breaks]
+                lengths = length(Vector(r.x + d.x[breaks], r.y + d.y[breaks]))
+                state.broken_length[place][breaks] = lengths
 
     def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
         """Whether any bond breaks at u, or at a configuration in which one of its ends is less than
@@ -70,9 +72,9 @@ class Fracturing:
 
     def _judged(
         self, m: NDArray[Any], state: State, when: str, nudge: Vector | None = None
-    ) -> Iterator[tuple[Home, Vector, NDArray[np.bool_]]]:
-        """For each slot where its bonds are kept, the bonds x_k - x_j, and which break. What is
-        remembered is renewed in place; not where differences are nudged, all alike, to see."""
+    ) -> Iterator[tuple[Home, Vector, Vector, NDArray[np.bool_]]]:
+        """Part by part of each slot's bonds where they are kept, their d and r, and which break.
+        What is remembered is renewed in place; not where d is nudged, all alike, to see."""
         assert state.broken_step is not None
         for n, slot, block, breakable in self._breakable:
             _, rows, columns = block.slices()
@@ -88,7 +90,7 @@ class Fracturing:
                     fresh = self._model.update(d, r, c, self._parameters)
                     renew(changing(self._numbers, own), fresh, intact)
                 breaks = self._model.breaks(d, r, c, self._parameters)
-            yield (n, rows, columns), Vector(r.x + d.x, r.y + d.y), intact & breaks
+            yield (n, rows, columns), d, r, intact & breaks
 
     def seen(self, d: Vector, u: Vector, block: Block, slot: Slot, state: State) -> Vector:
         """The difference that the rule sees: softened, or that of the fictitious point where the

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pbdkit.experiment.solvers import Equilibrium, Stepping
-from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.interfaces import FollowerRule, Here, Slot, Vector
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.remembering import particle_numbers
@@ -17,10 +18,15 @@ from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.remembering import changing, renew, shown
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import Present, difference, planes, presence, read_only, sum_over_slots
-
-BLOCK_CELLS = 16384
-"""Places a block: small enough for its temporaries to stay in the cache."""
+from pbdkit.stepping.sums import (
+    BLOCK_CELLS,
+    Present,
+    difference,
+    planes,
+    presence,
+    read_only,
+    sum_over_slots,
+)
 
 
 @dataclass(frozen=True)
@@ -67,9 +73,9 @@ class SlotFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
-        seen = self._inner.moves(m, state) if self._inner else m
+        seen = self._seen(m, state)
         for part in self._parts:
-            total, here = self._sums(part, seen, state)
+            total, here = self._sums(part, seen, state), self._here(part, seen, state)
             move = self._rule.apply(total, here, self._parameters)
             self._place(part, move, m, new)
             if self._rule.remembers():
@@ -79,12 +85,39 @@ class SlotFollowers(Followers):
 
     def moves(self, m: Floats, state: State) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        seen, out = self._inner.moves(m, state) if self._inner else m, np.zeros_like(m)
+        seen, out = self._seen(m, state), np.zeros_like(m)
         for part in self._parts:
-            moves = self._rule.apply(*self._sums(part, seen, state), self._parameters)
-            for move, plane in zip(moves, planes(out, part.block), strict=True):
-                plane[...] = move if part.movable is None else np.where(part.movable, move, 0.0)
+            total, here = self._sums(part, seen, state), self._here(part, seen, state)
+            _write(self._rule.apply(total, here, self._parameters), part, out)
         return out
+
+    def forces(self, m: Floats, state: State) -> Floats:
+        """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
+        zero where there is no neighbour."""
+        seen, out = self._seen(m, state), np.zeros_like(m)
+        for part in self._parts:
+            total, here = self._sums(part, seen, state), self._here(part, seen, state)
+            _write(self._rule.force(total, here, self._parameters), part, out)
+        return out
+
+    def energy(self, m: Floats, state: State) -> float:
+        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
+        if self._rule.energy is FollowerRule.energy:
+            return self._work(m, self.forces(m, state))
+        seen, out = self._seen(m, state), np.zeros_like(m[:1])
+        for part in self._parts:
+            (energy,) = self._sums(part, seen, state, self._energy_of_a_bond)
+            _write((energy,), part, out)
+        return float(out.sum())
+
+    def _work(self, u: Floats, forces: Floats) -> float:
+        """-½ Σ u·force over the body. Where the forces have no resultant, u counts from its mean,
+        so that no digit depends on where the body has gone."""
+        place = self._scene.raster.place_of(self._scene.raster.body_rows)
+        u, forces = u.reshape(2, -1)[:, place], forces.reshape(2, -1)[:, place]
+        if self._scene.frame is None and self._fracturing is None:
+            u = u - u.mean(axis=1, keepdims=True)
+        return -0.5 * float((u * forces).sum())
 
     def _cut(self, sublattice: int) -> list[_Part]:
         whole = self._scene.raster.body_block(sublattice)
@@ -104,19 +137,36 @@ class SlotFollowers(Followers):
             None if movable.all() else movable,
         )
 
-    def _sums(self, part: _Part, m: Floats, state: State) -> tuple[tuple[Any, ...], Here]:
-        """What `apply` is given on a block."""
+    def _seen(self, m: Floats, state: State) -> Floats:
+        """What the rule works on: displacements, or the moves of its inner rule."""
+        return self._inner.moves(m, state) if self._inner else m
+
+    def _here(self, part: _Part, m: Floats, state: State) -> Here:
+        own = [value[part.block.slices()] for value in state.particle_values]
+        return Here(read_only(planes(m, part.block)), part.X, shown(own))
+
+    def _energy_of_a_bond(self, d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any]:
+        return (self._rule.energy(d, r, w, p),)
+
+    def _sums(
+        self,
+        part: _Part,
+        m: Floats,
+        state: State,
+        function: Callable[[Vector, Vector, Any, Any], tuple[Any, ...]] | None = None,
+    ) -> tuple[Any, ...]:
+        """Σ function(d, r, w, p) over the neighbours, or what stands in for them: `gather`, where
+        it is no other."""
+        function = function or self._rule.gather
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
             d = difference(m, part.block, slot)
             if self._fracturing:
                 d = self._fracturing.seen(d, u, part.block, slot, state)
-            return self._rule.gather(d, slot.rest, part.weights[slot], self._parameters)
+            return function(d, slot.rest, part.weights[slot], self._parameters)
 
-        total = sum_over_slots(part.slots, part.present, contribution)
-        own = [value[part.block.slices()] for value in state.particle_values]
-        return total, Here(u, part.X, shown(own))
+        return sum_over_slots(part.slots, part.present, contribution)
 
     def _place(self, part: _Part, move: tuple[Any, Any], m: Floats, new: Floats) -> None:
         """Writes where the particles of a block go."""
@@ -124,3 +174,10 @@ class SlotFollowers(Followers):
         for here, step, plane in zip(u, move, out, strict=True):
             moved = target(here, step, plane, self._solver)
             plane[...] = moved if part.movable is None else np.where(part.movable, moved, here)
+
+
+def _write(values: tuple[Any, ...], part: _Part, out: Floats) -> None:
+    """The values of the particles that have neighbours, a plane each."""
+    _, rows, columns = part.block.slices()
+    for value, plane in zip(values, out[:, part.block.sublattice, rows, columns], strict=True):
+        plane[...] = value if part.movable is None else np.where(part.movable, value, 0.0)

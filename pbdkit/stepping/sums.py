@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Slot, Vector
 from pbdkit.scene.raster import EMPTY, Block, Raster
 
+BLOCK_CELLS = 16384
+"""Places a block: small enough for its temporaries to stay in the cache."""
 Present = NDArray[np.bool_] | None
 """Where a neighbour is present on a block; None where it is present everywhere."""
 Contribution = Callable[[Slot], tuple[Any, ...]]

@@ -7,7 +7,14 @@ from itertools import product
 from typing import Any
 
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import INTERFACES, Component, FramePolicy, Lattice, NeighbourMetric
+from pbdkit.interfaces import (
+    INTERFACES,
+    Component,
+    Diagnostic,
+    FramePolicy,
+    Lattice,
+    NeighbourMetric,
+)
 from pbdkit.registry.checking import interface_of
 
 LATTICES: dict[str, dict[str, Any]] = {
@@ -28,6 +35,11 @@ MEAN, NATURAL = {"type": "mean"}, {"type": "natural"}
 ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
 """The rule with which frames are tried whose edges are free of stress."""
 BODY = {"type": "grid", "columns": 6, "rows": 5}
+PULLED = [
+    {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+    {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [0.3, 0.1]}},
+]
+"""The leaders of the scenes that diagnostics measure."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
@@ -43,6 +55,7 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     given = dict(parts) | {field: component}
     if field == "diagnostics":
         given |= {field: [component], "fracture": parts.get("fracture", TEARING)}
+        given |= {"leaders": PULLED}
     choices = {
         "lattice": list(LATTICES.values()),
         # The fracture model that diagnostics are tried with has one threshold, for one shell.
@@ -64,7 +77,10 @@ def alternatives(part: Any) -> list[Any]:
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:
-    if isinstance(component, FramePolicy) and component.edges_are_free:
+    wants_material = isinstance(component, Diagnostic) and (
+        component.uses_material or component.uses_forces
+    )
+    if wants_material or (isinstance(component, FramePolicy) and component.edges_are_free):
         return [ELASTIC]
     return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 

@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Bonds, Cell, FollowerRule, FrameSites, Moment, Vector
+from pbdkit.interfaces import (
+    Bonds,
+    Cell,
+    FollowerRule,
+    FrameSites,
+    LeaderRows,
+    Moment,
+    Pair,
+    Stiffness,
+    Vector,
+)
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
@@ -105,6 +115,31 @@ class SeenMoment(Moment):
     def broken_bonds(self) -> int:
         """That of the moment itself."""
         return self._moment.broken_bonds()
+
+    def displacement_gradient(self) -> NDArray[Any]:
+        """That of the moment itself, in this order."""
+        return self._moment.displacement_gradient()[self._order]
+
+    def stiffness(self) -> Stiffness:
+        """That of the moment itself."""
+        return self._moment.stiffness()
+
+    def forces(self) -> NDArray[Any]:
+        """Those of the moment itself, in this order."""
+        return self._moment.forces()[self._order]
+
+    def energy(self) -> float:
+        """That of the moment itself."""
+        return self._moment.energy()
+
+    def leader_groups(self) -> tuple[LeaderRows, ...]:
+        """Where their particles now stand."""
+        place = np.argsort(self._order)
+        return tuple(LeaderRows(place[g.rows], g.leads) for g in self._moment.leader_groups())
+
+    def nearest(self, points: tuple[Pair, ...]) -> Indices:
+        """Where the nearest particles now stand."""
+        return np.argsort(self._order)[self._moment.nearest(points)]
 
     def bonds(self) -> Bonds:
         """That of the moment itself: bonds name their ends by number, and are in no order of

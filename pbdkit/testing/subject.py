@@ -13,7 +13,8 @@ from pbdkit.registry.checking import interface_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.testing.examples import name_of
 from pbdkit.testing.property import PropertyError
-from pbdkit.testing.questions import Question, questions_of
+from pbdkit.testing.question import Question
+from pbdkit.testing.questions import questions_of
 from pbdkit.testing.scenes import experiments_with
 
 

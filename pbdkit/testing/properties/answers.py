@@ -11,13 +11,20 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
 )
+from pbdkit.testing.calls import applied, differences, gathered, here, summed
 from pbdkit.testing.property import PropertyError, asked_of
-from pbdkit.testing.questions import Arrays, Question, applied, differences, gathered, own, summed
+from pbdkit.testing.question import Arrays, Question
 from pbdkit.testing.remembering import changed, remembered
 from pbdkit.testing.subject import Subject
 
 ALL = tuple(INTERFACES.values())
-NEEDS = ("has-a-sound-cell", "is-mutual", "takes-part")
+NEEDS = (
+    "has-a-sound-cell",
+    "is-mutual",
+    "takes-part",
+    "declares-what-it-remembers",
+    "draws-what-it-remembers",
+)
 REPEATABLE = (*NEEDS, "changes-no-input", "remembers-nothing", "answers-the-same")
 """What must hold before any comparison of two answers means something."""
 
@@ -80,7 +87,8 @@ def answers_the_same(subject: Subject) -> None:
         if names := differing(question.answer(), question.answer()):
             raise PropertyError(
                 f"`{question.what}` answers the same question otherwise the second time "
-                f"({_listed(names)}): it draws numbers at random, or looks at a clock"
+                f"({_listed(names)}): it draws numbers at random that nobody gave "
+                "it, or looks at a clock"
             )
 
 
@@ -104,7 +112,7 @@ def _meeting(subject: Subject) -> list[Question]:
     if not isinstance(rule, FollowerRule):
         return []
     scene = subject.scene()
-    arrays = differences(scene, 0) | own(scene, 0)
+    arrays = differences(scene, 0) | here(scene, 0)
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         for c, r in zip("xy", slot.rest, strict=True):
             arrays[f"d{k}.{c}"] = np.full_like(arrays[f"d{k}.{c}"], -r)

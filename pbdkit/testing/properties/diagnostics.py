@@ -36,11 +36,18 @@ def measures_what_it_declares(subject: Subject) -> None:
     """`measure` returns one array for each of its variables, shaped as their `dims` say, of numbers
     that go into the declared dtype without loss of kind."""
     diagnostic, scene = _diagnostic(subject), subject.scene()
-    sizes = {"particle": scene.raster.count, "axis": 2}
+    sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     variables, measured = diagnostic.variables(), diagnostic.measure(moment_of(scene, 0))
     if len(variables) != len(measured):
         raise PropertyError(f"{len(measured)} arrays for {len(variables)} variables")
+    if diagnostic.own_dimension:
+        if not diagnostic.at_end:
+            raise PropertyError(
+                f"its `own_dimension` '{diagnostic.own_dimension}' has a length only where it "
+                "declares `at_end` too"
+            )
+        sizes = _with_its_own(diagnostic, measured, sizes)
     for variable, value in zip(variables, measured, strict=True):
         unknown = [dim for dim in variable.dims if dim not in sizes]
         if unknown:
@@ -49,6 +56,18 @@ def measures_what_it_declares(subject: Subject) -> None:
                 "give"
             )
         _refuse_unfit(variable, np.asarray(value), tuple(sizes[dim] for dim in variable.dims))
+
+
+def _with_its_own(
+    diagnostic: Diagnostic, measured: tuple[Any, ...], sizes: dict[str, int]
+) -> dict[str, int]:
+    """The sizes with that of the diagnostic's own dimension, as the first variable that has it
+    gives it."""
+    name = diagnostic.own_dimension
+    for variable, value in zip(diagnostic.variables(), measured, strict=True):
+        if name in variable.dims and np.ndim(value) == len(variable.dims):
+            return {name: np.shape(value)[variable.dims.index(name)]} | sizes
+    return sizes
 
 
 def _refuse_unfit(variable: Variable, value: NDArray[Any], shape: tuple[int, ...]) -> None:

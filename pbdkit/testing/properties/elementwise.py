@@ -8,29 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import FollowerRule, FractureModel
+from pbdkit.testing.calls import applied, differences, gathered, here, summed
+from pbdkit.testing.numbers import SHAPE
 from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.property import PropertyError, asked_of
-from pbdkit.testing.questions import (
-    SHAPE,
-    Arrays,
-    applied,
-    differences,
-    gathered,
-    own,
-    summed,
-)
+from pbdkit.testing.question import Arrays, Question
 from pbdkit.testing.subject import Subject
 
 ROUNDING = 1e-12
 """Some thousand roundings: functions of numpy may differ in the last digit from place to place."""
-ORDERLY = (*REPEATABLE, "returns-a-value-a-particle")
+ORDERLY = (*REPEATABLE, "renews-what-it-remembers", "returns-a-value-a-particle")
 
 
 @asked_of(FollowerRule, FractureModel, needs=REPEATABLE)
 def returns_a_value_a_particle(subject: Subject) -> None:
     """Each component of an answer is one value a particle, or one number for all of them; a rule
     contributes as many from every neighbour, and `breaks` says yes or no."""
-    for question in subject.questions():
+    for question in _elementwise(subject):
         for name, value in question.answer().items():
             if value.shape not in ((), SHAPE):
                 raise PropertyError(
@@ -46,11 +40,14 @@ def returns_a_value_a_particle(subject: Subject) -> None:
             raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
 
 
-@asked_of(FollowerRule, FractureModel, needs=REPEATABLE)
+@asked_of(FollowerRule, FractureModel, needs=(*REPEATABLE, "renews-what-it-remembers"))
 def keeps_single_precision(subject: Subject) -> None:
     """Numbers of float32 get answers of float32: a run in single precision is one throughout."""
-    for question in subject.questions():
-        single = {name: value.astype(np.float32) for name, value in question.inputs.items()}
+    for question in _elementwise(subject):
+        single = {
+            name: value.astype(np.float32) if value.dtype.kind == "f" else value.copy()
+            for name, value in question.inputs.items()
+        }
         with np.errstate(all="ignore"):
             found = question.ask(single)
         for name, value in found.items():
@@ -67,7 +64,7 @@ def takes_particles_in_any_order(subject: Subject) -> None:
     """Particles in another order get the same answers in that order, and neighbours summed in the
     opposite order the same move, to rounding: numbering means nothing."""
     order = np.random.default_rng(0).permutation(int(np.prod(SHAPE)))
-    for question in subject.questions():
+    for question in _elementwise(subject):
         mixed = {name: _in_order(value, order) for name, value in question.inputs.items()}
         whole = question.answer()
         with np.errstate(all="ignore"):
@@ -85,7 +82,7 @@ def takes_particles_in_any_order(subject: Subject) -> None:
 
 def _refuse_an_order_of_slots(rule: FollowerRule, subject: Subject) -> None:
     scene = subject.scene()
-    arrays = differences(scene, 0) | own(scene, 0)
+    arrays = differences(scene, 0) | here(scene, 0)
     contributions = gathered(rule, scene, arrays)
     one = applied(rule, scene, summed(contributions), arrays)
     other = applied(rule, scene, summed(contributions[::-1]), arrays)
@@ -101,10 +98,10 @@ def _refuse_an_order_of_slots(rule: FollowerRule, subject: Subject) -> None:
 def is_local(subject: Subject) -> None:
     """A particle that is asked about alone, with plain numbers, gets the answer that it gets among
     the others: only itself and its neighbours count."""
-    for question in subject.questions():
+    for question in _elementwise(subject):
         whole = question.answer()
         for place in [(0, 0), (2, 1), (3, 2)]:
-            alone = {name: float(value[place]) for name, value in question.inputs.items()}
+            alone = {name: value[place].item() for name, value in question.inputs.items()}
             try:
                 with np.errstate(all="ignore"):
                     found = question.ask(alone)
@@ -124,6 +121,10 @@ def _compare_alone(what: str, found: Arrays, whole: Arrays, place: tuple[int, in
                 f"`{what}` gives a particle another answer alone than among others "
                 f"({name}: {value} and {among}): it is not elementwise"
             )
+
+
+def _elementwise(subject: Subject) -> list[Question]:
+    return [question for question in subject.questions() if question.elementwise]
 
 
 def _in_order(value: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:

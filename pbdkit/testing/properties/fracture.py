@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pbdkit.interfaces import FractureModel, Slot, Vector
+from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.testing.calls import breaking, differences, updated, vector
+from pbdkit.testing.numbers import SHAPE, own_of, remembered_of_bonds
 from pbdkit.testing.properties.answers import REPEATABLE
-from pbdkit.testing.property import PropertyError, asked_of
-from pbdkit.testing.questions import differences, vector
+from pbdkit.testing.properties.elementwise import ORDERLY
+from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
 from pbdkit.testing.subject import Subject
+
+CLOSE = 1e-9
+"""How near to its breaking strain a bond is tried, as a share of its length."""
 
 
 @asked_of(FractureModel, needs=REPEATABLE)
 def is_seen_alike_from_both_ends(subject: Subject) -> None:
-    """A bond breaks for both ends or for none: `breaks` answers the same for (-d, -r) as for
-    (d, r), and `constants` for a slot and its opposite; it is called for one end only."""
+    """A bond breaks for both ends or for none: `breaks` and `update` answer the same for (-d, -r)
+    as for (d, r), and `constants` for a slot and its opposite; they are called for one end only."""
     model, scene = _model(subject), subject.scene()
     for plane in scene.neighbourhood.planes:
         here, there = model.constants(plane.slot), model.constants(plane.opposite)
@@ -24,13 +32,16 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
                 f"`constants` are {here} for the slot {plane.slot.site} and {there} for its "
                 "opposite: take lengths and shells, not directions"
             )
+    own = own_of(remembered_of_bonds(scene, 0))
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=2.0), f"d{k}")
-        back = Vector(-d.x, -d.y), Vector(-slot.rest.x, -slot.rest.y)
-        if not np.array_equal(_breaks(model, scene, slot, d), _breaks(model, scene, slot, *back)):
-            raise PropertyError(
-                f"`breaks` answers otherwise for (-d, -r) than for (d, r) along {slot.site}"
-            )
+        back, r = Vector(-d.x, -d.y), Vector(-slot.rest.x, -slot.rest.y)
+        for what, ask in (("breaks", breaking), ("update", updated)):
+            one, other = ask(model, scene, slot, d, own), ask(model, scene, slot, back, own, r)
+            if not np.array_equal(np.asarray(one), np.asarray(other)):
+                raise PropertyError(
+                    f"`{what}` answers otherwise for (-d, -r) than for (d, r) along {slot.site}"
+                )
 
 
 @asked_of(FractureModel, needs=REPEATABLE)
@@ -40,17 +51,46 @@ def breaks_as_declared(subject: Subject) -> None:
     model, scene = _model(subject), subject.scene()
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=1e3), f"d{k}")
-        if not model.can_break and np.any(_breaks(model, scene, slot, d)):
+        if not model.can_break and np.any(breaking(model, scene, slot, d, ())):
             raise PropertyError("it declares `can_break = False`, and `breaks` says yes")
+
+
+@asked_of(FractureModel, needs=(*ORDERLY, "takes-particles-in-any-order", "is-local"))
+def breaks_beyond_its_strain(subject: Subject) -> None:
+    """Where it tells a `breaking_strain`, a bond that is drawn out along itself breaks a little
+    above it and, if it has not broken, not a little below: `pbdkit explain` tells users so."""
+    model, scene = _model(subject), subject.scene()
+    own, p = own_of(remembered_of_bonds(scene, 0)), scene.constants.fracture
+    for slot in scene.neighbourhood.slots[0]:
+        r, c = slot.rest, (*model.constants(slot), *own)
+        told = model.breaking_strain(r, c, p)
+        if told is None:
+            raise NotAskedError("it tells no `breaking_strain`")
+        limit = np.broadcast_to(told, SHAPE)
+        for side, expected in ((CLOSE, True), (-CLOSE, False)):
+            stretch = limit + side * (1.0 + np.abs(limit))
+            d = Vector(r.x * stretch, r.y * stretch)
+            now = _renewed(model, scene, slot, d, own)
+            wrong = np.broadcast_to(breaking(model, scene, slot, d, now), SHAPE) != expected
+            if wrong.any():
+                at = float(stretch[wrong][0])
+                raise PropertyError(
+                    f"`breaking_strain` and `breaks` disagree: at strain {at:.6g} along "
+                    f"{slot.site} the bond {'stays' if expected else 'breaks'}"
+                )
+
+
+def _renewed(
+    model: FractureModel, scene: Scene, slot: Slot, d: Vector, own: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """The numbers of bonds after an update."""
+    if not model.updates():
+        return own
+    new = iter(updated(model, scene, slot, d, own))
+    numbers = bond_numbers(scene.experiment)
+    return tuple(next(new) if n.changes else v for n, v in zip(numbers, own, strict=True))
 
 
 def _model(subject: Subject) -> FractureModel:
     assert isinstance(subject.component, FractureModel)
     return subject.component
-
-
-def _breaks(
-    model: FractureModel, scene: Scene, slot: Slot, d: Vector, r: Vector | None = None
-) -> np.ndarray:
-    c, p = model.constants(slot), scene.constants.fracture
-    return np.asarray(model.breaks(d, slot.rest if r is None else r, c, p))

@@ -18,7 +18,8 @@ from pbdkit.interfaces import (
     Lattice,
     NeighbourMetric,
 )
-from pbdkit.results.moment import StateMoment, Tables
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.engine import Engine
@@ -144,10 +145,15 @@ def continues_where_it_stopped(subject: Subject) -> None:
         zip(subject.scenes, scenes_with(anew, subject.parts), strict=True)
     ):
         start = displacements(scene, n, share=0.4)
+        _refuse_difference(initial_state(again), initial_state(scene), "a run made anew", scene)
         whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
-        saved = pickle.dumps(Stepper(scene).advance(state_with(scene, start), STEPS))
+        half = Stepper(scene).advance(state_with(scene, start), STEPS)
+        saved, kept = pickle.dumps(half), half.copy()
+        Stepper(scene).advance(half, STEPS)
         continued = Stepper(again).advance(pickle.loads(saved), STEPS)
         _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
+        copied = Stepper(again).advance(kept, STEPS)
+        _refuse_difference(copied, whole, f"a run continued from a copy of step {STEPS}", scene)
         if isinstance(component, Diagnostic) and isinstance(anew, Diagnostic):
             _compare_measured(component, scene, whole, anew, again, continued)
 

@@ -1,0 +1,171 @@
+"""What leaders must do to a body, and what it stores: reactions, strain energy, tensile tests."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from pbdkit.components.fields import Modulus, Positive
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import Diagnostic, Moment, Pair, Variable
+
+Floats = NDArray[np.floating[Any]]
+FORCE = "unit of youngs_modulus * unit of thickness * lattice unit"
+Thickness = Annotated[
+    float, Field(gt=0.0, description="Of the body, out of its plane.", examples=[2.0])
+]
+Group = Annotated[int, Field(ge=0)]
+TwoNumbers = Annotated[
+    tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)
+]
+TwoPoints = Annotated[tuple[Pair, Pair], Field(strict=False)]
+
+
+class StrainEnergy(Diagnostic):
+    """The strain energy of the body: ½ uᵀK u with the stiffness K that the rule is, or the energy
+    of the rule's own bonds where it is not linear ('springs').
+
+    Under a frame with points it is -½ Σ u·force, the work of the leaders in linear elasticity.
+    """
+
+    type: Literal["strain-energy"] = "strain-energy"
+    youngs_modulus: Modulus
+    thickness: Thickness = 1.0
+
+    uses_forces: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`strain_energy`."""
+        units = "unit of youngs_modulus * unit of thickness * lattice unit^2"
+        return (Variable("strain_energy", (), "strain energy", units),)
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """E t times the rule's."""
+        return (self.youngs_modulus * self.thickness * now.energy(),)
+
+
+class Reaction(Diagnostic):
+    """The resultant force that each leader group must exert; 0 while it does not lead.
+
+    Minus the forces of the neighbours on its particles; a particle of two groups counts half with
+    each. All groups together exert nothing under the natural frame. Frame points pull too: at the
+    corners of held edges that is no force of the body, and a warning says so.
+    """
+
+    type: Literal["reaction"] = "reaction"
+    youngs_modulus: Modulus
+    thickness: Thickness = 1.0
+
+    uses_forces: ClassVar[bool] = True
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`reaction`."""
+        name = "force that the leader group exerts"
+        return (Variable("reaction", ("leader_group", "axis"), name, FORCE),)
+
+    def check_leaders(self, groups: int) -> None:
+        """Refuses experiments without leaders."""
+        if groups == 0:
+            raise ExperimentError(f"'{self.type}' is of leader groups, and there is none")
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """E t times the sums."""
+        return (self.youngs_modulus * self.thickness * reactions(now),)
+
+
+class StressStrain(Diagnostic):
+    """The stress-strain curve of a tensile test along `axis`.
+
+    Nominal stress is the reaction of the leader group `group` (its place among the experiment's
+    leaders, from 0) along the axis over the initial cross-section, `width` times thickness, which
+    cancels. Nominal strain is the elongation of the gauge along the axis over its initial length;
+    the gauge lies between the body particles nearest to two `points`, or between two particles by
+    their `numbers`, or, where neither is given, between the mean places of `group` and `against`.
+    """
+
+    type: Literal["stress-strain"] = "stress-strain"
+    youngs_modulus: Modulus
+    width: Positive = Field(
+        description="Of the initial cross-section (lattice units).", examples=[2.5]
+    )
+    axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["x"])
+    group: Group = Field(1, description="The leader group that pulls, from 0.", examples=[1])
+    against: Group = Field(0, description="The group that it pulls away from.", examples=[0])
+    points: TwoPoints | None = Field(
+        None,
+        description="Ends of the gauge length; the nearest particles count.",
+        examples=[((0.0, 0.0), (1.0, 0.0))],
+    )
+    numbers: TwoNumbers | None = Field(
+        None, description="Ends of the gauge length by number.", examples=[(1, 30)]
+    )
+
+    uses_forces: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _one_gauge(self) -> StressStrain:
+        if self.points and self.numbers:
+            raise ValueError("give the gauge by points or by numbers, not by both")
+        return self
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`nominal_stress`, `nominal_strain`."""
+        return (
+            Variable("nominal_stress", (), "nominal stress", "unit of youngs_modulus"),
+            Variable("nominal_strain", (), "nominal strain", "1"),
+        )
+
+    def check(self, particles: int) -> None:
+        """Refuses numbers that no particle has."""
+        for n, number in enumerate(self.numbers or ()):
+            if number > particles:
+                raise ExperimentError(
+                    f"there is no particle {number}; they are numbered 1 to {particles}",
+                    ("numbers", n),
+                )
+
+    def check_leaders(self, groups: int) -> None:
+        """Refuses groups that are not there."""
+        by_leaders = not (self.points or self.numbers)
+        for name in ("group", "against") if by_leaders else ("group",):
+            if getattr(self, name) >= groups:
+                raise ExperimentError(
+                    f"there is no leader group {getattr(self, name)}; they are numbered from 0, "
+                    f"and there are {groups}",
+                    (name,),
+                )
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """Stress and strain."""
+        axis = "xy".index(self.axis)
+        start, end = self._ends(now)
+        first, last = (now.reference(rows)[:, axis].mean() for rows in (start, end))
+        if abs(last - first) <= 1e-9 * max(abs(first), abs(last)):
+            raise ExperimentError(
+                f"the gauge has no length along {self.axis}: both ends lie at {first:g}; give two "
+                "points apart"
+            )
+        u, v = (now.displacement(rows)[:, axis].mean() for rows in (start, end))
+        pulled = now.reference(now.leader_groups()[self.group].rows)[:, axis].mean()
+        outwards = np.sign(pulled - (first + last) / 2)
+        pull = outwards * reactions(now)[self.group, axis]
+        return self.youngs_modulus * pull / self.width, (v - u) / (last - first)
+
+    def _ends(self, now: Moment) -> tuple[Any, Any]:
+        """The rows at the start of the gauge and at its end."""
+        if self.points or self.numbers:
+            rows = now.nearest(self.points) if self.points else now.rows(self.numbers or ())
+            return rows[:1], rows[1:]
+        groups = now.leader_groups()
+        return groups[self.against].rows, groups[self.group].rows
+
+
+def reactions(now: Moment) -> Floats:
+    """What each leader group exerts over Young's modulus and thickness, (leader group, axis)."""
+    forces, groups = now.forces(), now.leader_groups()
+    leaders = [group.rows if group.leads else group.rows[:0] for group in groups]
+    times = np.bincount(np.concatenate(leaders), minlength=len(forces))
+    return np.stack([0.0 - (forces[rows] / times[rows, None]).sum(axis=0) for rows in leaders])

@@ -1,0 +1,62 @@
+"""Whether the diagnostics of an experiment go with its scene."""
+
+from __future__ import annotations
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Diagnostic
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.mesh import body_cells
+from pbdkit.scene.raster import FRAME, Raster
+from pbdkit.scene.remembering import remembered_names
+
+
+def check_diagnostics(experiment: Experiment, raster: Raster) -> list[str]:
+    """Raises ExperimentError for diagnostics that do not go with the scene or each other; returns
+    warnings about them."""
+    taken = remembered_names(experiment)
+    for n, diagnostic in enumerate(experiment.diagnostics):
+        with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
+            diagnostic.check(raster.count)
+            diagnostic.check_leaders(len(experiment.leaders))
+            diagnostic.coordinates()
+            if diagnostic.uses_cells and not body_cells(raster):
+                raise ExperimentError(
+                    f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
+                    "belong to the body; make it wider, or leave the diagnostic out"
+                )
+            if diagnostic.uses_material or diagnostic.uses_forces:
+                _refuse_without_material(diagnostic, experiment)
+            for variable in diagnostic.variables():
+                if variable.name in taken:
+                    other = f"{taken[variable.name]} does too"
+                    raise ExperimentError(f"adds the variable '{variable.name}'; {other}")
+                taken[variable.name] = f"diagnostics.{n}"
+    return _doubts(experiment, raster)
+
+
+def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
+    asking = [(n, d) for n, d in enumerate(experiment.diagnostics) if d.uses_forces]
+    if not asking or not (raster.table_kind == FRAME).any():
+        return []
+    return [
+        f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which at "
+        "the corners of held edges is no force of the body; there it converges slowly (a clamped "
+        "cantilever under 'traction-free' is 67 % off with 10 cells over its height and 24 % with "
+        "40; under 'natural' 1.6 % and .13 %); take frame: {type: natural}"
+        for n, diagnostic in asking
+    ]
+
+
+def _refuse_without_material(diagnostic: Diagnostic, experiment: Experiment) -> None:
+    rule = experiment.rule
+    if rule.stiffness() is None:
+        raise ExperimentError(
+            f"'{diagnostic.type}' needs a rule that is calibrated to a material ('elastic', "
+            f"'orthotropic', 'springs', 'strain-gradient'), which '{rule.type}' with these "
+            "parameters is not; take one of those, or leave the diagnostic out"
+        )
+    if experiment.neighbours.nearness():
+        raise ExperimentError(
+            f"'{diagnostic.type}' needs neighbours that stay; set neighbours.reevaluate: false"
+        )

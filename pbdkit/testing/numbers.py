@@ -1,0 +1,108 @@
+"""The numbers that a part remembers, as it declares them, draws them and is asked about them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import PluginError
+from pbdkit.interfaces import Bonds, Component, FollowerRule, FractureModel, Particles, Remembered
+from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembering import describe_bonds, generator_for
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.stepper import Stepper
+from pbdkit.testing.property import NotAskedError
+from pbdkit.testing.question import Arrays, Question
+from pbdkit.testing.states import displacements, state_with
+
+SHAPE = (4, 3)
+"""The shape of the arrays with which elementwise functions are called."""
+SEED = 7
+"""Of the generators that parts are given to draw from."""
+
+
+def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
+    """What a fracture model remembers of each bond, or a rule of each particle.
+
+    Raises NotAskedError where it remembers nothing.
+    """
+    is_rule = isinstance(part, FollowerRule)
+    numbers = particle_numbers(scene.experiment) if is_rule else bond_numbers(scene.experiment)
+    if not numbers:
+        raise NotAskedError(f"it remembers nothing of {'particles' if is_rule else 'bonds'}")
+    return numbers
+
+
+def owners(part: Component, scene: Scene) -> Bonds | Particles:
+    """Those of whom it remembers numbers, as `draw` is shown them."""
+    if isinstance(part, FractureModel):
+        return describe_bonds(scene)
+    rows = scene.raster.body_rows
+    return Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
+
+
+def draws(part: FractureModel | FollowerRule, scene: Scene) -> list[Question]:
+    """The question where its numbers start, if it draws them."""
+    try:
+        numbers_of(part, scene)
+    except NotAskedError:
+        return []
+    if not part.draws():
+        return []
+    shown = owners(part, scene)
+
+    def draw(arrays: Arrays) -> Arrays:
+        generator = generator_for(SEED, "fracture")
+        return dict(part.draw(type(shown)(**arrays), generator))  # type: ignore[arg-type]
+
+    return [Question("draw", dict(vars(shown)), draw)]
+
+
+def remembered_of_bonds(scene: Scene, seed: int) -> Arrays:
+    """Numbers of some bonds that have not broken, as they are at the start or two steps later;
+    those of one bond stand together."""
+    if not bond_numbers(scene.experiment):
+        return {}
+    pools = []
+    for state in _reached(scene, seed):
+        assert state.broken_step is not None
+        where = scene.bonds.plane, scene.bonds.place
+        table = [v.reshape(len(v), -1)[where] for v in state.bond_values]
+        intact = state.broken_step.reshape(len(state.broken_step), -1)[where] < 0
+        pools.append([column[intact] for column in table])
+    return _chosen(pools, seed)
+
+
+def remembered_of_particles(scene: Scene, seed: int) -> Arrays:
+    """The same of some of the body's particles."""
+    if not particle_numbers(scene.experiment):
+        return {}
+    places = scene.raster.place_of(scene.raster.body_rows)
+    states = _reached(scene, seed)
+    return _chosen([[v.ravel()[places] for v in s.particle_values] for s in states], seed)
+
+
+def own_of(arrays: Arrays) -> tuple[Any, ...]:
+    """The numbers among the arrays of a question, in their order."""
+    return tuple(arrays[f"own{n}"] for n in range(sum(k.startswith("own") for k in arrays)))
+
+
+def _reached(scene: Scene, seed: int) -> list[State]:
+    """The start, and where two steps lead if they can be made: what fails is asked about directly,
+    and named there."""
+    states = [initial_state(scene)]
+    try:
+        start = state_with(scene, displacements(scene, seed, share=0.1))
+        states.append(Stepper(scene).advance(start, 2))
+    except PluginError:
+        pass
+    return states
+
+
+def _chosen(pools: list[list[NDArray[Any]]], seed: int) -> Arrays:
+    columns = [np.concatenate(values) for values in zip(*pools, strict=True)]
+    rows = np.random.default_rng(seed + 2).integers(0, len(columns[0]), SHAPE)
+    return {f"own{n}": column[rows] for n, column in enumerate(columns)}
