@@ -14,7 +14,7 @@ import pbdkit
 FOLDER = Path(__file__).parent.parent / "experiments"
 SIZE_EFFECT = runpy.run_path(str(FOLDER / "size_effect.py"))
 chains, sheet, weakest_link = (SIZE_EFFECT[n] for n in ("chains", "sheet", "weakest_link"))
-SEEDS = range(3)
+SEEDS, STEPS = range(4), 30
 LEVEL = 1e-3
 """A right program fails a test of this level for one in a thousand sets of seeds; these are
 fixed."""
@@ -28,7 +28,7 @@ def ran(name, *settings):
 def pulled():
     """Of every chain of n bonds: increment in which it parted, increment, strengths of its bonds,
     one such triple a seed."""
-    return {n: [chains(n, 4.0, seed) for seed in SEEDS] for n in (4, 32)}
+    return {n: [chains(n, 4.0, seed, steps=STEPS) for seed in SEEDS] for n in (4, 16)}
 
 
 def test_strengths_are_drawn_from_weibulls_distribution():
@@ -46,28 +46,28 @@ def test_the_seed_decides_and_nothing_else():
     assert not np.intersect1d(one, other).size
 
 
-@pytest.mark.parametrize("bonds", [4, 32])
+@pytest.mark.parametrize("bonds", [4, 16])
 def test_every_chain_parts_at_its_weakest_bond(pulled, bonds):
     """Exactly: in the increment in which the applied strain exceeds the smallest strength."""
     for first, increment, strength in pulled[bonds]:
         weakest = strength.min(axis=1)
-        borne = weakest < 99 * increment  # some chains outlast the load
+        borne = weakest < (STEPS - 1) * increment  # some chains outlast the load
         assert borne.sum() >= 95
         over = first[borne] - weakest[borne]
         assert ((over > -1e-6 * increment) & (over < (1 + 1e-6) * increment)).all()
 
 
-@pytest.mark.parametrize("bonds", [4, 32])
+@pytest.mark.parametrize("bonds", [4, 16])
 def test_chains_have_the_exact_distribution_of_the_minimum(pulled, bonds):
-    """Kolmogorov's test over 300 chains: 1 - exp(-n (ε/scale)^m), that is Weibull with the scale
-    times n^(-1/m)."""
-    strength = np.concatenate([first - increment / 2 for first, increment, _ in pulled[bonds]])
-    assert len(strength) == 300
+    """Kolmogorov's test of the strength at which 400 chains part, as the test above has it, against
+    1 - exp(-n (ε/scale)^m), that is Weibull with the scale times n^(-1/m)."""
+    weakest = np.concatenate([strength.min(axis=1) for _, _, strength in pulled[bonds]])
+    assert len(weakest) == 400
     expected = weibull_min(4.0, scale=0.1 * bonds ** (-1 / 4.0))
-    assert kstest(strength, expected.cdf).pvalue > LEVEL
+    assert kstest(weakest, expected.cdf).pvalue > LEVEL
 
 
-@pytest.mark.parametrize("bonds", [4, 32])
+@pytest.mark.parametrize("bonds", [4, 16])
 def test_mean_strength_falls_as_the_root_of_the_size(pulled, bonds):
     """Within 3.3 standard errors of scale Γ(1 + 1/m) n^(-1/m), the standard deviation Weibull's."""
     strength = np.concatenate([first - increment / 2 for first, increment, _ in pulled[bonds]])
@@ -78,16 +78,28 @@ def test_mean_strength_falls_as_the_root_of_the_size(pulled, bonds):
 
 
 def test_large_sheets_are_weaker():
-    """The first bond to break is the weakest of n² in the same strain; then others take over, and
-    the sheet comes apart later, but the sooner the larger it is."""
+    """The first bond to break is the weakest of n² in the same strain. Its neighbours take over: the
+    sheet bears more than that, but the less the larger it is."""
     found = {size: np.array([sheet(size, 4.0, seed) for seed in range(8)]) for size in (3, 9)}
-    small, large = found[3].mean(axis=0), found[9].mean(axis=0)
-    assert not np.isnan(np.concatenate(list(found.values()))).any()
-    assert (large < 0.8 * small).all()
+    first, load = found[9].mean(axis=0) / found[3].mean(axis=0)
+    assert first < 0.75  # the theory says 9^(-1/4) = 0.58
+    assert load < 0.95
     for size, strengths in found.items():
-        # 8 sheets: the mean is known to 0.28/√8 = 10 %.
+        # Of 8 sheets the mean is known to 0.28/√8 = 10 %.
         assert strengths[:, 0].mean() == pytest.approx(weakest_link(size**2, 4.0), rel=0.33)
-        assert (strengths[:, 1] > strengths[:, 0]).all()
+        assert (strengths[:, 1] >= strengths[:, 0] - 0.002).all()
+
+
+def test_the_load_of_a_sheet_is_that_of_its_rows():
+    """A whole sheet has stiffness 1; where all rows but one are cut in a column, about 1/size."""
+    ds = ran("sheet", "steps=1")
+    along = ds.site.values[ds.bond.values]
+    cut = (along[:, 0, 0] == 3) & (along[:, 1, 0] == 4)
+    whole = np.ones(len(cut), bool)
+    stiffness = SIZE_EFFECT["stiffness"]
+    assert stiffness(ds, whole, 8) == pytest.approx(1.0, abs=1e-6)
+    assert stiffness(ds, ~cut, 8) == pytest.approx(0.0, abs=1e-6)
+    assert 1 / 8 < stiffness(ds, ~cut | (along[:, 0, 1] == 0), 8) < 0.6
 
 
 def test_a_large_modulus_is_one_strength_for_all():
