@@ -69,44 +69,42 @@ class Pantograph(pbdkit.FollowerRule):
     )
 
     def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> tuple[float, ...]:
-        """Stiffness of the spring, then 1 for the one of the eight points along the fibres."""
+        """Stiffness and rest length of the spring, then 1 for the one of the eight points along the
+        fibres that it is."""
         roles = {s.rest: role for s, role in _roles(setting.slots[slot.source])}
         what, direction = roles.get(slot.rest, ("", 0))
         stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(what, 0.0)
         places = [(ALONG, n) for n in range(4)] + [(NEXT, n) for n in range(4)]
-        return (stiffness, *(float(place == (what, direction)) for place in places))
+        rest = float(pbdkit.length(slot.rest))
+        return (stiffness, rest, *(float(place == (what, direction)) for place in places))
 
     @staticmethod
     def gather(d: pbdkit.Vector, r: pbdkit.Vector, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) of the spring, e = |r + d| - |r|; then d and presence at each of the eight
-        points along the fibres, if they resist bending."""
-        v, rest = pbdkit.Vector(r.x + d.x, r.y + d.y), pbdkit.length(r)
+        points along the fibres."""
+        stiffness, rest = w[0], w[1]
+        v = pbdkit.Vector(r.x + d.x, r.y + d.y)
         distance = pbdkit.length(v)
         # |v|² - |r|² = d·(r + v): small elongations keep all their digits.
         elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (distance + rest)
-        pull = w[0] * elongation / pbdkit.where(distance > 0.0, distance, 1.0)
-        if p.bending == 0.0:
-            return pull * v.x, pull * v.y, w[0]
+        pull = stiffness * elongation / pbdkit.where(distance > 0.0, distance, 1.0)
         x, y = d.x, d.y
         return (
-            pull * v.x, pull * v.y, w[0],
-            w[1] * x, w[1] * y, w[1], w[2] * x, w[2] * y, w[2],
-            w[3] * x, w[3] * y, w[3], w[4] * x, w[4] * y, w[4],
-            w[5] * x, w[5] * y, w[5], w[6] * x, w[6] * y, w[6],
-            w[7] * x, w[7] * y, w[7], w[8] * x, w[8] * y, w[8],
+            pull * v.x, pull * v.y, stiffness,
+            w[2] * x, w[2] * y, w[2], w[3] * x, w[3] * y, w[3],
+            w[4] * x, w[4] * y, w[4], w[5] * x, w[5] * y, w[5],
+            w[6] * x, w[6] * y, w[6], w[7] * x, w[7] * y, w[7],
+            w[8] * x, w[8] * y, w[8], w[9] * x, w[9] * y, w[9],
         )  # fmt: skip
 
     @staticmethod
     def apply(total: Any, here: pbdkit.Here, p: Any) -> tuple[Any, Any]:
         """Σ forces / Σ stiffness; no move where there is neither."""
-        if p.bending == 0.0:
-            x, y, stiffness = total
-        else:
-            ax, ay, a = _bent(total[3:9], total[15:21])
-            bx, by, b = _bent(total[9:15], total[21:27])
-            x = total[0] + p.bending * (ax + bx)
-            y = total[1] + p.bending * (ay + by)
-            stiffness = total[2] + p.bending * (a + b)
+        ax, ay, a = _bent(total[3:9], total[15:21])
+        bx, by, b = _bent(total[9:15], total[21:27])
+        x = total[0] + p.bending * (ax + bx)
+        y = total[1] + p.bending * (ay + by)
+        stiffness = total[2] + p.bending * (a + b)
         share = pbdkit.where(stiffness > 0.0, stiffness, 1.0)
         return x / share, y / share
 
