@@ -36,7 +36,7 @@ class Cells(NamedTuple):
 
 def pulled(across, along, pull, *settings):
     """The dataset of a sheet of along × across cells, pulled by a share of D."""
-    size = np.sqrt(2.0)
+    size = 2.0**0.5
     length, width = along * size, across * size
     share = pull * (length - width)
     given = [
