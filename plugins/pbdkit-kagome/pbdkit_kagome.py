@@ -10,8 +10,9 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
-import pbdkit
 from pydantic import Field
+
+import pbdkit
 
 pbdkit_api = 1
 

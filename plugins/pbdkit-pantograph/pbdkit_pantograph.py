@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal, TypeVar
 
-import pbdkit
 from pydantic import Field
+
+import pbdkit
 
 pbdkit_api = 1
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-import pbdkit
 from numpy.typing import NDArray
 from pydantic import Field
+
+import pbdkit
 
 pbdkit_api = 1
 
@@ -45,7 +46,9 @@ class Weibull(pbdkit.FractureModel):
 
     def bond_state(self) -> tuple[pbdkit.Remembered, ...]:
         """The strength of each bond, which stays."""
-        return (pbdkit.Remembered("strength", "strain at which the bond breaks", "1", changes=False),)
+        return (
+            pbdkit.Remembered("strength", "strain at which the bond breaks", "1", changes=False),
+        )
 
     def draw(self, bonds: pbdkit.Bonds, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
         """scale · E^(1/modulus), E exponentially distributed with mean 1."""

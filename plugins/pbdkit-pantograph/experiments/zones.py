@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
 import pbdkit
 
 FILE = Path(__file__).parent / "bias-extension.yaml"

@@ -10,6 +10,7 @@ from math import gamma
 from pathlib import Path
 
 import numpy as np
+
 import pbdkit
 
 FOLDER = Path(__file__).parent
