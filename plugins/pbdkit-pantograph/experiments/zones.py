@@ -24,8 +24,8 @@ FILE = Path(__file__).parent / "bias-extension.yaml"
 
 
 class Cells(NamedTuple):
-    """Of every cell: `centre` (cell, axis) in the reference, the angle between its fibres (degrees),
-    its zone; of every link: strain. `length` and `width` of the sheet."""
+    """Of every cell: `centre` (cell, axis) in the reference, the angle between its fibres
+    (degrees), its zone; of every link: strain. `length` and `width` of the sheet."""
 
     centre: np.ndarray
     angle: np.ndarray
@@ -101,8 +101,9 @@ def main():
             f"{found.angle[found.zone == z].mean():.2f}° ± {found.angle[found.zone == z].std():.2f}"
             for z in "ABC"
         ]
+        angles = ", ".join(f"{angle:.2f}" for angle in expected.values())
         print(
-            f"| {pull:g} | {' | '.join(means)} | {', '.join(f'{v:.2f}' for v in expected.values())} "
+            f"| {pull:g} | {' | '.join(means)} | {angles} "
             f"| {on_axis(found):.4f} | {(1 + pull) / np.sqrt(2.0):.4f} "
             f"| {100 * found.strain.min():.2f} to {100 * found.strain.max():.2f} % |",
             flush=True,

@@ -83,9 +83,10 @@ def test_pivots_go_to_the_average_of_what_both_fibres_propose():
     """(Σ springs + k_b (4 Σ D_1 - Σ D_2)) / (2 + 8 k_b), spelled out for a pivot in the middle."""
     ds = sheet(RULE | {"shear": 0.0}, 1, initial=NOISE, seed=3)
     before, after = ds.position.values
-    place = {tuple(np.round(X * ROOT).astype(int)): x for X, x in zip(ds.reference.values, before)}
+    places = np.round(ds.reference.values * ROOT).astype(int)
+    place = dict(zip(map(tuple, places), before, strict=True))
     for n in Plain(ds).inner[:5]:
-        i, j = np.round(ds.reference.values[n] * ROOT).astype(int)
+        i, j = places[n]
         proposals = []
         for m in (1, -1):
             first = [place[i + s, j + s * m] - before[n] for s in (1, -1)]

@@ -48,8 +48,8 @@ def chains(bonds, modulus, seed, number=100, steps=INCREMENTS):
 
 
 def sheet(size, modulus, seed):
-    """Applied strain at which the first bond of a sheet of size × size bonds breaks, and the largest
-    load that it bears, per row and in units of a bond's strain."""
+    """Applied strain at which the first bond of a sheet of size × size bonds breaks, and the
+    largest load that it bears, per row and in units of a bond's strain."""
     increment = 2.0 * SCALE / INCREMENTS
     ds = pulled("sheet", size, size, modulus, seed, increment, INCREMENTS)
     step = ds.broken_step.values

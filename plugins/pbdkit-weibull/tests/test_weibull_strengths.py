@@ -78,8 +78,8 @@ def test_mean_strength_falls_as_the_root_of_the_size(pulled, bonds):
 
 
 def test_large_sheets_are_weaker():
-    """The first bond to break is the weakest of n² in the same strain. Its neighbours take over: the
-    sheet bears more than that, but the less the larger it is."""
+    """The first bond to break is the weakest of n² in the same strain. Its neighbours take over:
+    the sheet bears more than that, but the less the larger it is."""
     found = {size: np.array([sheet(size, 4.0, seed) for seed in range(8)]) for size in (3, 9)}
     first, load = found[9].mean(axis=0) / found[3].mean(axis=0)
     assert first < 0.75  # the theory says 9^(-1/4) = 0.58
