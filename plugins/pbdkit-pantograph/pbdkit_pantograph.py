@@ -42,8 +42,8 @@ class Pantograph(pbdkit.FollowerRule):
     that the two fibres propose.
 
     The links of a fibre are springs of stiffness 1, and k_b = `bending` is that of the fibre
-    against being bent. A fibre proposes to its point, with D = x_k - x_j to the next points (1) and those
-    after them (2),
+    against being bent. A fibre proposes to its point, with D = x_k - x_j to the next points (1) and
+    those after them (2),
 
         (Σ (D_1 - l D_1/|D_1|) + k_b (4 Σ D_1 - Σ D_2)) / (2 + 8 k_b)
 
