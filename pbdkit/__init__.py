@@ -9,48 +9,55 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pbdkit.api import analyse, identify, load, rerun, run
+    # `as`: type checkers of those who say `import pbdkit` then find the names.
+    from pbdkit.api import (
+        analyse as analyse,
+        identify as identify,
+        load as load,
+        rerun as rerun,
+        run as run,
+    )
     from pbdkit.errors import (
-        DivergedError,
-        ExperimentError,
-        PbdkitError,
-        PbdkitWarning,
-        PluginError,
-        StorageError,
+        DivergedError as DivergedError,
+        ExperimentError as ExperimentError,
+        PbdkitError as PbdkitError,
+        PbdkitWarning as PbdkitWarning,
+        PluginError as PluginError,
+        StorageError as StorageError,
     )
-    from pbdkit.experiment.model import Experiment
+    from pbdkit.experiment.model import Experiment as Experiment
     from pbdkit.interfaces import (
-        BasisSite,
-        Bonds,
-        Cell,
-        Component,
-        Diagnostic,
-        FollowerRule,
-        FractureModel,
-        FrameMap,
-        FramePolicy,
-        FrameSites,
-        Here,
-        Lattice,
-        LeaderRows,
-        Moment,
-        Nearness,
-        NeighbourMetric,
-        Offset,
-        Pair,
-        Particles,
-        Remembered,
-        Setting,
-        Slot,
-        Stiffness,
-        Variable,
-        Vector,
-        length,
-        squared_length,
-        where,
+        BasisSite as BasisSite,
+        Bonds as Bonds,
+        Cell as Cell,
+        Component as Component,
+        Diagnostic as Diagnostic,
+        FollowerRule as FollowerRule,
+        FractureModel as FractureModel,
+        FrameMap as FrameMap,
+        FramePolicy as FramePolicy,
+        FrameSites as FrameSites,
+        Here as Here,
+        Lattice as Lattice,
+        LeaderRows as LeaderRows,
+        Moment as Moment,
+        Nearness as Nearness,
+        NeighbourMetric as NeighbourMetric,
+        Offset as Offset,
+        Pair as Pair,
+        Particles as Particles,
+        Remembered as Remembered,
+        Setting as Setting,
+        Slot as Slot,
+        Stiffness as Stiffness,
+        Variable as Variable,
+        Vector as Vector,
+        length as length,
+        squared_length as squared_length,
+        where as where,
     )
-    from pbdkit.registry.hooks import hookimpl
-    from pbdkit.results.accessor import open
+    from pbdkit.registry.hooks import hookimpl as hookimpl
+    from pbdkit.results.accessor import open as open
 
 _HOME = {
     "pbdkit.errors": (

@@ -1,11 +1,14 @@
 """Neighbourhoods of every lattice and metric: shells, opposite pairs, mutuality."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from property_cases import LATTICES, LATTICES_AND_NEIGHBOURS, NEIGHBOURS, scene_of
 
+import pbdkit
 from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
 from pbdkit.components.neighbours import Chebyshev, Coordination
 from pbdkit.scene.neighbourhood import build_neighbourhood
@@ -115,3 +118,28 @@ def test_frame_maps_are_means(lattice, neighbours):
     scene = scene_of(lattice=lattice, neighbours=neighbours)
     total = np.bincount(scene.frame.map.point, scene.frame.map.weight)
     np.testing.assert_allclose(total, 1.0, rtol=1e-15)
+
+
+class OnTheCorner(pbdkit.Lattice):
+    """Two sites a cell, neither of them a centre of inversion."""
+
+    type: Literal["on-the-corner"] = "on-the-corner"
+
+    def cell(self):
+        other = pbdkit.BasisSite(pbdkit.Vector(0.25, 0.0), index=(1, 0), primitive=(1, 0))
+        return pbdkit.Cell(
+            vectors=(pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 1.0)),
+            sites=(pbdkit.BasisSite(), other),
+            period=(2, 1),
+            primitive=((2, 0), (0, 1)),
+        )
+
+
+def test_neighbours_that_surround_a_site_unevenly_are_refused():
+    """Mutual as they are, a body at rest would drift under the barycentre."""
+    expected = (
+        r"'coordination' is lopsided on this lattice: the 1 neighbours of a site have their "
+        r"barycentre \(0\.25, 0\) away from it, and a body at rest would drift; choose whole shells"
+    )
+    with pytest.raises(pbdkit.ExperimentError, match=expected):
+        build_neighbourhood(OnTheCorner().cell(), Coordination())

@@ -16,6 +16,9 @@ FLATTEST = 1e-3
 SAME_PLACE = 1e-9
 """Sites nearer than this share of a cell vector lie at one place."""
 
+BALANCED = 1e-9
+"""How far a site may lie from the barycentre of its neighbours, as a share of their distance."""
+
 
 @dataclass(frozen=True)
 class BondPlane:
@@ -103,7 +106,8 @@ def flatness(cell: Cell) -> float:
 
 
 def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
-    """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual."""
+    """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual and
+    balanced."""
     exact = _ExactVectors()
     chosen = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
     slots = tuple(_slots_of(s, shells, exact) for s, shells in enumerate(chosen))
@@ -119,7 +123,20 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
             )
         if slot.site > (0, 0):
             planes.append(BondPlane(slot, opposite))
+    for own in slots:
+        _refuse_lopsided(own, metric)
     return Neighbourhood(slots, tuple(planes))
+
+
+def _refuse_lopsided(own: tuple[Slot, ...], metric: NeighbourMetric) -> None:
+    """On lattices whose sites are no centres of inversion, mutual is not enough."""
+    x, y = (math.fsum(slot.rest[axis] for slot in own) for axis in (0, 1))
+    if math.hypot(x, y) > BALANCED * math.fsum(math.hypot(*slot.rest) for slot in own):
+        raise ExperimentError(
+            f"'{metric.type}' is lopsided on this lattice: the {len(own)} neighbours of a site "
+            f"have their barycentre ({x / len(own):.3g}, {y / len(own):.3g}) away from it, and a "
+            "body at rest would drift; choose whole shells of equal distance, {type: coordination}"
+        )
 
 
 def _refuse_gaps(slots: tuple[tuple[Slot, ...], ...], different: int) -> None:
