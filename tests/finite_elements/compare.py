@@ -100,8 +100,11 @@ def _stepping(problem: Problem, cells: int, error: float, memory: float) -> Poin
 
 
 def seconds_at(points: list[Point], error: float, *, setup: bool, clock: str = "wall") -> float:
-    """Between two measurements as a power law has it; NaN beyond them."""
+    """Between two measurements as a power law has it; that of the coarsest where it is better, NaN
+    where the finest is worse."""
     times = [getattr(p.solving, clock) + setup * getattr(p.setup, clock) for p in points]
+    if points[0].error <= error:
+        return float(times[0])
     for (rough, before), (fine, after) in pairwise(zip(points, times, strict=True)):
         if rough.error >= error >= fine.error:
             share = np.log(rough.error / error) / np.log(rough.error / fine.error)
