@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -95,15 +95,9 @@ class CellElastic(FollowerRule):
         return p.modulus * total[0], p.modulus * total[1]
 
 
-class Elastic(CellElastic):
-    """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
+class IsotropicElastic(CellElastic):
+    """Common to the isotropic rules: a Poisson ratio, in plane stress or plane strain."""
 
-    On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
-    it is linear triangles. At ν = -1 it is the barycentre, of the four nearest or all six.
-    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
-    """
-
-    type: Literal["elastic"] = "elastic"
     poisson_ratio: Annotated[float, Field(ge=-1.0, le=0.5)] = Field(
         description="ν, from -1 to 0.5.", examples=[0.3, -1.0]
     )
@@ -112,7 +106,7 @@ class Elastic(CellElastic):
     )
 
     @model_validator(mode="after")
-    def _compressible(self) -> Elastic:
+    def _compressible(self) -> Self:
         if self.plane == "strain" and self.poisson_ratio > 0.49:
             raise ValueError("in plane strain poisson_ratio must be at most 0.49")
         return self
@@ -135,6 +129,17 @@ class Elastic(CellElastic):
         return nu / (1 - nu) if self.plane == "strain" else nu
 
 
+class Elastic(IsotropicElastic):
+    """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.
+
+    On the square and rectangular lattice with 8 neighbours, and on the hexagonal one with 6, where
+    it is linear triangles. At ν = -1 it is the barycentre, of the four nearest or all six.
+    Stable with a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or 3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
+    """
+
+    type: Literal["elastic"] = "elastic"
+
+
 class Orthotropic(CellElastic):
     """Orthotropic linear elasticity in plane stress along the axes of the square or rectangular
     lattice with 8 neighbours.
@@ -155,7 +160,7 @@ class Orthotropic(CellElastic):
     )
 
     @model_validator(mode="after")
-    def _positive(self) -> Orthotropic:
+    def _positive(self) -> Self:
         if self.poisson_ratio**2 * self.modulus_ratio >= 1.0:
             raise ValueError(
                 "no elastic material: poisson_ratio² · modulus_ratio must be below 1, and is "

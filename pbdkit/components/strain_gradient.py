@@ -8,12 +8,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from pbdkit.components.cell_stiffness import rectangle_of
-from pbdkit.components.elasticity import CellElastic, Elastic
+from pbdkit.components.elasticity import CellElastic, Elastic, IsotropicElastic
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Here, Setting
 
 
-class StrainGradient(Elastic):
+class StrainGradient(IsotropicElastic):
     """Elasticity with an internal length l: the elastic move z, less c = l²/D times the elastic
     move that is made of z.
 
@@ -24,7 +24,7 @@ class StrainGradient(Elastic):
     rule's bound is 2/λ: mostly very small, so that solver: {type: equilibrium} serves it best.
     """
 
-    type: Literal["strain-gradient"] = "strain-gradient"  # type: ignore[assignment]
+    type: Literal["strain-gradient"] = "strain-gradient"
     length: Annotated[float, Field(ge=0.0, le=1e6)] = Field(
         description="The internal length l (lattice units).", examples=[0.5]
     )

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import Distribution, EntryPoint, distribution, distributions
+from pathlib import PurePath
 
 from pbdkit.registry.hooks import GROUP
 from pbdkit.registry.wording import worded
@@ -93,4 +94,4 @@ def _unreadable(distribution: str, error: Exception) -> Point:
 
 
 def _folder(found: Distribution) -> str:
-    return os.path.basename(str(getattr(found, "_path", "(no name)")))  # noqa: PTH119 (no path)
+    return PurePath(str(getattr(found, "_path", "(no name)"))).name

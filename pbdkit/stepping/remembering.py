@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Bonds, FollowerRule, FractureModel, Particles, Remembered
 from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.remembered import Drawn
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
@@ -29,7 +31,8 @@ def initial_bond_values(scene: Scene) -> Values:
     if numbers and model.draws():
         bonds = scene.bonds
         where = bonds.plane, *np.unravel_index(bonds.place, scene.raster.shape[1:])
-        _draw(scene, "fracture", numbers, values, describe_bonds(scene), where)
+        owners = describe_bonds(scene)
+        _draw(scene, "fracture", numbers, values, partial(model.draw, owners), len(owners), where)
     return values
 
 
@@ -38,10 +41,9 @@ def initial_particle_values(scene: Scene) -> Values:
     rule, numbers = scene.experiment.rule, particle_numbers(scene.experiment)
     values = _started(scene, numbers, scene.raster.shape)
     if numbers and rule.draws():
-        rows = scene.raster.body_rows
-        where = np.unravel_index(scene.raster.place_of(rows), scene.raster.shape)
-        particles = Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
-        _draw(scene, "rule", numbers, values, particles, where)
+        owners, place = describe_particles(scene), scene.raster.place_of(scene.raster.body_rows)
+        where = np.unravel_index(place, scene.raster.shape)
+        _draw(scene, "rule", numbers, values, partial(rule.draw, owners), len(owners), where)
     return values
 
 
@@ -49,6 +51,12 @@ def generator_for(seed: int, part: str) -> np.random.Generator:
     """The random numbers of one part of the experiment, by its field: the same whatever other parts
     draw."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(part.encode())))
+
+
+def describe_particles(scene: Scene) -> Particles:
+    """The particles of the body with their places."""
+    rows = scene.raster.body_rows
+    return Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
 
 
 def describe_bonds(scene: Scene) -> Bonds:
@@ -102,13 +110,14 @@ def _draw(
     field: str,
     numbers: Sequence[Remembered],
     values: Values,
-    owners: Bonds | Particles,
+    draw: Callable[[np.random.Generator], Drawn],
+    count: int,
     where: tuple[Any, ...],
 ) -> None:
     part: FractureModel | FollowerRule = getattr(scene.experiment, field)
     generator = generator_for(scene.experiment.seed, field)
     with blaming(part, "to draw where its numbers start", field):
-        drawn: dict[str, Array] = part.draw(owners, generator)  # type: ignore[arg-type]
+        drawn = draw(generator)
         array_of = {number.name: value for number, value in zip(numbers, values, strict=True)}
         for name, value in drawn.items():
             if name not in array_of:
@@ -116,9 +125,9 @@ def _draw(
                     f"'{part.type}' draws '{name}', which it does not remember"
                     f"{did_you_mean(name, array_of)}"
                 )
-            if np.shape(value) != (len(owners),) or not np.isfinite(value).all():
+            if np.shape(value) != (count,) or not np.isfinite(value).all():
                 raise PluginError(
                     f"'{part.type}' draws '{name}' with the shape {np.shape(value)}, finite: "
-                    f"{bool(np.isfinite(value).all())}; needed are ({len(owners)},) finite numbers"
+                    f"{bool(np.isfinite(value).all())}; needed are ({count},) finite numbers"
                 )
             array_of[name][where] = value

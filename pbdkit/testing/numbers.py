@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Bonds, Component, FollowerRule, FractureModel, Particles, Remembered
+from pbdkit.interfaces.remembered import Drawn
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembering import describe_bonds, generator_for
+from pbdkit.stepping.remembering import describe_bonds, describe_particles, generator_for
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.stepper import Stepper
 from pbdkit.testing.property import NotAskedError
@@ -38,10 +39,17 @@ def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
     """Those of whom it remembers numbers, as `draw` is shown them."""
-    if isinstance(part, FractureModel):
-        return describe_bonds(scene)
-    rows = scene.raster.body_rows
-    return Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
+    is_of_bonds = isinstance(part, FractureModel)
+    return describe_bonds(scene) if is_of_bonds else describe_particles(scene)
+
+
+def drawn(part: Component, shown: Bonds | Particles, generator: np.random.Generator) -> Drawn:
+    """What it draws for them."""
+    if isinstance(part, FractureModel) and isinstance(shown, Bonds):
+        return part.draw(shown, generator)
+    assert isinstance(part, FollowerRule)
+    assert isinstance(shown, Particles)
+    return part.draw(shown, generator)
 
 
 def draws(part: FractureModel | FollowerRule, scene: Scene) -> list[Question]:
@@ -56,7 +64,7 @@ def draws(part: FractureModel | FollowerRule, scene: Scene) -> list[Question]:
 
     def draw(arrays: Arrays) -> Arrays:
         generator = generator_for(SEED, "fracture")
-        return dict(part.draw(type(shown)(**arrays), generator))  # type: ignore[arg-type]
+        return dict(drawn(part, type(shown)(**arrays), generator))
 
     return [Question("draw", dict(vars(shown)), draw)]
 

@@ -44,7 +44,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 def takes_part(subject: Subject) -> None:
     """A scene can be built with it: at least one of those tried takes it, and none makes it fail
     with anything but an ExperimentError."""
-    subject.scenes  # noqa: B018  (it is built here, and kept)
+    subject.scene()
 
 
 @asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, needs=NEEDS)

@@ -10,7 +10,7 @@ import numpy as np
 from pbdkit.interfaces import FollowerRule, FractureModel, Remembered
 from pbdkit.results.layout import base_columns, bond_columns, broken_columns
 from pbdkit.scene.remembering import remembered_names
-from pbdkit.testing.numbers import SEED, numbers_of, owners
+from pbdkit.testing.numbers import SEED, drawn, numbers_of, owners
 from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.properties.diagnostics import NAME
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
@@ -50,7 +50,7 @@ def draws_what_it_remembers(subject: Subject) -> None:
         if not part.draws():
             raise NotAskedError("all that it remembers starts at its `initial`")
         shown = owners(part, scene)
-        for name, values in part.draw(shown, np.random.default_rng(SEED)).items():  # type: ignore[arg-type]
+        for name, values in drawn(part, shown, np.random.default_rng(SEED)).items():
             if name not in numbers:
                 raise PropertyError(
                     f"`draw` gives '{name}'; what it remembers is {', '.join(numbers)}"
