@@ -11,19 +11,8 @@ from pbdkit.scene.raster import FOLLOWER, FRAME
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.stepper import Stepper
+from pbdkit.testing.scenes import LATTICES, NEIGHBOURS
 
-LATTICES: dict[str, dict[str, Any]] = {
-    "square": {"type": "square", "a": 1.0},
-    "rectangular": {"type": "rectangular", "a": 1.0, "b": 1.3},
-    "centred-rectangular": {"type": "centred-rectangular", "a": 1.0, "b": 1.2},
-    "hexagonal": {"type": "hexagonal", "a": 0.7},
-    "oblique": {"type": "oblique", "a": 1.1, "b": 0.9, "angle": 65.0},
-}
-NEIGHBOURS: dict[str, dict[str, Any]] = {
-    f"{name}-{shells}": {"type": name, "shells": shells}
-    for name in ("coordination", "chebyshev")
-    for shells in (1, 2)
-}
 RULES: dict[str, dict[str, Any]] = {
     "barycentre": {"type": "barycentre"},
     "mean-displacement": {"type": "mean-displacement"},

@@ -1,8 +1,11 @@
 """Where calibrated rules, their frames and lattices do not go together, and what is said then."""
 
+from typing import Literal
+
 import pytest
 
 import pbdkit
+from pbdkit.components.strain_gradient import StrainGradient
 from pbdkit.scene import cutting
 from pbdkit.scene.scene import build_scene
 
@@ -151,3 +154,16 @@ def test_cut_cells_have_the_area_of_the_outline(monkeypatch):
 def test_cells_between_given_sites_are_whole():
     assert set(scene().cells.share.ravel().tolist()) == {0.0, 1.0}
     assert scene().cells.share.sum() == 5 * 4
+
+
+class Tiring(StrainGradient):
+    type: Literal["tiring"] = "tiring"
+
+    def particle_state(self):
+        return (pbdkit.Remembered("tiredness", "how tired it is", "1"),)
+
+
+def test_a_rule_on_the_moves_of_another_remembers_nothing():
+    tiring = Tiring(poisson_ratio=0.3, length=2.0)
+    with pytest.raises(pbdkit.ExperimentError, match="one that remembers nothing"):
+        scene(rule=tiring)

@@ -362,3 +362,13 @@ def test_what_swings_for_ever_never_settles():
     assert ds.attrs["status"] == "complete"
     reason = r"not settled: in step \d+ particles still moved by up to 0.0018$"
     assert re.search(reason, ds.attrs["stop_reason"])
+
+
+def test_parts_that_remember_have_no_known_distance():
+    given = experiment(
+        fracture={"type": "damage", "onset": 0.1, "failure": 0.5},
+        solver={"type": "stepping", "settle": {"tolerance": 1e-4}},
+    )
+    with pytest.raises(pbdkit.ExperimentError, match="'damage' remembers") as refused:
+        pbdkit.Experiment(**given)
+    assert "leave solver.settle out" in str(refused.value)

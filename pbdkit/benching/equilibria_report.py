@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.benching.equilibria import STEPPING, EquilibriumBench, Row, Solved, Truth, Unsolved
-from pbdkit.benching.report import machine
+from pbdkit.benching.report import by_size, machine
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,20 +26,7 @@ LEGEND = (
 
 def equilibria_table(rows: Iterable[Row]) -> Table:
     """A row a method and tolerance; sizes apart by a line."""
-    from rich import box
-    from rich.table import Table
-
-    found = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in COLUMNS:
-        is_name = name == "method"
-        found.add_column(name, justify="left" if is_name else "right", no_wrap=is_name)
-    before: Row | None = None
-    for row in rows:
-        if before and before.size != row.size:
-            found.add_section()
-        found.add_row(*cells(row))
-        before = row
-    return found
+    return by_size(COLUMNS, ((row.size, cells(row)) for row in rows))
 
 
 def cells(row: Row) -> list[str]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, Literal
 
 from pbdkit.benching.measuring import Bench, Row
 from pbdkit.benching.method import Measured, NotMeasured, processors
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 COLUMNS = (
     "size", "particles", "method", "precision", "threads", "set-up", "cached", "ns", "MiB", "error",
 )  # fmt: skip
+WORDS = ("method", "precision")
 LEGEND = (
     "set-up: seconds until the first step, with compiling, and with what was compiled before",
     "ns: a particle and step; MiB: peak memory above that of the imports; error: largest distance",
@@ -25,18 +27,23 @@ LEGEND = (
 
 def table(rows: Iterable[Row]) -> Table:
     """A row a method and size; sizes apart by a line."""
+    return by_size(COLUMNS, ((row.size, _cells(row)) for row in rows))
+
+
+def by_size(columns: Iterable[str], rows: Iterable[tuple[object, list[str]]]) -> Table:
+    """Rows of a size and their cells, sizes apart by a line; words to the left, numbers to the
+    right."""
     from rich import box
     from rich.table import Table
 
     found = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in COLUMNS:
-        found.add_column(name, justify="left" if name in ("method", "precision") else "right")
-    before: Row | None = None
-    for row in rows:
-        if before and before.size != row.size:
-            found.add_section()
-        found.add_row(*_cells(row))
-        before = row
+    for name in columns:
+        justify: Literal["left", "right"] = "left" if name in WORDS else "right"
+        found.add_column(name, justify=justify, no_wrap=name == "method")
+    for _, block in groupby(rows, key=lambda row: row[0]):
+        for _, cells in block:
+            found.add_row(*cells)
+        found.add_section()
     return found
 
 
