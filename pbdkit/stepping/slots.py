@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,9 +74,7 @@ class SlotFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
-        seen = self._seen(m, state)
-        for part in self._parts:
-            total, here = self._sums(part, seen, state), self._here(part, seen, state)
+        for part, total, here in self._summed(m, state):
             move = as_move(self._rule.apply(total, here, self._parameters))
             self._place(part, move, m, new)
             if self._rule.remembers():
@@ -86,18 +84,16 @@ class SlotFollowers(Followers):
 
     def moves(self, m: Floats, state: State) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        seen, out = self._seen(m, state), np.zeros_like(m)
-        for part in self._parts:
-            total, here = self._sums(part, seen, state), self._here(part, seen, state)
+        out = np.zeros_like(m)
+        for part, total, here in self._summed(m, state):
             _write(as_move(self._rule.apply(total, here, self._parameters)), part, out)
         return out
 
     def forces(self, m: Floats, state: State) -> Floats:
         """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
         zero where there is no neighbour."""
-        seen, out = self._seen(m, state), np.zeros_like(m)
-        for part in self._parts:
-            total, here = self._sums(part, seen, state), self._here(part, seen, state)
+        out = np.zeros_like(m)
+        for part, total, here in self._summed(m, state):
             _write(self._rule.force(total, here, self._parameters), part, out)
         return out
 
@@ -107,8 +103,7 @@ class SlotFollowers(Followers):
             return self._work(m, self.forces(m, state))
         seen, out = self._seen(m, state), np.zeros_like(m[:1])
         for part in self._parts:
-            (energy,) = self._sums(part, seen, state, self._energy_of_a_bond)
-            _write((energy,), part, out)
+            _write(self._sums(part, seen, state, self._energy_of_a_bond), part, out)
         return float(out.sum())
 
     def _work(self, u: Floats, forces: Floats) -> float:
@@ -142,9 +137,14 @@ class SlotFollowers(Followers):
         """What the rule works on: displacements, or the moves of its inner rule."""
         return self._inner.moves(m, state) if self._inner else m
 
-    def _here(self, part: _Part, m: Floats, state: State) -> Here:
-        own = [value[part.block.slices()] for value in state.particle_values]
-        return Here(read_only(planes(m, part.block)), part.X, shown(own))
+    def _summed(self, m: Floats, state: State) -> Iterator[tuple[_Part, tuple[Any, ...], Here]]:
+        """Every block with the sums that `gather` makes and what stands there, as `apply` and
+        `force` are given them."""
+        seen = self._seen(m, state)
+        for part in self._parts:
+            own = [value[part.block.slices()] for value in state.particle_values]
+            here = Here(read_only(planes(seen, part.block)), part.X, shown(own))
+            yield part, self._sums(part, seen, state, self._rule.gather), here
 
     def _energy_of_a_bond(self, d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any]:
         return (self._rule.energy(d, r, w, p),)
@@ -154,11 +154,9 @@ class SlotFollowers(Followers):
         part: _Part,
         m: Floats,
         state: State,
-        function: Callable[[Vector, Vector, Any, Any], tuple[Any, ...]] | None = None,
+        function: Callable[[Vector, Vector, Any, Any], tuple[Any, ...]],
     ) -> tuple[Any, ...]:
-        """Σ function(d, r, w, p) over the neighbours, or what stands in for them: `gather`, where
-        it is no other."""
-        function = function or self._rule.gather
+        """Σ function(d, r, w, p) over the neighbours, or what stands in for them."""
         u = read_only(planes(m, part.block))
 
         def contribution(slot: Slot) -> tuple[Any, ...]:
