@@ -116,7 +116,7 @@ class StateMoment(Moment):
         raise ValueError(f"no part remembers '{name}'{did_you_mean(name, known)}")
 
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """The loop of the stepper, on the body's particles."""
         raster, state = self._tables.raster, self._state
@@ -137,7 +137,7 @@ class StateMoment(Moment):
 
     def over_cells(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> Floats:

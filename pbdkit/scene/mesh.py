@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Cell, Offset, Slot, Vector
+from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import FOLLOWER, Block, Raster
@@ -32,7 +32,7 @@ class MeshCell:
     corners: tuple[Offset | Slot, ...]
 
     @cached_property
-    def rest(self) -> tuple[Vector, ...]:
+    def rest(self) -> tuple[Components, ...]:
         """X_k - X_0 of the corners, lattice units."""
         return tuple(corner.rest for corner in self.corners)
 
