@@ -1,4 +1,4 @@
-"""Who moves with whom: the blocks, axis by axis, between particles that a step operator is made of."""
+"""Who moves with whom: the blocks, (axis, axis), that a step operator is made of."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ Indices = NDArray[np.signedinteger[Any]]
 class Couplings:
     """Blocks (axis, axis) at (row, column), in parts, counted in particles; those of one place add.
 
-    `shape` is in particles, `axes` how many space has. Blocks that are the same everywhere may be views of one.
+    `shape` is in particles, `axes` how many space has. Blocks that are the same everywhere may be
+    views of one.
     """
 
     shape: tuple[int, int]

@@ -36,8 +36,8 @@ class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
     `followers` and `leaders` are rows of the particle table; in the plane unknown 2n is x of the
-    n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by particle; of those with
-    leaders, `couplings_shown` is the share that frame points show.
+    n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by
+    particle; of those with leaders, `couplings_shown` is the share that frame points show.
     """
 
     followers: Indices

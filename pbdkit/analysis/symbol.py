@@ -1,8 +1,8 @@
 """How a rule answers plane waves on the infinite lattice: a bound that costs milliseconds.
 
 A displacement exp(iθ·c) over repeat cells c is multiplied in a step by the symbol, a matrix of
-blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as long as
-its frame copies or mirrors.
+blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as
+long as its frame copies or mirrors.
 """
 
 from __future__ import annotations
@@ -85,14 +85,16 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 
 def _symbols(scene: Scene) -> Complex:
-    """(wave, axes · S, axes · S): the rule's step on plane waves, of which opposite ones answer alike."""
+    """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
+    alike."""
     stencil = linearised(scene)
     angle = 2 * np.pi * np.arange(WAVES) / WAVES
     half = angle[: WAVES // 2 + 1]
     axes, waves = scene.axes, [half, *[angle] * (scene.axes - 1)]
     theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
     size = axes * len(stencil.own)
-    symbols = np.zeros((len(theta), size, size), complex) + np.eye(size)
+    symbols: Complex = np.zeros((len(theta), size, size), complex)
+    symbols += np.eye(size)
     of = [slice(axes * s, axes * (s + 1)) for s in range(len(stencil.own))]
     for s, own in enumerate(stencil.own):
         symbols[:, of[s], of[s]] += own

@@ -21,7 +21,8 @@ from pbdkit.results.gradient import displacement_gradient
 from pbdkit.results.tables import Tables
 from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.mesh import Patch
-from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.stepping.evaluator import summed
 from pbdkit.stepping.remembering import describe_bonds

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.raster import EMPTY, FOLLOWER, Block, Raster
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 
 
 @dataclass(frozen=True)

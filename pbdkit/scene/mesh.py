@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import FOLLOWER, Block, Raster
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER, Raster
 
 CELLS_AT_ONCE = 65536
 """So many are looked at together, so that temporaries stay small."""
