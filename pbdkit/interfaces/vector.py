@@ -35,7 +35,7 @@ class Components(tuple[Any, ...]):
 
     def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
         """The vector of function(component, ...), component by component."""
-        return type(self)(*map(function, self, *others))
+        return type(self)(*(function(*parts) for parts in zip(self, *others, strict=True)))
 
     def __add__(self, other: Any) -> Self:
         return self.each(operator.add, other)
