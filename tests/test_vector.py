@@ -41,9 +41,7 @@ OPERATIONS = {
     "length": (lambda a, b, s: pbdkit.length(a), lambda a, b, s: [math.sqrt(dotted(a, a))]),
     "formula": (
         lambda a, b, s: (1.0 - s) * a + s * b - (a + b) / s,
-        lambda a, b, s: [
-            ((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)
-        ],
+        lambda a, b, s: [((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)],
     ),
 }
 """By name: of vectors a and b and a positive number s; and the same of plain numbers."""
@@ -109,7 +107,7 @@ def test_other_numbers_of_components_are_refused():
         vector(range(4))
     plane, space = pbdkit.Vector(1.0, 2.0), pbdkit.SpaceVector(1.0, 2.0, 3.0)
     for one, other in ((plane, space), (space, plane)):
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
             one + other
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
             pbdkit.dot(one, other)
