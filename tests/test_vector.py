@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pbdkit
@@ -41,9 +41,7 @@ OPERATIONS = {
     "length": (lambda a, b, s: pbdkit.length(a), lambda a, b, s: [math.sqrt(dotted(a, a))]),
     "formula": (
         lambda a, b, s: (1.0 - s) * a + s * b - (a + b) / s,
-        lambda a, b, s: [
-            ((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)
-        ],
+        lambda a, b, s: [((1.0 - s) * x + s * y) - (x + y) / s for x, y in zip(a, b, strict=True)],
     ),
 }
 """By name: of vectors a and b and a positive number s; and the same of plain numbers."""
@@ -69,6 +67,7 @@ def bits(answer):
 def test_plain_numbers_are_the_definition(space, name):
     of_vectors, of_numbers = OPERATIONS[name]
 
+    @settings(deadline=None)  # the first example is compiled
     @given(in_space(space))
     def agree(drawn):
         a, b, s = drawn
@@ -109,7 +108,7 @@ def test_other_numbers_of_components_are_refused():
         vector(range(4))
     plane, space = pbdkit.Vector(1.0, 2.0), pbdkit.SpaceVector(1.0, 2.0, 3.0)
     for one, other in ((plane, space), (space, plane)):
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match="argument 2 is"):
             one + other
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match="argument 2 is"):
             pbdkit.dot(one, other)

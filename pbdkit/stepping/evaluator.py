@@ -8,7 +8,6 @@ against this.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,44 +28,16 @@ from pbdkit.interfaces import (
 from pbdkit.interfaces.answers import as_values, as_vector, as_verdict
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster, Where
+from pbdkit.scene.raster import FOLLOWER, Where
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.remembering import changing, renew, shown
 from pbdkit.stepping.state import State
+from pbdkit.stepping.surroundings import Around, Mask, Neighbour, presence, read_only
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
-Mask = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
-
-
-@dataclass(frozen=True)
-class Neighbour:
-    """One neighbour of some particles, or of one: its rest offset r and the rule's weights w; where
-    it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
-    constants c of the bond, what is remembered of it included."""
-
-    r: Components
-    w: Any
-    present: Mask | None = None
-    broken: Mask | None = None
-    c: Any = None
-
-
-@dataclass(frozen=True)
-class Around:
-    """What stays as it is around some particles: their slots with weights and presence, X and its
-    distance from the middle of the body where the rule asks for them, and where particles of the
-    body have a neighbour (None: everywhere)."""
-
-    where: Where
-    slots: tuple[Slot, ...]
-    weights: tuple[Any, ...]
-    present: tuple[Mask | None, ...]
-    X: Any
-    centred: Any
-    movable: Mask | None
 
 
 class Evaluator:
@@ -75,7 +46,7 @@ class Evaluator:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self.rule: FollowerRule = scene.experiment.rule
-        self._model = scene.experiment.fracture if scene.has_fracture else None
+        self._model = scene.experiment.fracture
         self._softens = self._model if isinstance(self._model, Softens) else None
         self._p, self._q = scene.constants.rule, scene.constants.fracture
 
@@ -95,7 +66,7 @@ class Evaluator:
         """The difference that the rule sees: softened, or that of the fictitious point where the
         bond broke."""
         model = self._model
-        if model is None or (to.broken is None and to.c is None):
+        if to.broken is None and to.c is None:
             return d
         with blaming(model, "to place a fictitious point"):
             lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
@@ -136,7 +107,6 @@ class Evaluator:
 
     def breaks(self, d: Components, r: Components, limits: Any, own: Sequence[Any]) -> Any:
         """Whether bonds break that remember these numbers."""
-        assert self._model
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
 
@@ -242,24 +212,6 @@ class Evaluator:
             own = shown([home.within(value[plane]) for value in state.bond_values])
             c = self._scene.constants.of_bond(*self._scene.constants.limits[slot], *own)
         return (broken if broken.any() else None), c
-
-
-def read_only(v: Any) -> Any:
-    """The same, as components hand it to a rule: nobody writes to the state but the stepper."""
-    for plane in v:
-        plane.flags.writeable = False
-    return v
-
-
-def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:
-    """For each slot, where the neighbour exists, None where it does everywhere; only places with a
-    particle count."""
-    nobody = place.of(raster.kind) == EMPTY
-    found: list[Mask | None] = []
-    for slot in slots:
-        present = place.seen_through(slot).of(raster.kind) != EMPTY
-        found.append(None if (present | nobody).all() else present)
-    return found
 
 
 def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:

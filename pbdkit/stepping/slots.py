@@ -11,10 +11,11 @@ from pbdkit.experiment.solvers import Equilibrium, Stepping
 from pbdkit.interfaces import Here, RenewsParticles, StoresEnergy
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Around, Contributions, Evaluator
+from pbdkit.stepping.evaluator import Contributions, Evaluator
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.remembering import changing, renew
 from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import Around
 
 
 class SlotFollowers(Followers):
