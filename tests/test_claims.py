@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from finite_elements.lattices import between_edges, error_at, solved
 from finite_elements.problems import BAR, CANTILEVER
-from paper_cases import QUIET, body_u, parted
+from paper_cases import QUIET, body_u, parted, run
 from paper_page import DOCS, measured, verdict
 
 import pbdkit
@@ -18,6 +18,8 @@ CORRECTED = {
     "standard Cauchy model": "comes out only with `elastic` and `natural`",
     "isotropic … elastic behaviour": "comes out only with distance-weighted on the hexagonal",
     "simulate Hook law": "does not come out",
+    "subject to Hook law [PE1]": "comes out only with the hexagonal lattice",
+    "behaviour of different materials": "comes out only with `elastic`",
     "plastic-like": "does not come out",
     "between the GPU cores": "comes out only with threads of a processor",
     "in a less pronounced way": "comes out only with late times",
@@ -121,6 +123,20 @@ def test_what_the_paper_s_rules_are():
     assert (net.kind, net.symmetry) == ("elasticity", "isotropic")
     assert net.poisson_ratio == pytest.approx(-3 / 7, abs=1e-12)
     assert net.spectrum.largest_stable_relaxation == pytest.approx(0.8533, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("lattice", "tension", "shear"), [("square", 2.0, 0.0), ("hexagonal", 2.25, 0.75)]
+)
+def test_pe1_is_an_elastic_energy_on_the_hexagonal_lattice_only(lattice, tension, shear):
+    """Of ν = 1/3: four times E / (2 (1 - ν²)) and E / (4 (1 + ν)), times the square of a strain."""
+    for gradient, expected in (([[1, 0], [0, 0]], tension), ([[0, 0.5], [0.5, 0]], shear)):
+        strain = 1e-3 * np.array(gradient)
+        started = f"initial={{type: affine, gradient: {strain.tolist()}}}"
+        settings = [f"lattice={{type: {lattice}, a: 1.0}}", started, "leaders=[]", "steps=1"]
+        ds = run("a", *settings, "diagnostics=[{type: pe1}]")
+        inside = (ds.site.values == (5, 5)).all(axis=1)
+        assert ds.pe1.values[0, inside] / 1e-6 == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("relaxation", [1.0, 0.3])

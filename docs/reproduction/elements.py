@@ -22,6 +22,12 @@ BARYCENTRE = {
 }
 WANTED, SIMILAR = "1e-3", 0.01
 CASES, LATTICES = ("a", "b", "c", "f1", "f2"), ("square", "hexagonal")
+NEIGHBOURHOODS = {
+    "square, 4": (),
+    "square, 8": ("neighbours.shells=2",),
+    "square, 24": ("neighbours={type: chebyshev, shells: 2}",),
+    "hexagonal, 6": ("lattice={type: hexagonal, a: 1.0}",),
+}
 WEIGHTED = "rule={type: distance-weighted}"
 ELASTIC = "rule={type: elastic, poisson_ratio: 0.3}"
 
@@ -100,6 +106,8 @@ def _cauchy() -> list[Claim]:
     square, hexagonal = weighted.values()
     bound = hexagonal.spectrum.largest_stable_relaxation
     found = ", ".join(f"{kind} ({name})" for name, kind in kinds.items())
+    means = {n: _identified(*settings) for n, settings in NEIGHBOURHOODS.items()}
+    speeds = ", ".join(f"{m.diffusivity:.3f} ({n})" for n, m in means.items())
     of_weights = (
         f"distance-weighted is {hexagonal.symmetry} elasticity with ν = "
         f"{hexagonal.poisson_ratio:.3f} on the hexagonal lattice, and has the symmetry of a "
@@ -125,5 +133,14 @@ def _cauchy() -> list[Claim]:
             all(kind == "elasticity" for kind in kinds.values()),
             f"distance-weighted on the hexagonal lattice, relaxation below {bound:.3f}",
             (hexagonal.kind, hexagonal.symmetry) == ("elasticity", "isotropic") and bound > 0,
+        ),
+        Claim(
+            "describe the behaviour of different materials, by changing some parameters",
+            f"under the barycentre lattice and neighbours change the diffusivity only: {speeds} "
+            f"square spacings a step. {of_weights.capitalize()}. K is no material's constant",
+            any(m.kind == "elasticity" for m in means.values()),
+            "`elastic`, `orthotropic`, `strain-gradient` and `springs`, not the paper's "
+            "([materials](materials.md))",
+            calibrated.kind == "elasticity",
         ),
     ]

@@ -6,7 +6,7 @@ from claims import Claim, Section
 from cost import cost
 from drawing import curves
 from elements import elements
-from hooke import hooke
+from hooke import energy, hooke
 from one_threshold import which
 from runs import Floats, Sheet, parted, run, run_text
 from waves import softening
@@ -104,6 +104,7 @@ def _rules() -> list[Claim]:
             bool((soft[("chebyshev", 2)] > 1).all()),
         ),
         hooke(),
+        energy(),
         Claim(
             "force the followers movement to overcome the baricenter … to oscillate",
             "a relaxation of 1.1 with noise of 1e-6 makes rows differ by "

@@ -1,11 +1,16 @@
-"""Whether neighbours that are weighted by their distance make Hooke's law."""
+"""Whether neighbours that are weighted by their distance make Hooke's law, and PE1 its energy."""
 
 import numpy as np
 from claims import Claim
 from runs import run, run_parts
 
+STRAIN = 1e-3
 WAYS = (0.1, 0.5, 1.0, 2.0)
 RELAXATIONS = (1.0, 0.6, 0.3)
+LATTICES = ("square", "hexagonal")
+STRAINS = ([[STRAIN, 0.0], [0.0, 0.0]], [[0.0, STRAIN / 2], [STRAIN / 2, 0.0]])
+ENERGIES = (0.5 / (1 - 1 / 9), 0.25 / (1 + 1 / 3))
+"""Per area and square of the strain: ε_xx alone, E / (2 (1 - ν²)), and shear, E / (4 (1 + ν))."""
 
 
 def pull(way: float, relaxation: float) -> float:
@@ -51,3 +56,33 @@ def hooke() -> Claim:
         "400",
         bool(np.ptp(ratios) < 0.01 * ratios.mean()),
     )
+
+
+def energy() -> Claim:
+    """What the paper says of PE1, against the energy of an elastic sheet of ν = 1/3."""
+    square, net = ([_pe1(lattice, gradient) for gradient in STRAINS] for lattice in LATTICES)
+    elastic = [4 * w for w in ENERGIES]
+    off = max(abs(found / exact - 1) for found, exact in zip(net, elastic, strict=True))
+    return Claim(
+        "potential energy of material points subject to Hook law [PE1]",
+        f"PE1 over the square of a strain of {STRAIN:g}: {square[0]:.3f} in tension along x, "
+        f"{square[1]:.1g} in shear on the square lattice with 4 neighbours, which is blind to it; "
+        f"{net[0]:.3f} and {net[1]:.3f} on the hexagonal one. That is four times the energy of "
+        f"an elastic sheet of ν = 1/3, E = 1 ({elastic[0]:.3f} and {elastic[1]:.3f}), within "
+        f"{off:.0e}",
+        square[1] > 0.01,
+        "the hexagonal lattice",
+        off < 0.01,
+    )
+
+
+def _pe1(lattice: str, gradient: list[list[float]]) -> float:
+    """PE1 of a particle inside a uniformly strained sheet, over the square of the strain."""
+    sheet = run_parts(
+        lattice={"type": lattice, "a": 1.0},
+        body={"type": "grid", "columns": 6, "rows": 6},
+        initial={"type": "affine", "gradient": gradient},
+        steps=1,
+        diagnostics=[{"type": "pe1"}],
+    )
+    return float(sheet.of("pe1")[0, 3, 3]) / STRAIN**2
