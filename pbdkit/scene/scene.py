@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Cell, Components, Remembers, Setting
+from pbdkit.interfaces import Cell, Components, Setting
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
@@ -24,6 +24,7 @@ from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.measuring import check_diagnostics
 from pbdkit.scene.mesh import Patch, body_cells
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.nested import inner_experiment
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
 from pbdkit.scene.sizes import refuse_too_large
@@ -133,33 +134,17 @@ def _build(experiment: Experiment) -> Scene:
     cells = filling.on(raster, tiling) if frame.weighs_cells else None
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     scene = Scene(experiment, *parts, tuple(warnings))
-    return replace(scene, inner=_inner(scene))
+    return with_inner(scene)
 
 
-def _inner(scene: Scene) -> Scene | None:
-    """The scene with the rule's inner rule in its place."""
-    experiment, rule = scene.experiment, scene.experiment.rule
-    if not isinstance(rule, AppliesTwice):
-        return None
-    with blaming(rule, "when asked for its inner rule", "rule"):
-        inner = rule.inner()
-    remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
-    for unfit, part, remedy in (
-        (scene.frame, "frame", "{type: natural}, which has no points"),
-        (scene.has_fracture, "fracture", "{type: none}"),
-        (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
-        (remembers, "rule", "one that remembers nothing"),
-    ):
-        if unfit:
-            raise ExperimentError(
-                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
-                f"this {part}; take {part}: {remedy}",
-                (part,),
-            )
-    experiment = experiment.model_copy(update={"rule": inner})
-    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    scene = replace(scene, experiment=experiment, constants=constants)
-    return replace(scene, inner=_inner(scene))
+def with_inner(scene: Scene) -> Scene:
+    """The scene with that of its inner rule, where the rule works on the moves of another."""
+    lags = scene.frame is not None and scene.frame.map.lag == 1
+    inner = inner_experiment(scene.experiment, lags=lags)
+    if inner is None:
+        return scene
+    constants = ask_for_constants(inner, setting_of(scene.raster, scene.neighbourhood))
+    return replace(scene, inner=with_inner(replace(scene, experiment=inner, constants=constants)))
 
 
 def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:
