@@ -31,16 +31,11 @@ class Springs(FollowerRule):
 
     def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
         """Half the spring's stiffness, for each of the cells beside it, and its rest length."""
-        rests = [math.hypot(*s.rest) for s in setting.slots[slot.source]]
-        edge = min(rests)
-        diagonals = sum(math.isclose(rest, edge * math.sqrt(2.0)) for rest in rests)
-        edges = sum(math.isclose(rest, edge) for rest in rests)
-        if (edges, diagonals) == (6, 0) and len(rests) == 6:
-            return OF_TRIANGLE / 2, math.hypot(*slot.rest)
-        if (edges, diagonals) == (4, 4) and len(rests) == 8:
-            is_edge = math.isclose(math.hypot(*slot.rest), edge)
-            half = (EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2
-            return half, math.hypot(*slot.rest)
+        cells, rest = setting.cells, math.hypot(*slot.rest)
+        if cells.regular == 3:
+            return OF_TRIANGLE / 2, rest
+        if cells.regular == 4:
+            return (DIAGONAL_OF_SQUARE if cells.is_diagonal(slot) else EDGE_OF_SQUARE) / 2, rest
         raise ExperimentError(
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"

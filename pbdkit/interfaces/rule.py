@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.polygons import Tiling
 from pbdkit.interfaces.remembered import Drawn, Particles, Remembered, is_own
 
 
@@ -43,12 +44,13 @@ class Stiffness(NamedTuple):
 class Setting:
     """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
     the box (`lower`, `upper`) of the body's reference configuration, frame not included, from the
-    lattice's site (0, 0)."""
+    lattice's site (0, 0). `cells` are the lattice's cells, and which of them lie beside a slot."""
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
     lower: Vector
     upper: Vector
+    cells: Tiling = field(default_factory=Tiling)
 
 
 class FollowerRule(Component):

@@ -12,14 +12,13 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Cell, Setting, Vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
-from pbdkit.scene.cells import Cells, Tiling, tiling_of
+from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.constants import SceneConstants, ask_for_constants
-from pbdkit.scene.cutting import Filling, fill_with_cells
+from pbdkit.scene.cut_cells import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
 from pbdkit.scene.leading import Leading, build_leading
 from pbdkit.scene.measuring import check_diagnostics
-from pbdkit.scene.mesh import Patch, body_cells
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
@@ -43,7 +42,7 @@ class Scene:
     raster: Raster
     constants: SceneConstants
     frame: Frame | None
-    cells: Cells | None
+    cells: WeighedCells | None
     inner: Scene | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
@@ -72,7 +71,7 @@ class Scene:
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
         """The cells of the body."""
-        return body_cells(self.raster)
+        return patches(self.raster, self.neighbourhood.tiling)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -97,13 +96,13 @@ def _build(experiment: Experiment) -> Scene:
     extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
     refuse_too_large(experiment, neighbourhood, extent, layers)
     if frame.weighs_cells:
-        filling, tiling = _cells(experiment, neighbourhood)
+        filling = _filling(experiment, neighbourhood)
         body, first = filling.body, filling.first
     else:
         body, first = fill(experiment.body, experiment.lattice)
     warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
-    warnings += check_diagnostics(experiment, raster)
+    warnings += check_diagnostics(experiment, raster, neighbourhood)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
@@ -115,7 +114,7 @@ def _build(experiment: Experiment) -> Scene:
     leading = build_leading(raster, experiment.leaders, experiment.steps, at_rest=at_rest)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
-    cells = filling.on(raster, tiling) if frame.weighs_cells else None
+    cells = filling.on(raster, neighbourhood.tiling) if frame.weighs_cells else None
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     scene = Scene(experiment, *parts, tuple(warnings))
     return replace(scene, inner=_inner(scene))
@@ -146,7 +145,7 @@ def _inner(scene: Scene) -> Scene | None:
     return replace(scene, inner=_inner(scene))
 
 
-def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:
+def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
     frame, rule = experiment.frame, experiment.rule
     if not rule.uses_cells:
         raise ExperimentError(
@@ -155,9 +154,14 @@ def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Fillin
             "barycentre), or another frame",
             ("frame",),
         )
-    with blaming(frame, "when asked for the cells", "neighbours"):
-        tiling = tiling_of(neighbourhood)
-    return fill_with_cells(experiment.body, experiment.lattice, tiling), tiling
+    if not neighbourhood.tiling.beside:
+        raise ExperimentError(
+            "the neighbours of a site are not the corners of the cells around it: take 8 on the "
+            "square or the rectangular lattice ({type: chebyshev, shells: 1}), 6 on the hexagonal "
+            "one ({type: coordination, shells: 1})",
+            ("neighbours",),
+        )
+    return fill_with_cells(experiment.body, experiment.lattice, neighbourhood.tiling)
 
 
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
@@ -168,7 +172,8 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
         x = np.array(positions(cell, *raster.cells_of(rows[raster.table_kind[rows] == FOLLOWER])))
         lower = np.minimum(lower, x.min(axis=1, initial=np.inf))
         upper = np.maximum(upper, x.max(axis=1, initial=-np.inf))
-    return Setting(cell, neighbourhood.slots, Vector(*lower.tolist()), Vector(*upper.tolist()))
+    box = Vector(*lower.tolist()), Vector(*upper.tolist())
+    return Setting(cell, neighbourhood.slots, *box, neighbourhood.tiling)
 
 
 def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pbdkit.interfaces import Slot
-from pbdkit.scene.cells import Tiling
+from pbdkit.interfaces.polygons import Tiling
 
 INDENT = "    "
 

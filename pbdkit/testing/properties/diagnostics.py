@@ -94,8 +94,8 @@ def takes_rows_in_any_order(subject: Subject) -> None:
         expected = np.asarray(one)
         for axis, dim in enumerate(variable.dims):
             expected = np.take(expected, order, axis) if dim == "particle" else expected
-        size = float(np.abs(expected).max(initial=1e-300))
-        if not (np.abs(np.asarray(other) - expected) <= ROUNDING * size).all():
+        size = float(np.nanmax(np.abs(expected), initial=1e-300))
+        if not np.allclose(other, expected, rtol=0.0, atol=ROUNDING * size, equal_nan=True):
             raise PropertyError(
                 f"'{variable.name}' depends on the order of the rows: ask `now.rows(numbers)` for "
                 "particles by number"
