@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
+
+import numpy as np
 
 from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.lattice import Offset
@@ -102,3 +104,11 @@ def area_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
     """The signed area of a polygon whose corners have gone by d from r, over that at rest."""
     now = [Vector(a.x + b.x, a.y + b.y) for a, b in zip(r, d, strict=True)]
     return signed_area(now) / signed_area(r)
+
+
+def corner_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
+    """The smallest of the same of the triangles at its corners, each spanned by the two sides that
+    meet there: all are positive exactly where a polygon is convex and the right way round."""
+    triples = [(k - 1, k, (k + 1) % len(r)) for k in range(len(r))]
+    shares = (area_share([d[k] for k in three], [r[k] for k in three]) for three in triples)
+    return reduce(np.minimum, shares)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import Vector
 from pbdkit.interfaces.diagnostic import CellValues
-from pbdkit.interfaces.polygons import area_share
+from pbdkit.interfaces.polygons import area_share, corner_share
 from pbdkit.results.gradient import displacement_gradient
 from pbdkit.results.tables import Tables, read_only
 from pbdkit.scene.cells import Patch
@@ -56,15 +56,24 @@ class StateCells(CellValues):
         return read_only(self._tables.of_body(planes).reshape(-1, 2, 2))
 
     def inside_out(self) -> str | None:
-        """A warning where cells have turned over, with how many and a particle of the worst; None
-        where none has: a rule of positions does not mind, a body does. Torn cells do not count:
-        the parts of a broken body go their own ways."""
+        """A warning where cells have turned over or, if none has, corners of cells; None where none
+        has: a rule of positions does not mind, a body does. Torn cells do not count: the parts of a
+        broken body go their own ways."""
+        remedy = "let the leaders go less far, or weaken the rule where it couples x and y"
+        if found := self._turned(area_share, "cells have turned over"):
+            return f"the last state is inside out: {found}; {remedy}"
+        if found := self._turned(corner_share, "cells have a corner that has turned over"):
+            return f"the last state is folded: {found}; {remedy}"
+        return None
+
+    def _turned(self, share: Callable[..., Any], what: str) -> str | None:
+        """Of how many cells the share of the area at rest is negative, and where it is worst."""
         turned = total = number = 0
         worst = 0.0
         for patch in self._scene.patches:
             counted = self._intact(patch)
             with np.errstate(all="ignore"):
-                area = area_share(patch.differences(self._state.u), patch.polygon.rest)
+                area = share(patch.differences(self._state.u), patch.polygon.rest)
                 area = np.where(counted & (area < TURNED), area, 0.0)
             turned += int(np.count_nonzero(area))
             total += int(np.count_nonzero(counted))
@@ -75,9 +84,8 @@ class StateCells(CellValues):
         if not turned:
             return None
         return (
-            f"the last state is inside out: {turned} of {total} cells have turned over, the worst, "
-            f"at particle {number}, to {worst:.3g} of its area at rest; let the leaders go less "
-            "far, or weaken the rule where it couples x and y"
+            f"{turned} of {total} {what}, the worst, at particle {number}, to {worst:.3g} of its "
+            "area at rest"
         )
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:

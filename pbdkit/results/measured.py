@@ -62,15 +62,17 @@ class Measured:
         a length."""
         taken, columns = layout.reserved_names(), list(self._remembered)
         for column in columns:
-            _refuse_taken(column.name, taken, f"a part remembers of each {column.dims[-1]}")
+            _refuse_taken(
+                column.name, taken, f"a part remembers '{column.name}' of each {column.dims[-1]}"
+            )
         for _, diagnostic in self._diagnostics:
             own, whose = diagnostic.coordinates(), f"Diagnostic '{diagnostic.type}' declares"
             for name in (*own, *filter(None, [diagnostic.own_dimension])):
-                _refuse_taken(name, taken, f"{whose} the dimension")
+                _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
             columns += [layout.own_coordinate(n, v.dtype.str[1:]) for n, v in own.items()]
             known = {*self.sizes, "time", "step", diagnostic.own_dimension}
             for variable in diagnostic.variables():
-                _refuse_taken(variable.name, taken, f"{whose} the variable")
+                _refuse_taken(variable.name, taken, f"{whose} the variable '{variable.name}'")
                 if unknown := [dim for dim in variable.dims if dim not in known]:
                     raise PluginError(
                         f"{whose} the variable '{variable.name}' with the dimension "
@@ -136,7 +138,7 @@ class Measured:
 def _refuse_taken(name: str, taken: set[str], what: str) -> None:
     """Raises PluginError for a name that stands in the dataset already; afterwards it does."""
     if name in taken:
-        raise PluginError(f"{what} '{name}', and that name is taken in the dataset; give another")
+        raise PluginError(f"{what}, and that name is taken in the dataset; give it another")
     taken.add(name)
 
 
