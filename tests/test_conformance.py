@@ -76,6 +76,7 @@ FAULTS = [
     (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
     (others.Measures, "returns-a-value-a-particle", "`breaks` returns float64: compare"),
     (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return `pbdkit.Vector"),
+    (others.TakesOurName, "labels-its-variables", "the dataset has 'site' already"),
     (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
     (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
     (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),

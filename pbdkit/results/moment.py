@@ -150,18 +150,17 @@ class StateMoment(Moment):
 
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""
-        bonds, particles = (
-            bond_numbers(self._scene.experiment),
-            particle_numbers(self._scene.experiment),
-        )
-        names = [number.name for number in (*bonds, *particles)]
-        if name not in names:
-            raise ValueError(f"no part remembers '{name}'{did_you_mean(name, names)}")
-        n = names.index(name)
-        if n < len(bonds):
-            return read_only(self._of_bonds(self._state.bond_values[n]))
-        values = self._state.particle_values[n - len(bonds)]
-        return read_only(self._raster.table(values[None])[:, 0])
+        experiment, state = self._scene.experiment, self._state
+        own = [number.name for number in bond_numbers(experiment)]
+        of_bonds = dict(zip(own, state.bond_values, strict=True))
+        own = [number.name for number in particle_numbers(experiment)]
+        of_particles = dict(zip(own, state.particle_values, strict=True))
+        if name in of_bonds:
+            return read_only(self._of_bonds(of_bonds[name]))
+        if name in of_particles:
+            return read_only(self._raster.table(of_particles[name][None])[:, 0])
+        known = [*of_bonds, *of_particles]
+        raise ValueError(f"no part remembers '{name}'{did_you_mean(name, known)}")
 
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
         """Values on the planes of bonds, (bond,)."""

@@ -50,11 +50,10 @@ class Patch:
 
     def bonds(self, slots: Slots) -> list[tuple[Block, Slot]]:
         """The bonds between corners: the block where they start, and their slot."""
-        found, corners = [], self.polygon.corners
+        corners, found = self.polygon.corners, []
         for k, a in enumerate(corners):
-            ahead = {(b.target, b.cell[0] - a.cell[0], b.cell[1] - a.cell[1])
-                     for b in corners[k + 1 :]}  # fmt: skip
-            own = [slot for slot in slots[a.target] if (slot.target, *slot.cell) in ahead]
+            ahead = {_step(a, b) for b in corners[k + 1 :]}
+            own = [slot for slot in slots[a.target] if (slot.target, slot.cell) in ahead]
             found += [(self.corners[k], slot) for slot in own]
         return found
 
@@ -146,31 +145,24 @@ def _beside(
 ) -> dict[Slot, tuple[Side, Side]]:
     """The cells beside every slot, where the neighbours are the corners of simple cells."""
     every = [(kind, polygon) for own in polygons for kind, polygon in enumerate(own)]
-    if not all(_is_simple(polygon) for _, polygon in every):
-        return {}
     found: dict[Slot, tuple[Side, Side]] = {}
     for s, own in enumerate(slots):
         slot_of = {(slot.target, slot.cell): slot for slot in own}
-        met: set[Step] = set()
         left: dict[Step, Side] = {}
         right: dict[Step, Side] = {}
         for kind, polygon in every:
-            for start, here in enumerate(polygon.corners):
-                if here.target != s:
-                    continue
-                keys = [_step(here, corner) for corner in polygon.corners]
-                met |= set(keys[:start] + keys[start + 1 :])
-                first = slot_of.get(keys[0])
-                for end, key in enumerate(keys):
-                    side = Side(kind, first, start, end)
-                    if (end - start) % len(keys) not in (0, len(keys) - 1):
-                        left[key] = side
-                    if (end - start) % len(keys) > 1:
-                        right[key] = side
-        if met != set(slot_of):
+            n = len(polygon.corners)
+            for start in (k for k in range(n) if polygon.corners[k].target == s):
+                keys = [_step(polygon.corners[start], corner) for corner in polygon.corners]
+                for ahead in range(1, n):
+                    end = (start + ahead) % n
+                    side = Side(kind, slot_of.get(keys[0]), start, end)
+                    left |= {keys[end]: side} if ahead < n - 1 else {}
+                    right |= {keys[end]: side} if ahead > 1 else {}
+        if not left.keys() == right.keys() == slot_of.keys():
             return {}
         found |= {slot: (left[key], right[key]) for key, slot in slot_of.items()}
-    return found
+    return found if all(_is_simple(polygon) for _, polygon in every) else {}
 
 
 def _step(here: Offset, there: Offset) -> Step:
@@ -180,12 +172,10 @@ def _step(here: Offset, there: Offset) -> Step:
 
 def _is_simple(polygon: Polygon) -> bool:
     """Whether it is a triangle or a parallelogram, whose triangles around the middle are equal."""
-    _, *others = polygon.rest
-    if len(others) != 3:
-        return len(others) == 2
-    one, middle, other = others
-    off = math.hypot(one.x + other.x - middle.x, one.y + other.y - middle.y)
-    return off <= 1e-6 * math.hypot(*middle)
+    r = polygon.rest
+    if len(r) != 4:
+        return len(r) == 3
+    return math.dist(r[2], (r[1].x + r[3].x, r[1].y + r[3].y)) <= 1e-6 * math.hypot(*r[2])
 
 
 def _reach(cell: Cell) -> float:
