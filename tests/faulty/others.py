@@ -247,7 +247,7 @@ class TakesOurName(Extent):
         return {"site": np.arange(3)}
 
     def measure(self, now):
-        return (super().measure(now)[0][:3],)
+        return (np.zeros(3),)
 
 
 class OneShort(Extent):
