@@ -22,6 +22,7 @@ from pbdkit.analysis.region import (
 )
 from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
 from pbdkit.experiment.solvers import Equilibrium
+from pbdkit.interfaces import Anchors
 from pbdkit.scene.scene import Scene
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
@@ -174,14 +175,14 @@ class Analysis:
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
         led[label[np.unique(operator.entries_led.rows)]] = True
-        numbers = operator.followers[np.arange(len(label)) // 2] + 1
+        numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)
 
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         found = []
-        anchored = self.scene.frame is not None and self.scene.experiment.frame.anchors()
+        anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored else self.parts_without_leader
         if len(parts) > 3:
             found.append(

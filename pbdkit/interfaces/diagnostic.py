@@ -10,10 +10,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.remembered import Bonds
 from pbdkit.interfaces.rule import Stiffness
+from pbdkit.interfaces.values import Bonds
 
 Floats = NDArray[np.floating[Any]]
 Need = Literal["bonds", "cells", "material", "forces"]
@@ -68,13 +67,13 @@ class CellValues(ABC):
     @abstractmethod
     def over(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> Floats:
         """function(d, r) of every cell whose corners are all of the body, (cell,).
 
-        d and r hold a Vector a corner, counter-clockwise: d[k] = u_k - u_0, r[k] = X_k - X_0; r is
+        d and r hold a vector a corner, counter-clockwise: d[k] = u_k - u_0, r[k] = X_k - X_0; r is
         constant. Elementwise, and called once a shape and part of the body. Cells with a broken
         bond between corners count unless `intact_only`.
         """
@@ -153,7 +152,7 @@ class Moment(ABC):
 
     @abstractmethod
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """Σ_k function(d, r) over the reference neighbours k of each body particle, (particle,).
 

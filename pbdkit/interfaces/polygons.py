@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.lattice import Offset
 from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.vector import Components
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Polygon:
     corners: tuple[Offset, ...]
 
     @cached_property
-    def rest(self) -> tuple[Vector, ...]:
+    def rest(self) -> tuple[Components, ...]:
         """X_k - X_0 of the corners, lattice units."""
         return tuple(corner.rest for corner in self.corners)
 
@@ -102,7 +102,7 @@ def signed_area(corners: Sequence[Any]) -> Any:
 
 def area_share(d: Sequence[Any], r: Sequence[Any]) -> Any:
     """The signed area of a polygon whose corners have gone by d from r, over that at rest."""
-    now = [Vector(a.x + b.x, a.y + b.y) for a, b in zip(r, d, strict=True)]
+    now = [a + b for a, b in zip(r, d, strict=True)]
     return signed_area(now) / signed_area(r)
 
 

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Vector
 from pbdkit.interfaces.diagnostic import CellValues
 from pbdkit.interfaces.polygons import area_share, corner_share
 from pbdkit.results.gradient import displacement_gradient
-from pbdkit.results.tables import Tables, read_only
+from pbdkit.results.tables import Tables, broken_along, read_only
 from pbdkit.scene.cells import Patch
 from pbdkit.stepping.state import Floats, State
 
@@ -29,7 +28,7 @@ class StateCells(CellValues):
 
     def over(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> Floats:
@@ -90,9 +89,9 @@ class StateCells(CellValues):
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:
         """Which cells of a patch have no broken bond between their corners."""
-        fracturing, broken, intact = self._tables.fracturing, self._state.broken_step, patch.whole
-        if fracturing is None or broken is None:
+        intact = patch.whole
+        if self._state.broken_step is None:
             return intact
         for block, slot in patch.bonds(self._scene.neighbourhood.slots):
-            intact = intact & ~fracturing.broken(block, slot, broken)
+            intact = intact & ~broken_along(self._scene, self._state, block, slot)
         return intact

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Diagnostic, Moment, Variable
+from pbdkit.interfaces import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values
@@ -24,12 +24,14 @@ class Measured:
     """The numbers and diagnostics of a scene that go into its dataset."""
 
     def __init__(self, scene: Scene) -> None:
-        fracture, rule = scene.experiment.fracture, scene.experiment.rule
+        experiment = scene.experiment
+        bonds_change = isinstance(experiment.fracture, RenewsBonds)
+        particles_change = isinstance(experiment.rule, RenewsParticles)
         self._scene = scene
-        self._diagnostics = list(enumerate(scene.experiment.diagnostics))
+        self._diagnostics = list(enumerate(experiment.diagnostics))
         numbers = [
-            *((n, "bond", fracture.updates()) for n in bond_numbers(scene.experiment)),
-            *((n, "particle", rule.remembers()) for n in particle_numbers(scene.experiment)),
+            *((n, "bond", bonds_change) for n in bond_numbers(experiment)),
+            *((n, "particle", particles_change) for n in particle_numbers(experiment)),
         ]
         self._remembered = [layout.remembered_column(*n) for n in numbers if n[0].recorded]
 
@@ -48,7 +50,7 @@ class Measured:
     def sizes(self) -> dict[str, int]:
         """The lengths of the dimensions that are known before the first step."""
         scene = self._scene
-        sizes = {"particle": scene.raster.count, "axis": 2, "index": 2}
+        sizes = {"particle": scene.raster.count, "axis": scene.axes, "index": scene.axes}
         if scene.shows_bonds:
             sizes |= {"bond": len(scene.bonds.ends), "end": 2}
         if self.shows_leaders:

@@ -11,19 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.experiment.leaders import Selection
-from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, Vector, length
+from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, length
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.rule import material_of
+from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
-from pbdkit.results.tables import Tables, read_only
+from pbdkit.results.tables import Tables, broken_along, read_only
 from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.stepping.evaluator import summed
 from pbdkit.stepping.remembering import describe_bonds
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import difference, sum_over_slots
 
 
 class StateMoment(Moment):
@@ -92,21 +94,20 @@ class StateMoment(Moment):
         return kinds_at(self._raster, self._scene.leading, self.step)
 
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """The loop of the stepper, on the body's particles."""
-        state, fracturing = self._state, self._tables.fracturing if intact_only else None
-        sums = np.full(self._raster.shape, np.nan)
+        state, sums = self._state, np.full(self._raster.shape, np.nan)
         for block, slots, present in self._tables.blocks:
 
             def contribution(slot: Slot, block: Any = block) -> tuple[Any, ...]:
-                value = function(difference(state.u, block, slot), slot.rest)
-                if fracturing is None or state.broken_step is None:
+                there = vector(block.seen_through(slot).of(state.u))
+                value = function(there - vector(block.of(state.u)), slot.rest)
+                if not intact_only or state.broken_step is None:
                     return (value,)
-                broken = fracturing.broken(block, slot, state.broken_step)
-                return (np.where(broken, 0.0, value),)
+                return (np.where(broken_along(self._scene, state, block, slot), 0.0, value),)
 
-            (total,) = sum_over_slots(slots, present, contribution)
+            (total,) = summed(zip(map(contribution, slots), present, strict=True))
             body = self._raster.kind[block.slices()] == FOLLOWER
             sums[block.slices()] = np.where(body, total, np.nan)
         return read_only(self._raster.table(sums[None])[:, 0])
@@ -179,7 +180,7 @@ class StateForces(ForceValues):
     @property
     def stiffness(self) -> Stiffness:
         """The rule's."""
-        stiffness = self._rule.stiffness()
+        stiffness = material_of(self._rule)
         if stiffness is None:
             raise ValueError(
                 f"the rule '{self._rule.type}' is not calibrated to a material: declare "

@@ -82,7 +82,7 @@ class Recorder:
         known: dict[str, Callable[[], Any]] = {
             "particle": lambda: numbers,
             "number": lambda: numbers,
-            "axis": lambda: np.array(["x", "y"]),
+            "axis": lambda: np.array(list("xyz"[: scene.axes])),
             "site": raster.site_table,
             "reference": raster.reference,
         }

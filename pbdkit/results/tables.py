@@ -8,12 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces import Slot
+from pbdkit.scene.places import Block
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.slots import SlotFollowers
-from pbdkit.stepping.state import Floats
-from pbdkit.stepping.sums import presence
+from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import presence
 
 Array = TypeVar("Array", bound=NDArray[Any])
 
@@ -23,6 +24,15 @@ def read_only(values: Array) -> Array:
     view: Array = values.view()
     view.flags.writeable = False
     return view
+
+
+def broken_along(scene: Scene, state: State, block: Block, slot: Slot) -> NDArray[np.bool_]:
+    """Where on a block the bond along a slot is broken, in a scene with fracture."""
+    assert state.broken_step is not None
+    plane, at_this_end = scene.neighbourhood.home[slot]
+    home = block if at_this_end else block.seen_through(slot)
+    broken: NDArray[np.bool_] = home.within(state.broken_step[plane]) >= 0
+    return broken
 
 
 class Tables:
@@ -59,14 +69,9 @@ class Tables:
         return read_only(self.raster.table_kind == FOLLOWER)
 
     @cached_property
-    def fracturing(self) -> Fracturing | None:
-        """The planes of bonds, where bonds can break."""
-        return Fracturing(self.scene) if self.scene.has_fracture else None
-
-    @cached_property
     def followers(self) -> SlotFollowers:
         """The rule on the scene, which knows forces and energy."""
-        return SlotFollowers(self.scene, self.fracturing)
+        return SlotFollowers(self.scene)
 
     @cached_property
     def blocks(self) -> list[tuple[Any, ...]]:

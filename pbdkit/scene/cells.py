@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Cell, Offset, Slot, Vector
+from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Side, Tiling
-from pbdkit.scene.raster import FOLLOWER, Block, Raster
+from pbdkit.scene.places import Block, Where
+from pbdkit.scene.raster import FOLLOWER, Raster
 
 Floats = NDArray[np.float64]
 Slots = tuple[tuple[Slot, ...], ...]
@@ -27,7 +28,10 @@ LEVEL = 1e-9
 
 
 def tiling_of(cell: Cell, slots: Slots) -> Tiling:
-    """The polygons of a lattice, each once a repeat cell, and those beside its slots."""
+    """The polygons of a lattice, each once a repeat cell, and those beside its slots; none but
+    in the plane."""
+    if len(cell.vectors) != 2:
+        return Tiling()
     polygons = tuple(_polygons(cell, s, slots[s]) for s in range(len(cell.sites)))
     return Tiling(polygons, _beside(polygons, slots))
 
@@ -88,17 +92,16 @@ class WeighedCells:
 
     def of(self, patch: Patch) -> Floats:
         """The shares of the cells of a patch."""
-        share: Floats = self.share[(patch.kind, *patch.corners[0].slices())]
-        return share
+        return patch.corners[0].of(self.share[patch.kind])
 
-    def beside(self, slot: Slot, block: Block, precision: str) -> tuple[Share, Share]:
-        """The shares to the left and the right of a slot on a block; 1 where all are whole."""
-        left, right = (self._seen(side, block, precision) for side in self.tiling.beside[slot])
+    def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
+        """The shares to the left and the right of a slot; 1 where all are whole."""
+        left, right = (self._seen(side, where, precision) for side in self.tiling.beside[slot])
         return left, right
 
-    def _seen(self, side: Side, block: Block, precision: str) -> Share:
-        there = block if side.first is None else block.seen_through(side.first)
-        share = self.share[(side.kind, *there.slices())]
+    def _seen(self, side: Side, where: Where, precision: str) -> Share:
+        there = where if side.first is None else where.seen_through(side.first)
+        share = there.of(self.share[side.kind])
         if (share == 1.0).all():
             return 1.0
         share = share.astype(precision)
@@ -135,7 +138,7 @@ def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon
     return tuple(sorted(found, key=lambda polygon: math.atan2(*polygon.rest[1][::-1])))
 
 
-def _is_ahead(r: Vector) -> bool:
+def _is_ahead(r: Components) -> bool:
     level = abs(r.y) <= LEVEL * math.hypot(*r)
     return bool(r.x > 0.0 if level else r.y > 0.0)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
-from pbdkit.interfaces import Lattice
+from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
@@ -98,7 +98,7 @@ class _Cutter:
         x, y = positions(self._cell, self._sublattice, m, n)
         self._x, self._y = x + lattice.origin[0], y + lattice.origin[1]
         self._tolerance = rounding_of(self._cell, self._x, self._y)
-        self._distance = self._signed(Sites(i, j, self._x, self._y))
+        self._distance = self._signed(Sites((i, j), Vector(self._x, self._y)))
 
     def shares(self, polygon: Polygon) -> tuple[Indices, Indices, Floats]:
         """(i, j, share) of the cells of that shape with a share, by the place of their first corner
@@ -134,7 +134,7 @@ class _Cutter:
         weights, small = _small_triangles()
         px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
         nowhere = np.zeros(px.shape, int)
-        distance = self._signed(Sites(nowhere, nowhere, px, py))
+        distance = self._signed(Sites((nowhere, nowhere), Vector(px, py)))
         share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
         cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
         a, b, c = (distance[corner][..., cut] for corner in small.T)

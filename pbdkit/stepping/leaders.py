@@ -24,7 +24,7 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
             continue
         begun = starts[n]
         if begun is None:
-            starts[n] = begun = state.u.reshape(2, -1)[:, leading.place].copy()
+            starts[n] = begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
         n_th = step - leading.group.from_ + 1
         offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
         led.append((leading.place, begun + np.atleast_2d(offset).T))
@@ -45,8 +45,7 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     apart = np.abs(np.diff(u[:, order], axis=1)).max(axis=0) > 1e-9 * max(1.0, np.abs(u).max())
     if (same & apart).any():
         place = places[order][:-1][same & apart][:1]
-        s, m, n = np.unravel_index(place, scene.raster.shape)
-        number = int(scene.raster.rows_at(s, m, n)[0]) + 1
+        number = int(scene.raster.rows_at(*np.unravel_index(place, scene.raster.shape))[0]) + 1
         raise ExperimentError(
             f"two groups move particle {number} differently in step {step}; select it in one of "
             "them only, or let one end before the other begins",
@@ -90,6 +89,6 @@ def is_cut_short(leading: Leading, steps: int) -> bool:
 
 def place(u: Floats, led: Led) -> None:
     """Puts leaders where they are prescribed."""
-    flat = u.reshape(2, -1)
+    flat = u.reshape(len(u), -1)
     for places, values in led:
         flat[:, places] = values

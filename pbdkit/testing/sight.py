@@ -18,7 +18,6 @@ from pbdkit.interfaces import (
     Moment,
     Pair,
     Stiffness,
-    Vector,
 )
 from pbdkit.interfaces.diagnostic import BondHistory, CellValues, ForceValues
 from pbdkit.interfaces.frame import Indices
@@ -117,7 +116,7 @@ class SeenMoment(Moment):
         return self._of("reference", rows)
 
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> NDArray[Any]:
         """In this order."""
         return self._moment.sum_over_neighbours(function, intact_only=intact_only)[self._order]
@@ -154,7 +153,7 @@ class SeenCells(CellValues):
 
     def over(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
-from pbdkit.stepping.sums import presence
+from pbdkit.stepping.surroundings import presence
 
 Bits = NDArray[np.unsignedinteger[Any]]
 

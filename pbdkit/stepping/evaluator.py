@@ -1,0 +1,153 @@
+"""What a particle does in a step, given its neighbours: told once, for every room that asks.
+
+Stepping, analysis, identity, diagnostics of a material and the conformance suite evaluate rule and
+fracture model here and nowhere else; kernels are generated from the same functions and tested
+against this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import (
+    Calibrated,
+    Components,
+    FollowerRule,
+    Here,
+    RenewsBonds,
+    RenewsParticles,
+    Slot,
+    Softens,
+    StoresEnergy,
+    where,
+)
+from pbdkit.interfaces.answers import as_values, as_vector, as_verdict
+from pbdkit.interfaces.vector import vector
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembering import changing, renew, shown
+
+Mask = NDArray[np.bool_]
+Contributions = tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """One neighbour of some particles, or of one: its rest offset r and the rule's weights w; where
+    it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
+    constants c of the bond, what is remembered of it included."""
+
+    r: Components
+    w: Any
+    present: Mask | None = None
+    broken: Mask | None = None
+    c: Any = None
+
+
+class Evaluator:
+    """The rule and the fracture model of a scene, with the numbers that they are called with."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.rule: FollowerRule = scene.experiment.rule
+        self._model = scene.experiment.fracture if scene.has_fracture else None
+        self._softens = self._model if isinstance(self._model, Softens) else None
+        self._p, self._q = scene.constants.rule, scene.constants.fracture
+
+    def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
+        """What a neighbour contributes, or what stands in for it."""
+        seen = self.seen(d, u, to)
+        return as_values(self.rule.gather(seen, to.r, to.w, self._p), "gather")
+
+    def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
+        """The half of the bond's energy that falls to this end."""
+        assert isinstance(self.rule, StoresEnergy)
+        return (self.rule.energy(self.seen(d, u, to), to.r, to.w, self._p),)
+
+    def seen(self, d: Components, u: Components, to: Neighbour) -> Components:
+        """The difference that the rule sees: softened, or that of the fictitious point where the
+        bond broke."""
+        model = self._model
+        if model is None or (to.broken is None and to.c is None):
+            return d
+        with blaming(model, "to place a fictitious point"):
+            lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
+        if self._softens and to.c is not None:
+            with blaming(model, "to soften a bond"):
+                d = as_vector(self._softens.seen(d, lost, to.r, to.c, self._q), "seen", u)
+        chosen: Components = d if to.broken is None else where(to.broken, lost, d)
+        return chosen
+
+    def move(self, total: Contributions, here: Here) -> Any:
+        """From where the particle stands to its target."""
+        return as_vector(self.rule.apply(total, here, self._p), "apply", here.u)
+
+    def force(self, total: Contributions, here: Here) -> Any:
+        """The force of the neighbours over Young's modulus and thickness."""
+        assert isinstance(self.rule, Calibrated)
+        return as_vector(self.rule.force(total, here, self._p), "force", here.u)
+
+    def remember(self, total: Contributions, here: Here) -> Contributions:
+        """The new values of the particle's numbers that change; none where the rule has none."""
+        if not isinstance(self.rule, RenewsParticles):
+            return ()
+        return as_values(self.rule.remember(total, here, self._p), "remember")
+
+    def renew_bonds(
+        self, d: Components, r: Components, limits: Any, own: Sequence[Any], intact: Mask
+    ) -> None:
+        """Writes the new values over what is remembered of bonds, in place, where they hold."""
+        if isinstance(self._model, RenewsBonds):
+            numbers = bond_numbers(self._scene.experiment)
+            renew(changing(numbers, own), self.update(d, r, limits, own), intact)
+
+    def update(self, d: Any, r: Any, limits: Any, own: Sequence[Any]) -> Contributions:
+        """The new values of the bonds' numbers that change."""
+        assert isinstance(self._model, RenewsBonds)
+        c = self._scene.constants.of_bond(*limits, *shown(own))
+        return as_values(self._model.update(d, r, c, self._q), "update")
+
+    def breaks(self, d: Components, r: Components, limits: Any, own: Sequence[Any]) -> Any:
+        """Whether bonds break that remember these numbers."""
+        assert self._model
+        c = self._scene.constants.of_bond(*limits, *shown(own))
+        return as_verdict(self._model.breaks(d, r, c, self._q))
+
+    def everywhere(self, slots: Iterable[Slot]) -> list[Neighbour]:
+        """The neighbours in the middle of a body: all are there, and no bond has broken."""
+        weights = self._scene.constants.weights
+        return [Neighbour(slot.rest, weights[slot]) for slot in slots]
+
+    def at_rest(self, slots: Sequence[Slot]) -> Any:
+        """The move of a particle at rest with all these neighbours."""
+        u = vector(np.zeros(self._scene.axes))
+        parts = [self.contribution(u, u, to) for to in self.everywhere(slots)]
+        return self.move(summed((part, None) for part in parts), Here(u, own=self.initial_own()))
+
+    def initial_own(self) -> Any:
+        """What a particle remembers at the start, unless it is drawn."""
+        numbers = particle_numbers(self._scene.experiment)
+        return self._scene.constants.of_particle(*(number.initial for number in numbers))
+
+
+def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
+    """Σ of contributions where the neighbours are present, in their order.
+
+    What a neighbour contributes equally everywhere may be a plain number, and stays one.
+    """
+    total: Contributions | None = None
+    for part, there in parts:
+        if there is not None:
+            part = tuple(where(there, value, _nothing(value)) for value in part)
+        total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
+    return total or ()
+
+
+def _nothing(like: Any) -> Any:
+    return like.each(lambda _: 0.0) if isinstance(like, Components) else 0.0
