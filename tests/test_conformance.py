@@ -76,6 +76,7 @@ FAULTS = [
     (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
     (others.Measures, "changes-no-input", "`breaks` returned float64: compare, as in"),
     (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return a vector, as"),
+    (others.TakesOurName, "labels-its-variables", "the dataset has 'site' already"),
     (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
     (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
     (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
