@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
@@ -18,7 +19,8 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.memory import MemorySink
-from pbdkit.running import run_into
+from pbdkit.results.progress import progress_bar
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
 if TYPE_CHECKING:
@@ -54,17 +56,30 @@ def run(
     `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
     ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
     DivergedError, with what was recorded before, when the run leaves the finite numbers. Warns,
-    with pbdkit.PbdkitWarning, where the last state is inside out.
+    with pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
+    diverge, and a last state that is inside out.
     """
-    sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
+    return _run(_experiment(experiment, components), progress)
+
+
+def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
+    sink, scene = MemorySink(), build_scene(experiment)
     refuse_too_much_output(scene)
-    report = run_into(sink, scene, progress=progress)
+    with progress_bar(progress) as show:
+        run = Run(scene, watch=Watch(show=show))
+        _warn(run.warnings)
+        report = record(run, sink)
     dataset = sink.dataset()
     if report.outcome.status in ("diverged", "unconverged"):
         raise DivergedError(report.outcome.stop_reason, dataset)
-    for warning in report.warnings:
-        warnings.warn(warning, PbdkitWarning, stacklevel=2)
+    _warn(report.warnings)
     return dataset
+
+
+def _warn(texts: Iterable[str]) -> None:
+    """As coming from whoever called `run` or `rerun`."""
+    for text in texts:
+        warnings.warn(text, PbdkitWarning, stacklevel=4)
 
 
 def analyse(

@@ -1,4 +1,4 @@
-"""Imports follow the data: experiment, scene, stepping, results, running, command line."""
+"""Imports follow the data: experiment, scene, stepping, results, runs, command line."""
 
 import ast
 from pathlib import Path
@@ -19,7 +19,7 @@ ORDER = [
     "identity",
     "equilibrium",
     "results",
-    "running",
+    "runs",
     "api",
     "benching",
     "testing",

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.results.memory import MemorySink
-from pbdkit.running import run_into
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import guard
 from pbdkit.stepping.guard import EVERY, Guard
@@ -151,7 +152,7 @@ def test_who_stops_the_run_while_the_last_good_state_is_looked_for_keeps_what_wa
     sink = MemorySink()
     scene = build_scene(pbdkit.Experiment(**given))
     # Two calls of a hundred steps at most blow up; from the third on somebody wants to stop.
-    report = run_into(sink, scene, progress=False, stopping=lambda: next(calls) >= 2)
+    report = record(Run(scene, watch=Watch(lambda: next(calls) >= 2)), sink)
     assert report.outcome.status == "diverged"
     assert sink.dataset().time.values.tolist() == [0]
 

@@ -11,7 +11,7 @@ import pbdkit
 from pbdkit.equilibrium import linear
 from pbdkit.equilibrium.krylov import conjugate_gradients
 from pbdkit.equilibrium.linear import linear_solver
-from pbdkit.equilibrium.watching import StoppedError, Watch
+from pbdkit.equilibrium.watch import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
 NAMES = ["lu", "multigrid", "conjugate-gradients"]

@@ -14,7 +14,7 @@ from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.loading import settle
 from pbdkit.equilibrium.moves import Moves, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME
 from pbdkit.scene.scene import Scene

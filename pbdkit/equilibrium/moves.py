@@ -24,7 +24,7 @@ class Moves:
         self._scene = scene
         fracturing = Fracturing(scene) if scene.has_fracture else None
         self._followers = SlotFollowers(
-            scene, fracturing, Stepping(relaxation=scene.experiment.solver.relaxation)
+            scene, fracturing, Stepping(relaxation=scene.experiment.stepping.relaxation)
         )
         self._after: Floats | None = None
 

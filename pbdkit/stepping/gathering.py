@@ -59,7 +59,7 @@ class GatheringFollowers(Followers):
         flat = new.reshape(2, -1)
         for u_here, step, plane in zip(u, move, flat, strict=True):
             before = plane[self._place]
-            moved = target(u_here, step, before, self._scene.experiment.solver)
+            moved = target(u_here, step, before, self._scene.experiment.stepping)
             plane[self._place[self._body]] = u_here[self._body]
             plane[place] = moved[movable]
 

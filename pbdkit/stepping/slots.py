@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.experiment.solvers import Equilibrium, Stepping
+from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import FollowerRule, Here, Slot, Vector
 from pbdkit.interfaces.answers import as_move, as_values
 from pbdkit.scene.constants import WHOLE_CELLS
@@ -50,7 +50,7 @@ def weights_on(scene: Scene, slot: Slot, block: Block) -> tuple[Any, ...]:
         return weights
     return (
         *weights[: -len(WHOLE_CELLS)],
-        *scene.cells.beside(slot, block, scene.experiment.solver.precision),
+        *scene.cells.beside(slot, block, scene.experiment.stepping.precision),
     )
 
 
@@ -61,10 +61,10 @@ class SlotFollowers(Followers):
         self,
         scene: Scene,
         fracturing: Fracturing | None,
-        solver: Stepping | Equilibrium | None = None,
+        solver: Stepping | None = None,
     ) -> None:
         self._scene = scene
-        self._solver = solver or scene.experiment.solver
+        self._solver = solver or scene.experiment.stepping
         self._rule = scene.experiment.rule
         self._parameters = scene.constants.rule
         self._fracturing = fracturing
