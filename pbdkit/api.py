@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,8 +104,24 @@ def identify(
 def rerun(
     dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
 ) -> xarray.Dataset:
-    """The same run again, bit for bit, from the experiment that the dataset carries."""
-    return run(experiment_of(dataset, components), progress=progress)
+    """The same run again, bit for bit, from the experiment that the dataset carries.
+
+    Warns, with pbdkit.PbdkitWarning, where other versions made the dataset than are installed.
+    """
+    experiment = experiment_of(dataset, components)
+    _warn_of_versions(dataset, experiment)
+    return _run(experiment, progress)
+
+
+def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
+    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | _attribute(dataset, "plugins")
+    for name, now in here.items():
+        before = made_by.get(name)
+        if name != GIVEN and before != now:
+            whose = f"{name} {before}" if before else f"an unknown version of {name}"
+            text = f"made by {whose}, run again by {now}: the result may differ"
+            warnings.warn(text, PbdkitWarning, stacklevel=3)
 
 
 def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
@@ -112,14 +129,24 @@ def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Exper
     it wants components that are not there."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
+    source = Source("dataset", _attribute(dataset, "experiment"))
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
+        given = _attribute(dataset, "plugins").get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+
+
+def _attribute(dataset: xarray.Dataset, name: str) -> dict[str, Any]:
+    try:
+        found = json.loads(dataset.attrs.get(name, "{}"))
+    except (TypeError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise ExperimentError(f"the dataset's attribute '{name}' is damaged: it is no JSON object")
+    return found
 
 
 def _experiment(

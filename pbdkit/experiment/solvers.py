@@ -51,8 +51,8 @@ class Stepping(Solver):
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
-    relaxation: Annotated[float, Field(gt=0.0)] = 1.0
-    memory: float = 0.0
+    relaxation: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
+    memory: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     settle: Settle | None = None
 
     @property

@@ -44,19 +44,19 @@ class Stepwise(Driver):
             return (yield from self._diverged(error))
 
     def _stepped(self) -> States:
-        outcome, steps = None, self.scene.experiment.steps
+        steps = self.scene.experiment.steps
         try:
             yield self.state
             self._heed()
-            while (step := self.state.step) < steps and not outcome:
+            while not (outcome := self._settled()) and (step := self.state.step) < steps:
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
                 yield self.state
                 self._heed()
-                outcome = self._settled()
         except StoppedError:
             step = self.state.step
-            outcome = Outcome("interrupted", f"stopped after step {step}", step)
+            stopped = Outcome("interrupted", f"stopped after step {step}", step)
+            outcome = stopped if step < steps else None
         if self.kept < self.state.step:
             self.ending = True
             yield self.state
