@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.certificate import scale_of
 from pbdkit.equilibrium.finding import UnconvergedError
-from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.moves import Moves, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch

@@ -13,7 +13,7 @@ from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State
 
 if TYPE_CHECKING:
-    from pbdkit.equilibrium.settling import Settling
+    from pbdkit.equilibrium.settlement import Settling
 
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
@@ -119,6 +119,6 @@ def _settling(scene: Scene, start: State, watch: Watch) -> Settling | None:
     asked = scene.experiment.stepping.settle
     if asked is None:
         return None
-    from pbdkit.equilibrium.settling import Settling  # only where it is asked for
+    from pbdkit.equilibrium.settlement import Settling  # only where it is asked for
 
     return Settling(scene, asked, start, watch)

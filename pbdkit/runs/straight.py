@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pbdkit.equilibrium.finding import UnconvergedError
-from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.watch import StoppedError
 from pbdkit.results.recorder import Outcome
 from pbdkit.runs.driver import Driver, States
