@@ -179,9 +179,9 @@ def test_rerun_warns_of_other_versions(tensile: dict[str, Any], install: Any) ->
         "class Same(pbdkit.FollowerRule):\n"
         "    type: Literal['same'] = 'same'\n"
         "    @staticmethod\n"
-        "    def gather(d, r, w, p): return d.x, d.y, 1.0\n"
+        "    def gather(d, r, w, p): return d, 1.0\n"
         "    @staticmethod\n"
-        "    def apply(total, here, p): return total[0] / total[2], total[1] / total[2]\n"
+        "    def apply(total, here, p): return total[0] / total[1]\n"
         "@pbdkit.hookimpl\ndef pbdkit_components(): return [Same]\n"
     )
     install("pbdkit-same", source, "0.3")
