@@ -40,7 +40,7 @@ class Guard:
     def of(cls, scene: Scene, start: State) -> Guard:
         """The guard of a run from that state."""
         ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
-        spacing = max(abs(s.rest.x) + abs(s.rest.y) for s in scene.neighbourhood.slots[0])
+        spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
         ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
         kept = start.copy() if start.step else None
