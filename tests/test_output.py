@@ -160,6 +160,15 @@ def test_a_plugin_that_changes_the_folder_moves_no_output(
     assert (folder / "tensile.nc").is_file()
 
 
+def test_where_there_is_no_folder_it_is_said(call: Call) -> None:
+    gone = Path.cwd() / "gone"
+    gone.mkdir()
+    os.chdir(gone)
+    gone.rmdir()
+    result = call("run", "paper/a")
+    assert (result.code, result.err.startswith("pbdkit: the current folder: ")) == (6, True)
+
+
 def test_plot_replaces_a_picture_only_where_it_is_told_to(call: Call) -> None:
     assert call("run", "e.json", "--quiet").code == 0
     picture = Path("tensile.png")

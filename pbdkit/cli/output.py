@@ -5,20 +5,30 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, sizes_of
 
-KINDS = {
-    stat.S_IFLNK: "a symbolic link",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
-"""What is at a path and no plain file, by the type that the system gives it."""
+KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
+"""What may be at a path and no plain file, by the type that the system gives it."""
+
+
+@contextmanager
+def folder_kept() -> Iterator[None]:
+    """Goes back to the current folder: a plugin may change it when it is imported. Raises
+    StorageError where there is none."""
+    try:
+        here = Path.cwd()
+    except OSError as error:
+        raise StorageError(f"the current folder: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        os.chdir(here)
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:

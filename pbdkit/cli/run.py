@@ -32,10 +32,8 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
-    from contextlib import chdir
-
     from pbdkit.api import load
-    from pbdkit.cli.output import disk_warnings, refuse_output
+    from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
     from pbdkit.cli.signals import asked_to_stop
     from pbdkit.equilibrium.watch import Watch
     from pbdkit.results.netcdf import NetcdfSink
@@ -44,7 +42,7 @@ def run(
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 
-    with chdir("."):  # a plugin may change the folder when it is imported
+    with folder_kept():
         loaded = load(experiment, settings=settings)
         path = output or Path(loaded.name.replace("/", "-") + ".nc")
     refuse_output(path, force=force, experiment=Path(experiment))
