@@ -14,10 +14,11 @@ from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator, Neighbour
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.remembering import changing, renew
 from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import Neighbour
 
 
 class GatheringFollowers(Followers):

@@ -35,7 +35,7 @@ def _refuse_equal(
 ) -> None:
     """Raises where two sites have the same value up to whole steps of the cell."""
     for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        apart = np.linalg.solve(steps.T, np.subtract(of(other), of(one)).astype(float))
+        apart = np.linalg.solve(steps.T, np.array(of(other), float) - np.array(of(one), float))
         if np.abs(apart - np.round(apart)).max() < 1e-9:
             raise PropertyError(
                 f"basis sites {m} and {n} have the same {what} {tuple(of(one))}, up to whole "
