@@ -53,7 +53,7 @@ class StorageError(PbdkitError):
 
 
 class PbdkitWarning(UserWarning):
-    """A run went through, and its result deserves a doubt; the text says which, and the remedy."""
+    """A run, or its result, deserves a doubt; the text says which, and the remedy."""
 
 
 def dotted(where: Sequence[Any]) -> str:

@@ -29,6 +29,13 @@ from pbdkit.components.cell_stiffness import rectangle_matrix
 from pbdkit.interfaces import Stiffness
 from pbdkit.scene.scene import build_scene
 
+# Forces are those of given starts, and of any frame.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:leaders. there are none"),
+    pytest.mark.filterwarnings("ignore:diagnostics.. .* counts what frame points pull"),
+    pytest.mark.filterwarnings("ignore:frame. under 'none' edges"),
+]
+
 E, T = 7.0, 2.0
 REACTION = {"type": "reaction", "youngs_modulus": E, "thickness": T}
 ENERGY = {"type": "strain-energy", "youngs_modulus": E, "thickness": T}

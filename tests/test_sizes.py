@@ -7,7 +7,7 @@ import pytest
 import pbdkit
 from pbdkit.analysis.forecast import forecast
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.running import run_into
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
 MIB = 2**20
@@ -28,7 +28,7 @@ def test_memory_and_output_are_what_check_says(change, tmp_path):
     path = tmp_path / "out.nc"
 
     tracemalloc.start()
-    run_into(NetcdfSink(path), build_scene(scene.experiment), progress=False)
+    record(Run(build_scene(scene.experiment)), NetcdfSink(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 

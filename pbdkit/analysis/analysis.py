@@ -21,7 +21,6 @@ from pbdkit.analysis.region import (
     swings_below,
 )
 from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
-from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.interfaces import Anchors
 from pbdkit.scene.scene import Scene
 
@@ -54,7 +53,7 @@ class Analysis:
     @cached_property
     def spectrum(self) -> Spectrum | None:
         """Of the step as the solver makes it, with relaxation, memory and lag."""
-        own, solver = self._rule_spectrum, self.scene.experiment.solver
+        own, solver = self._rule_spectrum, self.scene.experiment.stepping
         if own is None:
             reach = self._within_reach
             return spectrum(self.operator.augmented().matrix()) if reach else None
@@ -80,7 +79,7 @@ class Analysis:
         """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
         no memory left."""
         now, before = self.operator.entries_now, self.operator.entries_before
-        share, every = 1.0 / self.scene.experiment.solver.relaxation, np.arange(now.shape[0])
+        share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(now.shape[0])
         rest = Entries(every, every, np.full(len(every), 1.0 - share), now.shape)
         return rest.plus(now.plus(before), share).matrix()
 
@@ -98,7 +97,7 @@ class Analysis:
     def largest_stable_relaxation(self) -> float | None:
         """The relaxation below which all modes shrink, with the memory as it is:
         2 (1 + b) / (1 - λ_min) for real eigenvalues."""
-        own, memory = self._rule_spectrum, self.scene.experiment.solver.memory
+        own, memory = self._rule_spectrum, self.scene.experiment.stepping.memory
         return largest_stable_relaxation(own.eigenvalues, memory) if own else None
 
     @property
@@ -153,7 +152,7 @@ class Analysis:
 
         None where no leader moves steadily, steps do not settle or are not made, or it would cost
         too much."""
-        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        straight = not self.scene.experiment.solver.makes_steps
         if straight or not self._within_reach or not self.stable:
             return None
         return lag_of(self.scene)
@@ -194,14 +193,14 @@ class Analysis:
                 f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
                 "nothing holds it"
             )
-        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        straight = not self.scene.experiment.solver.makes_steps
         if straight and self.largest_stable_relaxation:
             pass  # it makes no steps, and steps with that relaxation would lead there too
         elif self.stable is False:
             bound = self.largest_stable_relaxation
             remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
             found.append(
-                f"solver.relaxation: {self.scene.experiment.solver.relaxation:g} diverges, the "
+                f"solver.relaxation: {self.scene.experiment.stepping.relaxation:g} diverges, the "
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"
             )
         elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:

@@ -48,7 +48,7 @@ def wave_bound(scene: Scene) -> Bound | None:
     None for rules that depend on the place or take no single numbers, where neighbours are found
     anew, and where the frame lags: its delay can make modes grow that no plane wave knows.
     """
-    solver, lags = scene.experiment.solver, scene.frame is not None and scene.frame.map.lag
+    solver, lags = scene.experiment.stepping, scene.frame is not None and scene.frame.map.lag
     if lags or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
     try:
@@ -70,7 +70,7 @@ def bounds_the_body(scene: Scene) -> bool:
     modes of their own, and with much memory so have frames on leaning lattices."""
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach
-    return whole and abs(scene.experiment.solver.memory) <= LITTLE_MEMORY
+    return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY
 
 
 def _eigenvalues(matrices: Complex) -> Complex:

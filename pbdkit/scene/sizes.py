@@ -48,7 +48,7 @@ def estimate(
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
-    value = 8 if experiment.solver.precision == "float64" else 4
+    value = 8 if experiment.stepping.precision == "float64" else 4
     bonds, own = bond_numbers(experiment), particle_numbers(experiment)
     state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1 + value)
     state += planes * _bytes_of(bonds, value) + _bytes_of(own, value)
