@@ -119,5 +119,8 @@ def _report(error: BaseException) -> int:
 
 
 def _failed(message: str, code: int) -> int:
+    from pbdkit.errors import printable
+
+    message = printable(message)
     click.echo(f"pbdkit: {message}" if "\n" not in message else f"pbdkit:\n{message}", err=True)
     return code

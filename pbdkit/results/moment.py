@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces import Bonds, LeaderRows, Moment, Pair, Slot, Stiffness, Vector, length
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.registry.blame import blaming
 from pbdkit.results.gradient import displacement_gradient
 from pbdkit.results.tables import Tables
-from pbdkit.scene.leading import kinds_at, select
+from pbdkit.scene.leading import Selecting, kinds_at
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
@@ -196,8 +195,7 @@ class StateMoment(Moment):
 
     def nearest(self, points: tuple[Pair, ...]) -> Indices:
         """As leaders are selected."""
-        rows = [select(self._tables.raster, Selection(nearest=(point,)), ()) for point in points]
-        return np.concatenate(rows)
+        return Selecting(self._tables.raster).nearest(points)
 
     def patches(self, *, intact_only: bool = False) -> Iterator[tuple[Patch, NDArray[np.bool_]]]:
         """The cells of the body, and which of them count."""
