@@ -19,7 +19,7 @@ from pbdkit.analysis.region import Complex
 BEYOND = 1e-7
 """How far outside the spectrum the shift of the inverse iteration lies."""
 
-DEAREST, VECTORS = 5e8, 100
+DEAREST, VECTORS = 1e9, 20
 """So many multiplications are made at most for a spectrum, VECTORS a number beside each product."""
 
 
