@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -97,14 +97,25 @@ def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Exper
     it wants components that are not there."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
+    source = Source("dataset", _carried(dataset, "experiment"))
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
+        given = _carried(dataset, "plugins").get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+
+
+def _carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
+    """What a dataset carries as JSON; StorageError where it is not."""
+    try:
+        found = json.loads(dataset.attrs.get(attribute, "{}"))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
+    if not isinstance(found, dict):
+        raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
+    return found
 
 
 def _experiment(

@@ -70,17 +70,12 @@ class Analysis:
     @property
     def left_out(self) -> list[str]:
         """What is not known because it would take too long."""
-        what = "the spectrum, the lag and parts that no leader reaches are left out"
-        if self.scene.experiment.neighbours.nearness():
-            return []
+        why = ""
         if too_many := excess(self.scene):
-            return [f"analysis: {what}, the body is too large ({too_many})"]
-        if self.spectrum is None:
-            return [
-                "analysis: the spectrum and the lag are left out, eigenvalues lie too close "
-                "together to be found soon, as in long bodies; a shorter one shows more"
-            ]
-        return []
+            why = f"parts that no leader reaches too: the body is too large, {too_many}"
+        elif self._within_reach and self.spectrum is None:
+            why = "eigenvalues lie too close together, as in long bodies; a shorter one shows more"
+        return [f"analysis: the spectrum and the lag are left out, {why}"] if why else []
 
     @property
     def _lags(self) -> bool:

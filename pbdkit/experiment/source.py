@@ -55,6 +55,12 @@ class Source:
 def read_file(path: Path) -> Source:
     """The experiment in a file; ExperimentError names what cannot be read, and where."""
     try:
+        with path.open("rb") as file:
+            if file.read(4) in (b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05"):
+                raise ExperimentError(
+                    f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
+                    "pbdkit.rerun(pbdkit.open(...)) runs the same again"
+                )
         if path.stat().st_size > MAX_BYTES:
             raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
         raw = path.read_bytes()

@@ -19,6 +19,9 @@ from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
 Floats = NDArray[np.floating[Any]]
 
+SHOWN = 5
+"""So many warnings of one kind are given."""
+
 
 @dataclass(frozen=True)
 class Leading:
@@ -76,6 +79,19 @@ def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
         )
 
 
+def doubts(raster: Raster, groups: Iterable[LeaderGroup]) -> list[str]:
+    """Warnings about groups that lead others than was meant."""
+    body, found = Selecting(raster), []
+    for n, group in enumerate(groups):
+        for point in body.far(group.select.nearest or ()):
+            x, y = raster.reference(body.nearest([point]))[0]
+            found.append(
+                f"leaders.{n}.select.nearest: ({point[0]:g}, {point[1]:g}) lies far from the body; "
+                f"the particle that leads is at ({x:.6g}, {y:.6g})"
+            )
+    return found[:SHOWN]
+
+
 def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
     """(particle,): the kind of every particle during a step; at time 0 that of step 1."""
     kinds = raster.table_kind.copy()
@@ -94,6 +110,14 @@ class Selecting:
     @cached_property
     def _body(self) -> Indices:
         return self.raster.body_rows
+
+    def far(self, points: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
+        """The points that lie outside the body by more than the cell is wide."""
+        vectors = self.raster.lattice.cell().vectors
+        width = max(math.hypot(*v) for v in vectors)
+        for point in points:
+            if not np.hypot(*(self._x - point).T).min() <= width:
+                yield point
 
     @cached_property
     def _x(self) -> Floats:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Here, Vector
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.leaders import Led
 from pbdkit.stepping.state import Floats, State
@@ -91,15 +92,18 @@ def _rests_by_construction(scene: Scene) -> bool:
         block = scene.raster.body_block(s)
         if block and any(there is not None for there in presence(scene.raster, block, slots)):
             return False
-        parts = [rule.gather(home, k.rest, constants.weights[k], constants.rule) for k in slots]
-        total = tuple(sum(part, zero) for part in zip(*parts, strict=True))
-        move = rule.apply(total, Here(home, Vector(None, None)), constants.rule)
-        if any(component != 0.0 for component in move):
-            return False
-        if fracture.can_break and any(
-            fracture.breaks(home, k.rest, constants.limits[k], constants.fracture) for k in slots
-        ):
-            return False
+        with blaming(rule, "when asked whether it rests"):
+            parts = [rule.gather(home, k.rest, constants.weights[k], constants.rule) for k in slots]
+            total = tuple(sum(part, zero) for part in zip(*parts, strict=True))
+            move = rule.apply(total, Here(home, Vector(None, None)), constants.rule)
+            if any(component != 0.0 for component in move):
+                return False
+        with blaming(fracture, "when asked what breaks at rest"):
+            if fracture.can_break and any(
+                fracture.breaks(home, k.rest, constants.limits[k], constants.fracture)
+                for k in slots
+            ):
+                return False
     return True
 
 
