@@ -56,10 +56,8 @@ def reading(path: str | Path) -> Iterator[xarray.Dataset]:
     with open(path) as dataset:
         try:
             yield dataset
-        except ExperimentError as error:
-            raise ExperimentError(f"{path}: {error}") from None
-        except StorageError as error:
-            raise StorageError(f"{path}: {error}") from None
+        except (ExperimentError, StorageError) as error:
+            raise type(error)(f"{path}: {'; '.join(str(error).splitlines())}") from None
         except (PbdkitError, MemoryError):
             raise
         except Exception as error:

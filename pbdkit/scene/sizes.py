@@ -27,7 +27,7 @@ the tables besides what stays; each bond plane, in the table of bonds and the ma
 of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
 
 GRADIENT, FORCES, TABLES = 250, 160, 40
-"""The same for diagnostics: of the displacement gradient, of forces, and of sums over bonds."""
+"""The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
 
 ANEW, ANEW_EACH = 150, 118
 """The same where neighbours are found anew, and a neighbour."""
@@ -77,11 +77,13 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
         inner = rule.inner() is not None
     made = WORKSPACE + experiment.shows_bonds * planes * BONDS + inner * INNER
     made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
-    fields = any(
-        d.uses_cells and any("particle" in v.dims for v in d.variables()) for d in diagnostics
-    )
-    made += fields * GRADIENT + any(d.uses_forces for d in diagnostics) * FORCES
-    made += any(d.uses_bonds for d in diagnostics) * TABLES
+    tables = [d for d in diagnostics if any("particle" in v.dims for v in d.variables())]
+    if any(d.uses_cells for d in tables):
+        made += GRADIENT
+    elif any(d.uses_forces for d in diagnostics):
+        made += FORCES
+    elif tables:
+        made += TABLES
     if experiment.neighbours.nearness():
         made += ANEW + each * ANEW_EACH
     if isinstance(experiment.solver, Equilibrium):
