@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.equilibrium.watch import Watch
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -115,7 +115,7 @@ def rerun(
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
     here = {"pbdkit": version("pbdkit")} | experiment.distributions()
-    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | _attribute(dataset, "plugins")
+    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | _carried(dataset, "plugins")
     for name, now in here.items():
         before = made_by.get(name)
         if name != GIVEN and before != now:
@@ -129,23 +129,24 @@ def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Exper
     it wants components that are not there."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", _attribute(dataset, "experiment"))
+    source = Source("dataset", _carried(dataset, "experiment"))
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = _attribute(dataset, "plugins").get(GIVEN)
+        given = _carried(dataset, "plugins").get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
 
 
-def _attribute(dataset: xarray.Dataset, name: str) -> dict[str, Any]:
+def _carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
+    """What a dataset carries as JSON; StorageError where it is not."""
     try:
-        found = json.loads(dataset.attrs.get(name, "{}"))
-    except (TypeError, ValueError, RecursionError):
-        found = None
+        found = json.loads(dataset.attrs.get(attribute, "{}"))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
     if not isinstance(found, dict):
-        raise ExperimentError(f"the dataset's attribute '{name}' is damaged: it is no JSON object")
+        raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
     return found
 
 

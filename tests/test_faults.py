@@ -125,10 +125,10 @@ TEXTS = {
 
 @pytest.mark.parametrize(("text", "expected"), TEXTS.values(), ids=TEXTS)
 def test_a_file_is_refused_at_once(refused: Refused, text: str | bytes, expected: str) -> None:
-    begun = time.perf_counter()
+    begun = time.process_time()  # a busy machine does not decide
     message = refused(text)
     assert agrees(message, expected), message
-    assert time.perf_counter() - begun < 1.0
+    assert time.process_time() - begun < 1.0
 
 
 READ = {
