@@ -21,6 +21,16 @@ settings.register_profile("landing", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("landing")
 
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What every worker, and every process that a test starts, finds in its environment: one folder
+    of compiled kernels, kept from run to run, and one thread of linear algebra, as the systems here
+    are small and the workers take the processors."""
+    if cache := getattr(config, "cache", None):
+        os.environ.setdefault("PBDKIT_CACHE_DIR", str(cache.mkdir("kernels")))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 Build = Callable[..., Scene]
 Refused = Callable[..., str]
 Install = Callable[..., None]
