@@ -29,7 +29,7 @@ def install(session: nox.Session, group: str) -> None:
 def tests(session: nox.Session) -> None:
     """The tests, or those that are named: `nox -s tests -- tests/test_paper.py`."""
     install(session, "test")
-    session.run("pytest", *(session.posargs or ["-n", "auto"]))
+    session.run("pytest", *(session.posargs or ["-n", "auto", "--dist", "worksteal"]))
 
 
 @nox.session
@@ -60,7 +60,7 @@ def plugins(session: nox.Session) -> None:
     """The tests of the plugins, installed beside one another."""
     install(session, "test")
     session.run_install("pip", "install", *(word for plugin in PLUGINS for word in ("-e", plugin)))
-    session.run("pytest", "-n", "auto", *PLUGINS)
+    session.run("pytest", "-n", "auto", "--dist", "worksteal", *PLUGINS)
     session.run("pbdkit", "plugins", "list")
 
 
