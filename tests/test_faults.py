@@ -246,6 +246,6 @@ def test_long_equal_motions_are_compared_at_once(tensile: dict[str, Any]) -> Non
     long = velocity(1e-9, 300_000)
     groups = [group(LEFT, long), group(CORNER, long)]
     experiment = pbdkit.Experiment(**tensile | {"leaders": groups, "steps": 300_000})
-    begun = time.perf_counter()
+    begun = time.process_time()
     assert len(build_scene(experiment).leading) == 2
-    assert time.perf_counter() - begun < 0.5
+    assert time.process_time() - begun < 0.5
