@@ -21,7 +21,7 @@ ORDER = [
     "results",
     "running",
     "api",
-    "benching",
+    "bench",
     "testing",
     "cli",
 ]

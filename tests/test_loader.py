@@ -13,7 +13,6 @@ import pytest
 from plugin_sources import BROKEN, NEWER, listed, rule
 
 import pbdkit
-from pbdkit.benching.method import REFERENCE
 from pbdkit.cli import COMMANDS
 from pbdkit.registry.registry import Registry
 
@@ -55,7 +54,8 @@ def test_every_command_is_tried() -> None:
 def test_all_broken_plugins_together_stop_no_command(
     install: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: [REFERENCE])  # one is enough
+    one = ("numpy", "float64", 1)
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [one])  # is enough
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
         install(f"pbdkit-broken-{n}", source, f"0.{n}")
