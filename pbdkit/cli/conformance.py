@@ -11,7 +11,7 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.loading import Plugin
+    from pbdkit.registry.plugin import Plugin
     from pbdkit.testing import Report
 
 FAILED = 3

@@ -13,7 +13,7 @@ from pbdkit.cli.conformance import check
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.loading import Plugin
+    from pbdkit.registry.plugin import Plugin
 
 UNLIMITED = 10_000
 INTERFACES = (
@@ -69,13 +69,12 @@ def list_(as_json: bool) -> None:
 )
 def new(name: str, interface: str, parent: Path) -> None:
     """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
-    from pbdkit.skeleton.names import names_from
-    from pbdkit.skeleton.project import write_project
+    from pbdkit.skeleton.project import project_of
 
-    names = names_from(name, interface)
-    folder = write_project(names, interface, parent)
+    project = project_of(name, interface)
+    folder = project.write(parent)
     click.echo(
-        f"{folder}: the {interface} '{names.type}' stands in {names.module}.py; next:\n"
+        f"{folder}: the {interface} '{project.type}' stands in {project.module}.py; next:\n"
         f"  pip install -e {folder if folder.is_absolute() else f'./{folder}'}\n"
         f"  pbdkit run {folder / 'example.yaml'}"
     )

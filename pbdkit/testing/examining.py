@@ -8,7 +8,7 @@ from typing import Any
 
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.answers import AnswerError
-from pbdkit.registry.wording import remedy
+from pbdkit.registry.blame import remedy
 from pbdkit.testing.properties import properties_of
 from pbdkit.testing.property import NotAskedError, Property, PropertyError
 from pbdkit.testing.report import Outcome, Report

@@ -15,7 +15,7 @@ from pbdkit.interfaces import (
     Lattice,
     NeighbourMetric,
 )
-from pbdkit.registry.checking import interface_of
+from pbdkit.registry.blame import interface_of
 
 LATTICES: dict[str, dict[str, Any]] = {
     "square": {"type": "square", "a": 1.0},

@@ -9,7 +9,7 @@ from typing import Any
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Component
-from pbdkit.registry.checking import interface_of
+from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.testing.examples import name_of
 from pbdkit.testing.property import PropertyError
