@@ -22,6 +22,7 @@ from pbdkit.analysis.region import (
 )
 from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
 from pbdkit.experiment.solvers import Equilibrium
+from pbdkit.interfaces import Anchors
 from pbdkit.scene.scene import Scene
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
@@ -181,7 +182,7 @@ class Analysis:
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         found = []
-        anchored = self.scene.frame is not None and self.scene.experiment.frame.anchors()
+        anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored else self.parts_without_leader
         if len(parts) > 3:
             found.append(

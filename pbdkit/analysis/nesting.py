@@ -25,7 +25,7 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
     everybody = scene.raster.place_of(np.arange(scene.raster.count))
     z, inner = moves_and_couplings(scene.inner, state, everybody)
     field = np.zeros(state.u.shape)
-    field.reshape(2, -1)[:, everybody] = z.T
+    field.reshape(len(field), -1)[:, everybody] = z.T
     moves, outer = _directly(scene, replace(state, u=field), place)
     product = (outer.entries().sparse() @ inner.entries().sparse()).tobsr((2, 2))
     product.sum_duplicates()

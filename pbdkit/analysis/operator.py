@@ -159,7 +159,7 @@ class _Assembly:
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
         relaxation = self._scene.experiment.solver.relaxation
-        u = self._state.u.reshape(2, -1).astype(float, copy=False)
+        u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
         rows = self._unknown[place]
         own = response.of_each(relaxation * response.own)
         self._now.add(rows, rows, own)
@@ -181,7 +181,7 @@ class _Assembly:
         relaxation, rows = self._scene.experiment.solver.relaxation, self._unknown[place]
         moves, couplings = moves_and_couplings(self._scene, self._state, place)
         everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
-        u = self._state.u.reshape(2, -1)[:, everybody].T.astype(float, copy=False)
+        u = self._state.u.reshape(self._scene.axes, -1)[:, everybody].T.astype(float, copy=False)
         self._source[rows] = relaxation * (moves - couplings.times(u))
         for own, column, blocks in couplings.parts:
             self._see(rows[own], everybody[column], relaxation * blocks)

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot, Vector
 from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, summed
 
 Floats = NDArray[np.float64]
-NOWHERE = Vector(None, None)
-STILL = Vector(np.float64(0.0), np.float64(0.0))
+NOWHERE = Here(None)
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Stencil:
     neighbours: dict[Slot, Floats]
 
 
-def linearised(scene: Scene, at: Vector = NOWHERE) -> Stencil:
-    """The stencil of the scene's rule; `at` is the reference position for rules that use it."""
+def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
+    """The stencil of the scene's rule; `at` says where for rules that ask."""
     if scene.inner:
         return _composed(linearised(replace(scene, inner=None), at), linearised(scene.inner, at))
     every = scene.neighbourhood.slots
@@ -75,37 +76,32 @@ def _after(first: Slot, second: Slot) -> Slot:
         second.target,
         (first.cell[0] + second.cell[0], first.cell[1] + second.cell[1]),
         (first.site[0] + second.site[0], first.site[1] + second.site[1]),
-        Vector(first.rest.x + second.rest.x, first.rest.y + second.rest.y),
+        first.rest + second.rest,
         first.shell + second.shell,
     )
 
 
-def move(
-    scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Vector], here: Here
-) -> tuple[Any, Any]:
+def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:
     """The rule's move of a particle with all its neighbours, d = difference(slot) along each."""
-    rule, constants = scene.experiment.rule, scene.constants
-    parts = [
-        rule.gather(difference(slot), slot.rest, constants.weights[slot], constants.rule)
-        for slot in slots
-    ]
-    total = tuple(sum(part[1:], part[0]) for part in zip(*parts, strict=True))
-    return rule.apply(total, here, constants.rule)
+    evaluator = Evaluator(scene)
+    neighbours = zip(slots, evaluator.everywhere(slots), strict=True)
+    parts = [(evaluator.contribution(difference(s), here.u, to), None) for s, to in neighbours]
+    return evaluator.move(summed(parts), here._replace(own=evaluator.initial_own()))
 
 
-def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Vector) -> Floats:
-    """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are: (2, 2)."""
+def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Here) -> Floats:
+    """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are, (axis, axis)."""
     columns = []
-    for along in (Vector(1.0, 0.0), Vector(0.0, 1.0)):
+    for along in np.eye(scene.axes):
 
-        def moved(step: complex, along: Vector = along) -> tuple[Any, Any]:
-            nudge = Vector(np.multiply(step, along.x), np.multiply(step, along.y))
-            back = Vector(-nudge.x, -nudge.y)
+        def moved(step: complex, along: Floats = along) -> Any:
+            nudge = vector(np.multiply(step, component) for component in along)
+            still = vector(np.zeros(scene.axes))
 
-            def difference(slot: Slot) -> Vector:
-                return back if of is None else nudge if slot is of else STILL
+            def difference(slot: Slot) -> Any:
+                return -nudge if of is None else nudge if slot is of else still
 
-            return move(scene, slots, difference, Here(nudge if of is None else STILL, at))
+            return move(scene, slots, difference, at._replace(u=nudge if of is None else still))
 
         columns.append(derivative(moved))
     return np.array(columns).T

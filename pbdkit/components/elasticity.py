@@ -15,10 +15,19 @@ from pbdkit.components.cell_stiffness import (
     rectangle_of,
 )
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FollowerRule, Here, Setting, Slot, Stiffness, Vector, where
+from pbdkit.interfaces import (
+    Calibrated,
+    FollowerRule,
+    Here,
+    Setting,
+    Slot,
+    Stiffness,
+    Vector,
+    where,
+)
 
 
-class CellElastic(FollowerRule):
+class CellElastic(Calibrated, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -60,39 +69,39 @@ class CellElastic(FollowerRule):
             )
         return {"modulus": self.modulus()}
 
-    def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
-        """(xx, xy, yy, t): the weight of the cell to the left is [[xx, xy + t], [xy - t, yy]], of
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
+        """xx, xy, yy, t: the weight of the cell to the left is [[xx, xy + t], [xy - t, yy]], of
         that to the right the transpose; a cell on both sides counts half on each."""
         if sides := rectangle_of(setting):
             left, right = in_rectangles(slot, self.ratios(), *sides)
         else:
             left, right = in_triangles(slot, self.ratios())
         symmetric, skew = (left + right) / 2, (left - right) / 2
-        found = symmetric[0, 0], symmetric[0, 1], symmetric[1, 1], skew[0, 1]
-        return tuple(map(float, found))
+        return {
+            "xx": symmetric[0, 0], "xy": symmetric[0, 1], "yy": symmetric[1, 1], "t": skew[0, 1]
+        }  # fmt: skip
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """W d, and the symmetric part of W."""
-        side_xx, side_xy, side_yy, skew, left, right = w
-        whole, turn = left + right, (left - right) * skew
-        xx, xy, yy = side_xx * whole, side_xy * whole, side_yy * whole
-        return xx * d.x + (xy + turn) * d.y, (xy - turn) * d.x + yy * d.y, xx, xy, yy
+        whole, turn = w.left + w.right, (w.left - w.right) * w.t
+        xx, xy, yy = w.xx * whole, w.xy * whole, w.yy * whole
+        pull = Vector(xx * d.x + (xy + turn) * d.y, (xy - turn) * d.x + yy * d.y)
+        return pull, xx, xy, yy
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Vector:
         """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
-        fx, fy, xx, xy, yy = total
+        pull, xx, xy, yy = total
         det = xx * yy - xy * xy
         some = det > 0.0
-        share = where(some, det, 1.0)
-        x, y = (yy * fx - xy * fy) / share, (xx * fy - xy * fx) / share
-        return where(some, x, 0.0), where(some, y, 0.0)
+        move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
+        return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · Σ W d."""
-        return p.modulus * total[0], p.modulus * total[1]
+        return p.modulus * total[0]
 
 
 class IsotropicElastic(CellElastic):

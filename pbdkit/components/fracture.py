@@ -10,7 +10,15 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FractureModel, Slot, Vector, length, squared_length, where
+from pbdkit.interfaces import (
+    BreaksAtStrain,
+    FractureModel,
+    Slot,
+    StartsCracked,
+    length,
+    squared_length,
+    where,
+)
 from pbdkit.interfaces.fracture import Segment
 
 Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
@@ -25,22 +33,22 @@ class NoFracture(FractureModel):
 
     can_break: ClassVar[bool] = False
 
-    def constants(self, slot: Slot) -> tuple[float, ...]:
+    def constants(self, slot: Slot) -> dict[str, float]:
         """None."""
-        return ()
+        return {}
 
     @staticmethod
-    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
         """Never."""
         return False
 
     @staticmethod
-    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
+    def fictitious(u: Any, r: Any, p: Any) -> Any:
         """The undeformed cell."""
-        return Vector(0.0, 0.0)
+        return 0.0 * r
 
 
-class Parting(FractureModel):
+class Parting(BreaksAtStrain, StartsCracked, FractureModel):
     """What models share whose fictitious points stand at m_j + λ R or at X_k.
 
     The fictitious point that takes the lost neighbour's place stands at m_j + λ R
@@ -80,11 +88,9 @@ class Parting(FractureModel):
         return self.cracks
 
     @staticmethod
-    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
+    def fictitious(u: Any, r: Any, p: Any) -> Any:
         """(λ - 1) r: the point at m_j + λ r; or -u_j: the point at X_k."""
-        return Vector(
-            where(p.at_reference, -u.x, p.excess * r.x), where(p.at_reference, -u.y, p.excess * r.y)
-        )
+        return where(p.at_reference, -u, p.excess * r)
 
 
 class Threshold(Parting):
@@ -103,24 +109,24 @@ class Threshold(Parting):
         examples=[[1.6], [1.6, 2.4]],
     )
 
-    def constants(self, slot: Slot) -> tuple[float, ...]:
-        """The squared threshold of the slot's shell.
+    def constants(self, slot: Slot) -> dict[str, float]:
+        """The squared threshold of the slot's shell, `limit`.
 
         A threshold that equals the rest length up to rounding breaks nothing at rest.
         """
         threshold, rest = self.thresholds[slot.shell - 1], squared_length(slot.rest)
         at_rest = threshold >= math.sqrt(rest) * (1 - 1e-12)
-        return (max(threshold**2, rest) if at_rest else threshold**2,)
+        return {"limit": max(threshold**2, rest) if at_rest else threshold**2}
 
     @staticmethod
-    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
         """|r + d|² > threshold²."""
-        return squared_length(Vector(r.x + d.x, r.y + d.y)) > c[0]
+        return squared_length(r + d) > c.limit
 
     @staticmethod
-    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
         """The threshold as a strain."""
-        return np.sqrt(c[0]) / length(r) - 1.0
+        return np.sqrt(c.limit) / length(r) - 1.0
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
         """Refuses a wrong number of thresholds, and thresholds below every rest length."""

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import Anchors, FrameMap, FramePolicy, FrameSites
 
 
 class NoFrame(FramePolicy):
@@ -72,18 +72,15 @@ class FirstFrame(CopyingFrame):
         return FrameMap(points, body[first], np.ones(len(points)), self.lag)
 
 
-class MirrorFrame(LayeredFrame):
+class MirrorFrame(Anchors, LayeredFrame):
     """u_f = R u_b, b the site reflected in the outermost body row or column and R flipping the
     component normal to it, both at corners: the paper's mirroring to obtain an infinite sample.
 
-    For bodies that fill a rectangle of a square or rectangular lattice.
+    The planes of reflection stand in space. For bodies that fill a rectangle of a square or
+    rectangular lattice.
     """
 
     type: Literal["mirror"] = "mirror"
-
-    def anchors(self) -> bool:
-        """The planes of reflection stand in space."""
-        return True
 
     def follow(self, frame: FrameSites) -> FrameMap:
         """One entry a point, with the matrix R."""

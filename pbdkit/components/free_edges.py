@@ -9,6 +9,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FrameMap, FramePolicy, FrameSites, Stiffness
+from pbdkit.interfaces.rule import material_of
 
 NEGLIGIBLE = 1e-17
 """Weights below this, of body particles far along an edge, are left out."""
@@ -60,7 +61,7 @@ class TractionFree(FramePolicy):
     def follow(self, frame: FrameSites) -> FrameMap:
         """The points depend on one another along the edge: the map is what their equations make of
         a displacement of each body particle."""
-        stiffness = frame.rule.stiffness()
+        stiffness = material_of(frame.rule)
         if stiffness is None:
             raise ExperimentError(
                 f"'{self.type}' needs a rule that is calibrated to a material ('elastic', "

@@ -21,15 +21,14 @@ class Barycentre(FollowerRule):
     linear: ClassVar[bool] = True
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(d, r, 1)."""
-        return d.x, d.y, r.x, r.y, 1.0
+        return d, r, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Any:
         """(Σd + Σr) / N."""
-        dx, dy, rx, ry, n = total
-        return (dx + rx) / n, (dy + ry) / n
+        return (total[0] + total[1]) / total[2]
 
 
 class MeanDisplacement(FollowerRule):
@@ -40,15 +39,14 @@ class MeanDisplacement(FollowerRule):
     linear: ClassVar[bool] = True
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(d, 1)."""
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Any:
         """Σd / N."""
-        dx, dy, n = total
-        return dx / n, dy / n
+        return total[0] / total[1]
 
 
 class DistanceWeighted(FollowerRule):
@@ -61,18 +59,17 @@ class DistanceWeighted(FollowerRule):
     type: Literal["distance-weighted"] = "distance-weighted"
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(|r + d| (r + d), |r + d|)."""
-        x, y = r.x + d.x, r.y + d.y
-        distance = length(Vector(x, y))
-        return distance * x, distance * y, distance
+        there = r + d
+        distance = length(there)
+        return distance * there, distance
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Any:
         """Σ |r + d| (r + d) / Σ |r + d|."""
-        x, y, distance = total
-        share = where(distance > 0.0, distance, 1.0)
-        return x / share, y / share
+        there, distance = total
+        return there / where(distance > 0.0, distance, 1.0)
 
 
 class MixedCoordinate(FollowerRule):
@@ -94,22 +91,19 @@ class MixedCoordinate(FollowerRule):
     uses_reference: ClassVar[bool] = True
 
     def parameters(self, setting: Setting) -> dict[str, float]:
-        """K, the loading axis as 0 or 1, and the body's middle across it."""
-        along = ("x", "y").index(self.axis)
-        across = 1 - along
-        middle = (setting.lower[across] + setting.upper[across]) / 2
-        return {"K": self.K, "along": along, "middle": middle}
+        """K, and the loading axis as 0 or 1."""
+        return {"K": self.K, "along": ("x", "y").index(self.axis)}
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(d, r, 1)."""
-        return d.x, d.y, r.x, r.y, 1.0
+        return d, r, 1.0
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Vector:
         """The barycentre's move, and K · (u + move along the axis) · da across it."""
-        dx, dy, rx, ry, n = total
-        x, y = (dx + rx) / n, (dy + ry) / n
+        move = (total[0] + total[1]) / total[2]
+        there = here.u + move
         if p.along == 0:
-            return x, y + p.K * (here.u.x + x) * (here.X.y - p.middle)
-        return x + p.K * (here.u.y + y) * (here.X.x - p.middle), y
+            return Vector(move.x, move.y + p.K * there.x * here.centred.y)
+        return Vector(move.x + p.K * there.y * here.centred.x, move.y)

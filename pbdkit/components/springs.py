@@ -6,13 +6,23 @@ import math
 from typing import Any, ClassVar, Literal
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import FollowerRule, Here, Setting, Slot, Stiffness, Vector, length, where
+from pbdkit.interfaces import (
+    FollowerRule,
+    Here,
+    Setting,
+    Slot,
+    Stiffness,
+    StoresEnergy,
+    dot,
+    length,
+    where,
+)
 
 EDGE_OF_SQUARE, DIAGONAL_OF_SQUARE, OF_TRIANGLE = 0.75, 0.375, math.sqrt(0.75)
 """Stiffnesses of the springs over Young's modulus and thickness: isotropic with ν = 1/3."""
 
 
-class Springs(FollowerRule):
+class Springs(StoresEnergy, FollowerRule):
     """Each neighbour proposes the place at its rest distance, on the line to where the particle
     stands: x_k + l₀ (x_j - x_k)/|x_j - x_k|; the particle goes to the weighted mean.
 
@@ -29,50 +39,45 @@ class Springs(FollowerRule):
         """Plane stress with ν = 1/3, for small strain."""
         return Stiffness(9 / 8, 9 / 8, 3 / 8, 3 / 8)
 
-    def weights(self, slot: Slot, setting: Setting) -> tuple[float, ...]:
+    def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Half the spring's stiffness, for each of the cells beside it, and its rest length."""
         rests = [math.hypot(*s.rest) for s in setting.slots[slot.source]]
         edge = min(rests)
         diagonals = sum(math.isclose(rest, edge * math.sqrt(2.0)) for rest in rests)
         edges = sum(math.isclose(rest, edge) for rest in rests)
         if (edges, diagonals) == (6, 0) and len(rests) == 6:
-            return OF_TRIANGLE / 2, math.hypot(*slot.rest)
+            return {"half": OF_TRIANGLE / 2, "rest": math.hypot(*slot.rest)}
         if (edges, diagonals) == (4, 4) and len(rests) == 8:
             is_edge = math.isclose(math.hypot(*slot.rest), edge)
             half = (EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2
-            return half, math.hypot(*slot.rest)
+            return {"half": half, "rest": math.hypot(*slot.rest)}
         raise ExperimentError(
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"
         )
 
     @staticmethod
-    def gather(d: Vector, r: Vector, w: Any, p: Any) -> tuple[Any, ...]:
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
-        half, rest, left, right = w
-        stiffness = half * (left + right)
-        v = Vector(r.x + d.x, r.y + d.y)
+        stiffness, v = w.half * (w.left + w.right), r + d
         distance = length(v)
-        elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (distance + rest)
-        pull = stiffness * elongation / where(distance > 0.0, distance, 1.0)
-        return pull * v.x, pull * v.y, stiffness
+        elongation = dot(d, r + v) / (distance + w.rest)
+        return (stiffness * elongation / where(distance > 0.0, distance, 1.0)) * v, stiffness
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Any:
         """Σ k e n / Σ k; no move where there is no cell."""
-        x, y, stiffness = total
-        share = where(stiffness > 0.0, stiffness, 1.0)
-        return x / share, y / share
+        pull, stiffness = total
+        return pull / where(stiffness > 0.0, stiffness, 1.0)
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def force(total: Any, here: Here, p: Any) -> Any:
         """Σ k e n."""
-        return total[0], total[1]
+        return total[0]
 
     @staticmethod
-    def energy(d: Vector, r: Vector, w: Any, p: Any) -> Any:
+    def energy(d: Any, r: Any, w: Any, p: Any) -> Any:
         """Half of ½ k e²."""
-        half, rest, left, right = w
-        v = Vector(r.x + d.x, r.y + d.y)
-        elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (length(v) + rest)
-        return half * (left + right) * elongation * elongation / 4
+        v = r + d
+        elongation = dot(d, r + v) / (length(v) + w.rest)
+        return w.half * (w.left + w.right) * elongation * elongation / 4

@@ -10,10 +10,10 @@ from pydantic import Field
 from pbdkit.components.cell_stiffness import rectangle_of
 from pbdkit.components.elasticity import CellElastic, Elastic, IsotropicElastic
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Here, Setting
+from pbdkit.interfaces import AppliesTwice, Here, Setting, Vector
 
 
-class StrainGradient(IsotropicElastic):
+class StrainGradient(AppliesTwice, IsotropicElastic):
     """Elasticity with an internal length l: the elastic move z, less c = l²/D times the elastic
     move that is made of z.
 
@@ -42,22 +42,18 @@ class StrainGradient(IsotropicElastic):
                 f"'{self.type}' works on cells of equal sides, and these are {sides[0]:g} by "
                 f"{sides[1]:g}; take a square or a hexagonal lattice"
             )
-        weights = [(slot.rest.x, self.weights(slot, setting)[0]) for slot in setting.slots[0]]
+        weights = [(slot.rest.x, self.weights(slot, setting)["xx"]) for slot in setting.slots[0]]
         diffusion = sum(w * x * x for x, w in weights) / sum(w for _, w in weights) / 2
         return parameters | {"c": self.length**2 / diffusion}
 
     @staticmethod
-    def apply(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: Here, p: Any) -> Any:
         """z - c (Σ W)⁻¹ Σ W (z_k - z_j)."""
-        x, y = CellElastic.apply(total, here, p)
-        return here.u.x - p.c * x, here.u.y - p.c * y
+        return here.u - p.c * CellElastic.apply(total, here, p)
 
     @staticmethod
-    def force(total: Any, here: Here, p: Any) -> tuple[Any, Any]:
+    def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · (Σ W z_j - c Σ W (z_k - z_j))."""
-        fx, fy, xx, xy, yy = total
+        pull, xx, xy, yy = total
         x, y = here.u
-        return (
-            p.modulus * (xx * x + xy * y - p.c * fx),
-            p.modulus * (xy * x + yy * y - p.c * fy),
-        )
+        return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - p.c * pull)

@@ -9,8 +9,18 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from pbdkit.components.fracture import Parting
-from pbdkit.interfaces import Bonds, Remembered, Slot, Vector, length, squared_length, where
-from pbdkit.interfaces.remembered import Drawn
+from pbdkit.interfaces import (
+    Bonds,
+    Draws,
+    Remembered,
+    RenewsBonds,
+    Slot,
+    Softens,
+    length,
+    squared_length,
+    where,
+)
+from pbdkit.interfaces.values import Drawn
 
 StrainLimit = Annotated[float, Field(gt=0.0, le=1e75)]
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -21,7 +31,7 @@ def _factors(bonds: Bonds, scatter: float, generator: np.random.Generator) -> An
     return 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
 
 
-class StrainFracture(Parting):
+class StrainFracture(Draws, Parting):
     """A bond breaks when its strain |r + d| / |r| - 1 exceeds `failure`, whatever its shell; bonds
     that are pressed together never break.
 
@@ -35,33 +45,37 @@ class StrainFracture(Parting):
     )
     scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 
-    def constants(self, slot: Slot) -> tuple[float, ...]:
-        """(|r|², failure strain of the bond), the latter remembered where it is scattered; or,
-        where all are alike, ((1 + failure)² |r|², 0), which is one multiplication less to round."""
+    def constants(self, slot: Slot) -> dict[str, float]:
+        """`square` = |r|² and the `failure_strain` of the bond, remembered where it is scattered;
+        or, where all are alike, (1 + failure)² |r|² and 0, one multiplication less to round."""
         rest = squared_length(slot.rest)
-        return (rest,) if self.scatter else ((1.0 + self.failure) ** 2 * rest, 0.0)
+        if self.scatter:
+            return {"square": rest}
+        return {"square": (1.0 + self.failure) ** 2 * rest, "failure_strain": 0.0}
 
-    def bond_state(self) -> tuple[Remembered, ...]:
+    def remembered(self) -> tuple[Remembered, ...]:
         """`failure_strain` where it is not the same for all."""
         return (_FAILURE_STRAIN,) if self.scatter else ()
 
-    def draw(self, bonds: Bonds, generator: np.random.Generator) -> Drawn:
+    def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
-        return {"failure_strain": self.failure * _factors(bonds, self.scatter, generator)}
+        if not self.scatter:
+            return {}
+        return {"failure_strain": self.failure * _factors(owners, self.scatter, generator)}
 
     @staticmethod
-    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
         """|r + d|² > (1 + failure)² |r|²."""
-        stretch = 1.0 + c[1]
-        return squared_length(Vector(r.x + d.x, r.y + d.y)) > c[0] * (stretch * stretch)
+        stretch = 1.0 + c.failure_strain
+        return squared_length(r + d) > c.square * (stretch * stretch)
 
     @staticmethod
-    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
         """The failure strain of the bond."""
-        return np.sqrt(c[0]) * (1.0 + c[1]) / length(r) - 1.0
+        return np.sqrt(c.square) * (1.0 + c.failure_strain) / length(r) - 1.0
 
 
-class Damage(Parting):
+class Damage(Softens, RenewsBonds, Draws, Parting):
     """A bond softens from strain `onset` on and is broken at strain `failure`.
 
     Its damage is the largest so far of D = failure / (failure - onset) (1 - onset / ε), from 0 at
@@ -90,47 +104,47 @@ class Damage(Parting):
             raise PydanticCustomError("fault", "{text}", {"text": text, "key": "onset"})
         return self
 
-    def constants(self, slot: Slot) -> tuple[float, ...]:
-        """|r|, then onset and failure unless each bond has its own."""
-        rest = float(length(slot.rest))
-        return (rest,) if self.scatter else (rest, self.onset, self.failure)
+    def constants(self, slot: Slot) -> dict[str, float]:
+        """`rest` = |r|, and `onset_strain` and `failure_strain` unless each bond has its own."""
+        rest = {"rest": length(slot.rest)}
+        own = {} if self.scatter else {"onset_strain": self.onset, "failure_strain": self.failure}
+        return rest | own
 
-    def bond_state(self) -> tuple[Remembered, ...]:
+    def remembered(self) -> tuple[Remembered, ...]:
         """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
         return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
 
-    def draw(self, bonds: Bonds, generator: np.random.Generator) -> Drawn:
+    def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
         if not self.scatter:
             return {}
-        factors = _factors(bonds, self.scatter, generator)
+        factors = _factors(owners, self.scatter, generator)
         return {"onset_strain": self.onset * factors, "failure_strain": self.failure * factors}
 
     @staticmethod
-    def update(d: Vector, r: Vector, c: Any, p: Any) -> tuple[Any, ...]:
+    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
         """The damage, where there is more than before."""
-        rest, onset, failure, damage = c
-        strain = length(Vector(r.x + d.x, r.y + d.y)) / rest - 1.0
+        onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
+        strain = length(r + d) / c.rest - 1.0
         softens = strain > onset
         law = failure / (failure - onset) * (1.0 - onset / where(softens, strain, 1.0))
         law = where(strain < failure, law, 1.0)
         return (where(softens & (law > damage), law, damage),)
 
     @staticmethod
-    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
         """D = 1."""
-        return c[3] >= 1.0
+        return c.damage >= 1.0
 
     @staticmethod
-    def seen(d: Vector, lost: Vector, r: Vector, c: Any, p: Any) -> Vector:
+    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
         """(1 - D) d + D lost."""
-        damage, kept = c[3], 1.0 - c[3]
-        return Vector(kept * d.x + damage * lost.x, kept * d.y + damage * lost.y)
+        return (1.0 - c.damage) * d + c.damage * lost
 
     @staticmethod
-    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
         """The failure strain of the bond."""
-        return c[2]
+        return c.failure_strain
 
 
 _FAILURE_STRAIN = Remembered(

@@ -9,7 +9,6 @@ from pbdkit.analysis.operator import StepOperator
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing
 from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats, State
 
@@ -22,9 +21,8 @@ class Moves:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        fracturing = Fracturing(scene) if scene.has_fracture else None
         self._followers = SlotFollowers(
-            scene, fracturing, Stepping(relaxation=scene.experiment.solver.relaxation)
+            scene, Stepping(relaxation=scene.experiment.solver.relaxation)
         )
         self._after: Floats | None = None
 

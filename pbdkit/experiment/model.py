@@ -35,6 +35,8 @@ from pbdkit.interfaces import (
     FramePolicy,
     Lattice,
     NeighbourMetric,
+    RenewsParticles,
+    Softens,
 )
 from pbdkit.interfaces.component import Strict
 from pbdkit.registry.registry import Registry
@@ -121,14 +123,15 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false, or leave solver.settle out",
                 key="solver",
             )
-        if self.solver.settle and (self.rule.remembers() or self.fracture.softens()):
-            part = self.rule if self.rule.remembers() else self.fracture
+        remembers = isinstance(self.rule, RenewsParticles)
+        if self.solver.settle and (remembers or isinstance(self.fracture, Softens)):
+            part = self.rule if remembers else self.fracture
             raise fault(
                 f"'{part.type}' remembers, so that no distance from equilibrium is known; leave "
                 "solver.settle out",
                 key="solver",
             )
-        if self.rule.remembers() and isinstance(self.solver, Equilibrium):
+        if remembers and isinstance(self.solver, Equilibrium):
             raise fault(
                 f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
                 "all of them; take solver: {type: stepping}",

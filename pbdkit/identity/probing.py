@@ -4,13 +4,15 @@ same everywhere. Asked of the rule's own functions with single numbers."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.stencil import NOWHERE, STILL, Stencil, linearised, move
-from pbdkit.interfaces import Here, Slot, Vector
-from pbdkit.scene.scene import Scene, setting_of
+from pbdkit.analysis.stencil import NOWHERE, Stencil, linearised, move
+from pbdkit.interfaces import Here, Slot
+from pbdkit.interfaces.vector import vector
+from pbdkit.scene.scene import Scene, body_box
 
 Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]
@@ -68,15 +70,14 @@ def _passes(scene: Scene) -> list[Scene]:
     return [replace(scene, inner=None), *inner]
 
 
-def _places(scene: Scene) -> list[Vector]:
+def _places(scene: Scene) -> list[Here]:
     """The middle of the body, and its corners, for rules that ask for the place."""
     if not scene.experiment.rule.uses_reference:
         return [NOWHERE]
-    setting = setting_of(scene.raster, scene.neighbourhood)
-    (left, low), (right, high) = setting.lower, setting.upper
-    corners = [(x, y) for x in (left, right) for y in (low, high)]
-    at = [((left + right) / 2, (low + high) / 2), *corners]
-    return [Vector(np.float64(x), np.float64(y)) for x, y in at]
+    lower, upper = body_box(scene.raster)
+    local = [scene.middle, *map(vector, product(*zip(lower, upper, strict=True)))]
+    origin = vector(scene.experiment.lattice.origin)
+    return [Here(None, (at + origin).each(np.float64), at - scene.middle) for at in local]
 
 
 def _one_side(slots: Slots) -> Slots:
@@ -84,12 +85,12 @@ def _one_side(slots: Slots) -> Slots:
     return tuple(slot for slot in slots if slot.rest.x + SLANT * slot.rest.y > 0.0)
 
 
-def _move_at_rest(scene: Scene, at: Vector, slots: tuple[Slots, ...]) -> float:
+def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
     moves = [np.abs(_moved(scene, own, {}, at)).max() for own in slots if own]
     return float(max(moves, default=0.0))
 
 
-def _answers(scene: Scene, at: Vector, size: float, within: float) -> bool:
+def _answers(scene: Scene, at: Here, size: float, within: float) -> bool:
     """Whether the rule's move is Σ W d for random differences d of that size."""
     stencil = linearised(scene, at)
     generator = np.random.default_rng(0)
@@ -102,7 +103,7 @@ def _answers(scene: Scene, at: Vector, size: float, within: float) -> bool:
     return True
 
 
-def _turns_with_the_body(scene: Scene, at: Vector, spacing: float) -> bool:
+def _turns_with_the_body(scene: Scene, at: Here, spacing: float) -> bool:
     """Whether a finite rotation of all neighbours about the particle rotates its move."""
     generator = np.random.default_rng(1)
     c, s = np.cos(ANGLE), np.sin(ANGLE)
@@ -128,7 +129,7 @@ def _is_symmetric(stencil: Stencil) -> bool:
     return bool(max(*apart, own) <= ROUNDING * scale)
 
 
-def _place_dependence(scene: Scene, stencils: dict[Vector, Stencil]) -> str | None:
+def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> str | None:
     """How the rule differs between the body's middle and its corners; None where it does not."""
     middle, *corners = [_matrices(of) for of in stencils.values()]
     if not corners:
@@ -141,7 +142,7 @@ def _place_dependence(scene: Scene, stencils: dict[Vector, Stencil]) -> str | No
     corner = list(stencils)[1 + worst]
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
     verdict = f"; no constant of a material does that: {parameters} is no Poisson ratio"
-    text = _worded(scene, differences[worst], f"({corner.x:.6g}, {corner.y:.6g})")
+    text = _worded(scene, differences[worst], f"({corner.X.x:.6g}, {corner.X.y:.6g})")
     return text + (verdict if parameters else "")
 
 
@@ -164,9 +165,9 @@ def _worded(scene: Scene, difference: Floats, corner: str) -> str:
     )
 
 
-def _moved(scene: Scene, slots: Slots, d: Differences, at: Vector) -> Floats:
-    def difference(slot: Slot) -> Vector:
-        return Vector(*d[slot]) if slot in d else STILL
-
+def _moved(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:
+    still = vector(np.zeros(scene.axes))
     with np.errstate(all="ignore"):
-        return np.array(move(scene, slots, difference, Here(STILL, at)), float)
+        moved = move(scene, slots, lambda slot: vector(d[slot]) if slot in d else still,
+                     at._replace(u=still))  # fmt: skip
+    return np.array(moved, float)

@@ -1,14 +1,37 @@
 """What the author of a component reads: the six interfaces and the data they exchange."""
 
-from pbdkit.interfaces.arithmetic import Vector, length, squared_length, where
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
-from pbdkit.interfaces.fracture import FractureModel
-from pbdkit.interfaces.frame import FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces.fracture import (
+    BreaksAtStrain,
+    FractureModel,
+    RenewsBonds,
+    Softens,
+    StartsCracked,
+)
+from pbdkit.interfaces.frame import Anchors, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
 from pbdkit.interfaces.neighbours import Nearness, NeighbourMetric, Slot
-from pbdkit.interfaces.remembered import Bonds, Particles, Remembered
-from pbdkit.interfaces.rule import FollowerRule, Here, Setting, Stiffness
+from pbdkit.interfaces.rule import (
+    AppliesTwice,
+    Calibrated,
+    FollowerRule,
+    Here,
+    RenewsParticles,
+    Setting,
+    Stiffness,
+    StoresEnergy,
+)
+from pbdkit.interfaces.values import Bonds, Draws, Particles, Remembered, Remembers
+from pbdkit.interfaces.vector import (
+    Components,
+    SpaceVector,
+    Vector,
+    dot,
+    length,
+    squared_length,
+    where,
+)
 
 INTERFACES: dict[str, type[Component]] = {
     "lattice": Lattice,
@@ -22,11 +45,17 @@ INTERFACES: dict[str, type[Component]] = {
 
 __all__ = [
     "INTERFACES",
+    "Anchors",
+    "AppliesTwice",
     "BasisSite",
     "Bonds",
+    "BreaksAtStrain",
+    "Calibrated",
     "Cell",
     "Component",
+    "Components",
     "Diagnostic",
+    "Draws",
     "FollowerRule",
     "FractureModel",
     "FrameMap",
@@ -42,11 +71,19 @@ __all__ = [
     "Pair",
     "Particles",
     "Remembered",
+    "Remembers",
+    "RenewsBonds",
+    "RenewsParticles",
     "Setting",
     "Slot",
+    "Softens",
+    "SpaceVector",
+    "StartsCracked",
     "Stiffness",
+    "StoresEnergy",
     "Variable",
     "Vector",
+    "dot",
     "length",
     "squared_length",
     "where",

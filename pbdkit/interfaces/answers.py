@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces.arithmetic import Vector
+from pbdkit.interfaces.vector import Components
 
 
 class AnswerError(TypeError):
     """A function returned something of another kind; the text says what to return."""
 
 
-def as_vector(answer: Any, what: str) -> Vector:
-    """The answer of the function `what`; AnswerError where it is no vector."""
-    if not isinstance(answer, Vector):
-        raise AnswerError(f"`{what}` returned {_kind(answer)}: return `pbdkit.Vector(x, y)`")
-    return answer
-
-
-def as_move(answer: Any) -> Any:
-    """The answer of a rule's `apply`; AnswerError where it is not two components."""
-    if not isinstance(answer, Iterable):
-        raise AnswerError(f"`apply` returned {_kind(answer)}, not the move (x, y)")
-    if len(components := tuple(answer)) != 2:
+def as_vector(answer: Any, what: str, like: Any) -> Any:
+    """The answer of the function `what`; AnswerError where it is no vector of as many components as
+    another."""
+    if type(answer) is not type(like):
+        names = ", ".join(type(like)._fields)
         raise AnswerError(
-            f"`apply` returned {len(components)} values, not the move (x, y)"
-            if isinstance(answer, (tuple, list))
-            else f"`apply` returned {_kind(answer)}, not the move (x, y)"
+            f"`{what}` returned {_kind(answer)}: return a vector, as "
+            f"`pbdkit.{_kind(like)}({names})`"
         )
     return answer
 
@@ -45,7 +36,7 @@ def as_verdict(answer: Any) -> Any:
 def as_values(answer: Any, what: str) -> tuple[Any, ...]:
     """The answer of a function that gives any number of values; AnswerError where it is one, as
     where the comma of ``(value,)`` is forgotten."""
-    if not isinstance(answer, (tuple, list)):
+    if isinstance(answer, Components) or not isinstance(answer, (tuple, list)):
         raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple: write `(value,)`")
     return tuple(answer)
 

@@ -10,10 +10,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.remembered import Bonds
 from pbdkit.interfaces.rule import Stiffness
+from pbdkit.interfaces.values import Bonds
+from pbdkit.interfaces.vector import Vector
 
 Floats = NDArray[np.floating[Any]]
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.neighbours import Slot
-from pbdkit.interfaces.remembered import Bonds, Drawn, Remembered, is_own
+from pbdkit.interfaces.values import Remembers
 
 Segment = tuple[Pair, Pair]
 """A straight crack, from one point to another (lattice units)."""
@@ -23,12 +22,14 @@ class FractureModel(Component):
 
     To add a model, write `breaks` and `fictitious`, both static and elementwise as a rule's
     functions are. d = u_k - u_j is the difference along the bond, r its rest offset, c the
-    slot's constants and p the parameters.
+    slot's constants and what is remembered of the bond, by name, and p the parameters.
 
-    A model that remembers numbers of each bond declares them with `bond_state`; the functions see
-    them as further entries of c, in that order. In the intermediate configuration, for each bond
-    that has not broken and can: ``update`` gives their new values, then ``breaks`` decides; from
-    then on they stay. Afterwards ``seen`` is what the rule sees at bonds that have not broken.
+    In the intermediate configuration, for each bond that has not broken and can: a model that
+    `RenewsBonds` gives their new values, then ``breaks`` decides; from then on they stay.
+    Afterwards a model that `Softens` says what the rule sees at bonds that have not broken.
+
+    What only some models can do is a class that they take on besides: `Remembers`, `Draws`,
+    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`.
     """
 
     can_break: ClassVar[bool] = True
@@ -42,58 +43,21 @@ class FractureModel(Component):
         """The numbers that the functions see as ``p.name``; by default the model's own."""
         return self.numeric_parameters()
 
-    def segments(self) -> Sequence[Segment]:
-        """Cracks that are there from the start: all bonds that cross them are broken at step 0."""
-        return ()
-
     @abstractmethod
-    def constants(self, slot: Slot) -> tuple[float, ...]:
-        """The constants of a slot, seen as ``c``; the same for a slot and its opposite."""
-
-    def bond_state(self) -> tuple[Remembered, ...]:
-        """The numbers that the model remembers of each bond; by default none."""
-        return ()
-
-    def draw(self, bonds: Bonds, generator: np.random.Generator) -> Drawn:
-        """Where these numbers start, (bond,) by name, if not all at their `initial`.
-
-        The generator depends on the experiment's `seed` and on nothing else: neither on other
-        random parts, nor on engine or threads.
-        """
-        return {}
+    def constants(self, slot: Slot) -> dict[str, float]:
+        """The constants of a slot, seen as ``c.name``; the same for a slot and its opposite, and
+        the same names for all."""
 
     @staticmethod
     @abstractmethod
-    def breaks(d: Vector, r: Vector, c: Any, p: Any) -> Any:
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
         """Whether the bond breaks in the intermediate configuration; called for one end only."""
 
     @staticmethod
-    def update(d: Vector, r: Vector, c: Any, p: Any) -> tuple[Any, ...]:
-        """The new values of the numbers that change, in their order; called for one end only.
-
-        By default they stay. Where a configuration lasts the values must come to an end (a largest
-        value so far does, a count of steps does not), or the solver `equilibrium` finds none.
-        """
-        return ()
-
-    @staticmethod
     @abstractmethod
-    def fictitious(u: Vector, r: Vector, p: Any) -> Vector:
-        """The difference that stands in for d once the bond is broken; u is that of this end."""
-
-    @staticmethod
-    def seen(d: Vector, lost: Vector, r: Vector, c: Any, p: Any) -> Vector:
-        """The difference that the rule sees at a bond that has not broken; by default d.
-
-        `lost` is the fictitious difference: damage D softens a bond as (1 - D) d + D lost.
-        """
-        return d
-
-    @staticmethod
-    def breaking_strain(r: Vector, c: Any, p: Any) -> Any:
-        """The strain |r + d| / |r| - 1 beyond which the bond breaks, for those who explain; by
-        default None: the model breaks bonds by something else, or does not say."""
-        return None
+    def fictitious(u: Any, r: Any, p: Any) -> Any:
+        """The difference that stands in for d once the bond is broken, a vector; u is that of this
+        end."""
 
     def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
         """Warnings about the model on these rest lengths, a sequence a shell; by default none.
@@ -102,17 +66,46 @@ class FractureModel(Component):
         """
         return []
 
-    def updates(self) -> bool:
-        """Whether what it remembers changes."""
-        return is_own(self, FractureModel, "update")
 
-    def softens(self) -> bool:
-        """Whether the rule sees something else than d at bonds that have not broken."""
-        return is_own(self, FractureModel, "seen")
+class RenewsBonds(Remembers):
+    """A fracture model of which some remembered numbers change from step to step."""
 
-    def draws(self) -> bool:
-        """Whether bonds differ from the start."""
-        return is_own(self, FractureModel, "draw")
+    @staticmethod
+    @abstractmethod
+    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
+        """The new values of the numbers that change, in their order; called for one end only.
+
+        Where a configuration lasts the values must come to an end (a largest value so far does, a
+        count of steps does not), or the solver `equilibrium` finds none.
+        """
+
+
+class Softens(ABC):
+    """A fracture model under which the rule sees something else than d at bonds that have not
+    broken."""
+
+    @staticmethod
+    @abstractmethod
+    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
+        """The difference that the rule sees; `lost` is the fictitious one: damage D softens a bond
+        as (1 - D) d + D lost."""
+
+
+class StartsCracked(ABC):
+    """A fracture model with cracks that are there from the start."""
+
+    @abstractmethod
+    def segments(self) -> Sequence[Segment]:
+        """The cracks: all bonds that cross them are broken at step 0."""
+
+
+class BreaksAtStrain(ABC):
+    """A fracture model that says how far a bond may be strained, for those who explain."""
+
+    @staticmethod
+    @abstractmethod
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+        """The strain |r + d| / |r| - 1 beyond which the bond breaks."""
 
 
 def breaking_order(

@@ -69,11 +69,11 @@ class FramePolicy(Component):
     def depth(self, reach: int) -> int:
         """How many layers the frame has; `reach` is what the neighbours reach, in site index."""
 
-    def anchors(self) -> bool:
-        """Whether it ties the body to its place: a translated body then moves otherwise. By
-        default it does not, and the weights of each point sum to 1."""
-        return False
-
     @abstractmethod
     def follow(self, frame: FrameSites) -> FrameMap:
         """The map from body displacements to the frame's; every frame point needs an entry."""
+
+
+class Anchors:
+    """A frame that ties the body to its place: a translated body then moves otherwise. Of other
+    frames the weights of each point sum to 1."""

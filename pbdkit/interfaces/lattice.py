@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component, Pair
+from pbdkit.interfaces.vector import Vector
 
 Index = tuple[int, int]
 

@@ -6,9 +6,9 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pbdkit.interfaces.arithmetic import Vector
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell, Index, Offset
+from pbdkit.interfaces.vector import Vector
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Bonds
+from pbdkit.interfaces import Bonds, BreaksAtStrain
 from pbdkit.interfaces.fracture import breaking_order
 from pbdkit.scene.raster import FRAME
 from pbdkit.scene.remembering import bond_numbers
@@ -100,14 +100,15 @@ class Explained:
         limits, constants = np.full(len(self.bonds), np.nan), self._scene.constants
         model = self._scene.experiment.fracture
         numbers = [number.name for number in bond_numbers(self._scene.experiment)]
-        if not model.can_break or any(name not in self._dataset for name in numbers):
+        if not isinstance(model, BreaksAtStrain) or not model.can_break:
+            return limits
+        if any(name not in self._dataset for name in numbers):
             return limits
         own = [_last(self._dataset[name]).astype(float) for name in numbers]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
             rows = np.flatnonzero(self._scene.bonds.plane == n)
-            c = (*constants.limits[plane.slot], *(values[rows] for values in own))
-            limit = model.breaking_strain(plane.slot.rest, c, constants.fracture)
-            limits[rows] = np.nan if limit is None else limit
+            c = constants.of_bond(*constants.limits[plane.slot], *(values[rows] for values in own))
+            limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
         return limits
 
     @cached_property

@@ -14,16 +14,18 @@ from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces import Bonds, LeaderRows, Moment, Pair, Slot, Stiffness, Vector, length
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.rule import material_of
+from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.results.gradient import displacement_gradient
 from pbdkit.results.tables import Tables
 from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.mesh import Patch
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.stepping.evaluator import summed
 from pbdkit.stepping.remembering import describe_bonds
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import difference, sum_over_slots
 
 
 class StateMoment(Moment):
@@ -118,18 +120,17 @@ class StateMoment(Moment):
     ) -> Floats:
         """The loop of the stepper, on the body's particles."""
         raster, state = self._tables.raster, self._state
-        fracturing = self._tables.fracturing if intact_only else None
         sums = np.zeros(raster.shape)
         for block, slots, present in self._tables.blocks:
 
             def contribution(slot: Slot, block: Any = block) -> tuple[Any, ...]:
-                value = function(difference(state.u, block, slot), slot.rest)
-                if fracturing is None or state.broken_step is None:
+                there = vector(block.seen_through(slot).of(state.u))
+                value = function(there - vector(block.of(state.u)), slot.rest)
+                if not intact_only or state.broken_step is None:
                     return (value,)
-                broken = fracturing.broken(block, slot, state.broken_step)
-                return (np.where(broken, 0.0, value),)
+                return (np.where(self._broken(block, slot), 0.0, value),)
 
-            (total,) = sum_over_slots(slots, present, contribution)
+            (total,) = summed(zip(map(contribution, slots), present, strict=True))
             body = raster.kind[block.slices()] == FOLLOWER
             sums[block.slices()] = np.where(body, total, 0.0)
         return raster.table(sums[None])[:, 0]
@@ -149,7 +150,7 @@ class StateMoment(Moment):
 
     def stiffness(self) -> Stiffness:
         """The rule's."""
-        stiffness = self._tables.scene.experiment.rule.stiffness()
+        stiffness = material_of(self._tables.scene.experiment.rule)
         assert stiffness is not None, "the scene refuses such rules"
         return stiffness
 
@@ -214,10 +215,18 @@ class StateMoment(Moment):
 
     def _intact(self, patch: Patch) -> NDArray[np.bool_]:
         """Which cells of a patch have no broken bond between their corners."""
-        fracturing, broken, intact = self._tables.fracturing, self._state.broken_step, patch.whole
-        if fracturing is None or broken is None:
+        intact = patch.whole
+        if self._state.broken_step is None:
             return intact
         sides = patch.cell.bonds(self._tables.scene.neighbourhood)
         for block, slot in ((patch.corners[k], slot) for k, slot in sides):
-            intact = intact & ~fracturing.broken(block, slot, broken)
+            intact = intact & ~self._broken(block, slot)
         return intact
+
+    def _broken(self, block: Block, slot: Slot) -> NDArray[np.bool_]:
+        """Where on a block the bond along a slot is broken."""
+        assert self._state.broken_step is not None
+        plane, at_this_end = self._tables.scene.neighbourhood.home[slot]
+        home = block if at_this_end else block.seen_through(slot)
+        broken: NDArray[np.bool_] = home.within(self._state.broken_step[plane]) >= 0
+        return broken

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.errors import PluginError
+from pbdkit.interfaces import RenewsBonds, RenewsParticles
 from pbdkit.results.layout import Column, remembered_column
 from pbdkit.results.moment import StateMoment
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
@@ -19,9 +20,13 @@ class RememberedColumns:
 
     def __init__(self, scene: Scene) -> None:
         fracture, rule = scene.experiment.fracture, scene.experiment.rule
+        renews_bonds, renews_own = (
+            isinstance(fracture, RenewsBonds),
+            isinstance(rule, RenewsParticles),
+        )
         every = [
-            *((n, "bond", fracture.updates()) for n in bond_numbers(scene.experiment)),
-            *((n, "particle", rule.remembers()) for n in particle_numbers(scene.experiment)),
+            *((n, "bond", renews_bonds) for n in bond_numbers(scene.experiment)),
+            *((n, "particle", renews_own) for n in particle_numbers(scene.experiment)),
         ]
         self.columns = [remembered_column(*entry) for entry in every if entry[0].recorded]
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.shares import cells_with_shares
-from pbdkit.stepping.fracturing import Fracturing
+from pbdkit.stepping.evaluator import presence
 from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats
-from pbdkit.stepping.sums import presence
 
 
 class Tables:
@@ -40,14 +39,9 @@ class Tables:
         return self.raster.reference()
 
     @cached_property
-    def fracturing(self) -> Fracturing | None:
-        """The planes of bonds, where bonds can break."""
-        return Fracturing(self.scene) if self.scene.has_fracture else None
-
-    @cached_property
     def followers(self) -> SlotFollowers:
         """The rule on the scene, which knows forces and energy."""
-        return SlotFollowers(self.scene, self.fracturing)
+        return SlotFollowers(self.scene)
 
     @cached_property
     def shares(self) -> list[tuple[Patch, NDArray[np.float64]]]:

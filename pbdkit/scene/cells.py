@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Slot
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import Block
+from pbdkit.scene.raster import Where
 
 Floats = NDArray[np.float64]
 Share = NDArray[np.floating[Any]] | float
@@ -100,14 +100,14 @@ class Cells:
     tiling: Tiling
     share: Floats
 
-    def beside(self, slot: Slot, block: Block, precision: str) -> tuple[Share, Share]:
-        """The shares to the left and the right of a slot on a block; 1 where all are whole."""
-        left, right = (self._seen(side, block, precision) for side in self.tiling.beside[slot])
+    def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
+        """The shares to the left and the right of a slot; 1 where all are whole."""
+        left, right = (self._seen(side, where, precision) for side in self.tiling.beside[slot])
         return left, right
 
-    def _seen(self, side: Side, block: Block, precision: str) -> Share:
-        there = block if side.first is None else block.seen_through(side.first)
-        share = self.share[(side.kind, *there.slices())]
+    def _seen(self, side: Side, where: Where, precision: str) -> Share:
+        there = where if side.first is None else where.seen_through(side.first)
+        share = there.of(self.share[side.kind])
         if (share == 1.0).all():
             return 1.0
         share = share.astype(precision)

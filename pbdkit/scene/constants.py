@@ -7,54 +7,76 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from pbdkit.errors import PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Slot
-from pbdkit.interfaces.answers import as_values
 from pbdkit.registry.blame import blaming
+from pbdkit.scene.remembering import bond_numbers, particle_numbers
 
-Constants = tuple[float, ...]
-WHOLE_CELLS = (1.0, 1.0)
+WHOLE_CELLS = {"left": 1.0, "right": 1.0}
 """The shares of the cells on both sides of a bond, where no frame weighs cells."""
 
 
 @dataclass(frozen=True)
 class SceneConstants:
-    """Parameters as tuples with names (``p.K``), and by slot the rule's weights and, where bonds
-    can break, the fracture model's constants."""
+    """Named tuples: the parameters `rule` and `fracture` (``p``); by slot the rule's `weights`
+    (``w``) and, where bonds can break, the fracture model's `limits` (``c`` without what is
+    remembered). `of_bond` makes ``c`` of limits and remembered numbers, `of_particle`
+    ``here.own``."""
 
     rule: Any
-    weights: dict[Slot, Constants]
+    weights: dict[Slot, Any]
     fracture: Any
-    limits: dict[Slot, Constants]
+    limits: dict[Slot, Any]
+    of_bond: Any
+    of_particle: Any
 
 
 def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
     """What rule and fracture model answer; what they refuse is about their part."""
     slots = [slot for own in setting.slots for slot in own]
-    with blaming(experiment.rule, "when asked for its constants", "rule"):
-        rule = _named(experiment.rule.parameters(setting))
-        sides = WHOLE_CELLS if experiment.rule.uses_cells else ()
-        weights = {
-            s: (*_numbers(experiment.rule.weights(s, setting), "weights"), *sides) for s in slots
-        }
-    fracture = experiment.fracture
+    rule, fracture = experiment.rule, experiment.fracture
+    with blaming(rule, "when asked for its constants", "rule"):
+        of_rule = _named("Parameters", rule.parameters(setting))
+        sides = WHOLE_CELLS if rule.uses_cells else {}
+        weights = {s: _named("Weights", rule.weights(s, setting) | sides) for s in slots}
+        _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
-        parameters = _named(fracture.parameters())
+        of_fracture = _named("Parameters", fracture.parameters())
         asked = slots if fracture.can_break else []
-        limits = {s: _numbers(fracture.constants(s), "constants") for s in asked}
-    return SceneConstants(rule, weights, parameters, limits)
+        limits = {s: _named("Constants", fracture.constants(s)) for s in asked}
+        _refuse_other_names(limits, "constants")
+        own = tuple(number.name for number in bond_numbers(experiment))
+        names = limits[asked[0]]._fields if asked else ()
+        if twice := set(names) & set(own):
+            raise PluginError(
+                f"'{fracture.type}' has a constant and remembers a number of the name "
+                f"'{min(twice)}': leave one out"
+            )
+    of_particle = tuple(number.name for number in particle_numbers(experiment))
+    return SceneConstants(
+        of_rule,
+        weights,
+        of_fracture,
+        limits,
+        _kind("Constants", (*names, *own)),
+        _kind("Own", of_particle),
+    )
 
 
-def _named(values: dict[str, float]) -> Any:
-    return _kind(tuple(values))(*map(float, values.values()))
+def _named(kind: str, values: Any) -> Any:
+    """Plain numbers by name: those of numpy would raise single precision to double."""
+    if not isinstance(values, dict):
+        raise TypeError(f"it returned {type(values).__name__}, not numbers by name: {{'k': 1.0}}")
+    return _kind(kind, tuple(values))(*map(float, values.values()))
 
 
 @cache
-def _kind(names: tuple[str, ...]) -> Any:
+def _kind(name: str, fields: tuple[str, ...]) -> Any:
     """Making a kind of tuple takes as long as many a part of a scene."""
-    return namedtuple("Parameters", names)
+    return namedtuple(name, fields)
 
 
-def _numbers(answer: Any, what: str) -> Constants:
-    """Plain numbers: those of numpy would raise single precision to double."""
-    return tuple(map(float, as_values(answer, what)))
+def _refuse_other_names(by_slot: dict[Slot, Any], what: str) -> None:
+    if len({values._fields for values in by_slot.values()}) > 1:
+        raise ValueError(f"its `{what}` do not have the same names for all slots")

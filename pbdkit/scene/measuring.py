@@ -5,6 +5,7 @@ from __future__ import annotations
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Diagnostic
+from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.mesh import body_cells
 from pbdkit.scene.raster import FRAME, Raster
@@ -50,7 +51,7 @@ def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
 
 def _refuse_without_material(diagnostic: Diagnostic, experiment: Experiment) -> None:
     rule = experiment.rule
-    if rule.stiffness() is None:
+    if material_of(rule) is None:
         raise ExperimentError(
             f"'{diagnostic.type}' needs a rule that is calibrated to a material ('elastic', "
             f"'orthotropic', 'springs', 'strain-gradient'), which '{rule.type}' with these "

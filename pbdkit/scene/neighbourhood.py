@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,6 +47,13 @@ class Neighbourhood:
         """The largest difference of repeat cell along each axis."""
         steps = [slot.cell for slots in self.slots for slot in slots]
         return max(abs(m) for m, _ in steps), max(abs(n) for _, n in steps)
+
+    @cached_property
+    def home(self) -> dict[Slot, tuple[int, bool]]:
+        """By slot the plane on which its bonds live, and whether they do at this end: it is the end
+        of the plane's own slot."""
+        ends = enumerate(self.planes)
+        return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
     def shells(self) -> list[list[float]]:
         """The rest lengths of each shell, the first shell first."""

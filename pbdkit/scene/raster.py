@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,11 +41,57 @@ class Block:
         (m, n), (a, b), (c, d) = slot.cell, self.start, self.stop
         return Block(slot.target, (a + m, b + n), (c + m, d + n))
 
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., sublattice, cell, cell) here, as a view."""
+        return values[(..., *self.slices())]
+
+    def within(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., cell, cell) here, as a view."""
+        return values[(..., *self.slices()[1:])]
+
     def rows(self, cells: int) -> list[Block]:
         """The block cut along its first axis into parts of about so many cells."""
         (a, b), (c, d) = self.start, self.stop
         step = max(1, cells // max(1, d - b))
         return [Block(self.sublattice, (i, b), (min(i + step, c), d)) for i in range(a, c, step)]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Some particles of one sublattice by their flat place on rasters of a shape; they can be asked
+    as a Block can."""
+
+    shape: tuple[int, ...]
+    place: Indices
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., sublattice, cell, cell) here."""
+        flat = values.reshape(*values.shape[: values.ndim - len(self.shape)], -1)
+        found: NDArray[Any] = flat[..., self.place]
+        return found
+
+    def within(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., cell, cell) here."""
+        flat = values.reshape(*values.shape[: values.ndim - len(self.shape) + 1], -1)
+        found: NDArray[Any] = flat[..., self.place % math.prod(self.shape[1:])]
+        return found
+
+    def seen_through(self, slot: Slot | Offset) -> Places:
+        """The neighbours at that slot; `step` away."""
+        return Places(self.shape, self.place + slot_step(self.shape, slot))
+
+
+Where = Block | Places
+"""Some particles of one sublattice."""
+
+
+def slot_step(shape: tuple[int, ...], slot: Slot | Offset) -> int:
+    """From a flat place of rasters to that of the neighbour at a slot."""
+    source = slot.source if isinstance(slot, Slot) else slot.target
+    step = slot.target - source
+    for size, cells in zip(shape[1:], slot.cell, strict=True):
+        step = step * size + cells
+    return step
 
 
 @dataclass(frozen=True)
@@ -147,11 +194,15 @@ class Raster:
         offsets = positions(self.lattice.cell(), *self.cells_of(rows))
         return np.stack(offsets, axis=1) + self.lattice.origin
 
-    def reference_planes(self, block: Block) -> Vector:
-        """X from the lattice's site (0, 0) on a block, a plane a component."""
-        m = np.arange(block.start[0], block.stop[0])[:, None] + self.first[0]
-        n = np.arange(block.start[1], block.stop[1])[None, :] + self.first[1]
-        return positions(self.lattice.cell(), block.sublattice, m, n)
+    def reference_planes(self, where: Where) -> Vector:
+        """X from the lattice's site (0, 0), a plane a component."""
+        s: Any
+        if isinstance(where, Places):
+            s, *cells = np.unravel_index(where.place, self.shape)
+        else:
+            s, *cells = where.sublattice, *np.ogrid[where.slices()[1:]]
+        cells = [c + first for c, first in zip(cells, self.first, strict=True)]
+        return positions(self.lattice.cell(), s, *cells)
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
         """(particle, axis): the values of planes u, (axis, sublattice, cell, cell), by number."""

@@ -6,7 +6,7 @@ from collections import Counter
 
 from pbdkit.errors import PluginError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Remembered
+from pbdkit.interfaces import FollowerRule, FractureModel, Remembered, Remembers
 from pbdkit.interfaces.answers import as_values
 from pbdkit.registry.blame import blaming
 
@@ -15,16 +15,19 @@ Declared = tuple[Remembered, ...]
 
 def bond_numbers(experiment: Experiment) -> Declared:
     """What the fracture model remembers of each bond; nothing where bonds cannot break."""
-    if not experiment.fracture.can_break:
-        return ()
-    with blaming(experiment.fracture, "when asked what it remembers", "fracture"):
-        return as_values(experiment.fracture.bond_state(), "bond_state")
+    return _declared(experiment.fracture, "fracture") if experiment.fracture.can_break else ()
 
 
 def particle_numbers(experiment: Experiment) -> Declared:
     """What the rule remembers of each particle."""
-    with blaming(experiment.rule, "when asked what it remembers", "rule"):
-        return as_values(experiment.rule.particle_state(), "particle_state")
+    return _declared(experiment.rule, "rule")
+
+
+def _declared(part: FollowerRule | FractureModel, field: str) -> Declared:
+    if not isinstance(part, Remembers):
+        return ()
+    with blaming(part, "when asked what it remembers", field):
+        return as_values(part.remembered(), "remembered")
 
 
 def remembered_names(experiment: Experiment) -> dict[str, str]:

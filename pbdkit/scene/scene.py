@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import add
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Cell, Setting, Vector
+from pbdkit.interfaces import AppliesTwice, Cell, Components, Remembers, Setting
+from pbdkit.interfaces.rule import material_of
+from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Cells, Tiling, tiling_of
@@ -52,6 +55,18 @@ class Scene:
     def has_fracture(self) -> bool:
         """Whether any bond can break."""
         return self.experiment.fracture.can_break
+
+    @property
+    def axes(self) -> int:
+        """How many axes space has: the lattice says so."""
+        return len(self.raster.lattice.cell().vectors)
+
+    @cached_property
+    def middle(self) -> Components:
+        """The middle of the body's box, from the lattice's site (0, 0)."""
+        lower, upper = body_box(self.raster)
+        middle: Components = (lower + upper) / 2
+        return middle
 
     @property
     def shows_bonds(self) -> bool:
@@ -124,15 +139,16 @@ def _build(experiment: Experiment) -> Scene:
 def _inner(scene: Scene) -> Scene | None:
     """The scene with the rule's inner rule in its place."""
     experiment, rule = scene.experiment, scene.experiment.rule
+    if not isinstance(rule, AppliesTwice):
+        return None
     with blaming(rule, "when asked for its inner rule", "rule"):
         inner = rule.inner()
-    if inner is None:
-        return None
+    remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
     for unfit, part, remedy in (
         (scene.frame, "frame", "{type: natural}, which has no points"),
         (scene.has_fracture, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
-        (rule.particle_state() or inner.particle_state(), "rule", "one that remembers nothing"),
+        (remembers, "rule", "one that remembers nothing"),
     ):
         if unfit:
             raise ExperimentError(
@@ -162,13 +178,19 @@ def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Fillin
 
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     """What a rule may derive its constants from."""
+    lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
+    return Setting(raster.lattice.cell(), neighbourhood.slots, lower, upper)
+
+
+def body_box(raster: Raster) -> tuple[Components, Components]:
+    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
     cell = raster.lattice.cell()
-    lower, upper = np.full(2, np.inf), np.full(2, -np.inf)
+    lower, upper = np.full(len(cell.vectors), np.inf), np.full(len(cell.vectors), -np.inf)
     for rows in raster.chunks():
         x = np.array(positions(cell, *raster.cells_of(rows[raster.table_kind[rows] == FOLLOWER])))
         lower = np.minimum(lower, x.min(axis=1, initial=np.inf))
         upper = np.maximum(upper, x.max(axis=1, initial=-np.inf))
-    return Setting(cell, neighbourhood.slots, Vector(*lower.tolist()), Vector(*upper.tolist()))
+    return vector(lower.tolist()), vector(upper.tolist())
 
 
 def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
@@ -194,7 +216,7 @@ def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -
 
 def _edge_effects(experiment: Experiment) -> list[str]:
     frame, rule = experiment.frame, experiment.rule
-    if frame.edges_are_free or rule.stiffness() is None:
+    if frame.edges_are_free or material_of(rule) is None:
         return []
     return [
         f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated rule "

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Diagnostic
+from pbdkit.interfaces import Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.remembering import Declared, bond_numbers, particle_numbers
@@ -84,8 +84,8 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     of_bonds, of_particles = (
         _recorded_bytes(numbers, renews, recorded)
         for numbers, renews in (
-            (bonds, experiment.fracture.updates()),
-            (own, experiment.rule.remembers()),
+            (bonds, isinstance(experiment.fracture, RenewsBonds)),
+            (own, isinstance(experiment.rule, RenewsParticles)),
         )
     )
     once += math.ceil(particles * (planes * of_bonds[0] + of_particles[0]))

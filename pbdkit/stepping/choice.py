@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.interfaces import Softens
+from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.leaders import last_event
@@ -81,9 +83,10 @@ def obstacle(scene: Scene) -> str:
         return "neighbours are found anew at every step"
     if scene.inner:
         return "the rule works on the moves of another"
-    if scene.experiment.fracture.bond_state() or scene.experiment.fracture.softens():
+    fracture = scene.experiment.fracture
+    if bond_numbers(scene.experiment) or isinstance(fracture, Softens):
         return f"fracture '{scene.experiment.fracture.type}' keeps a state of each bond"
-    if scene.experiment.rule.particle_state():
+    if particle_numbers(scene.experiment):
         return f"rule '{scene.experiment.rule.type}' keeps a state of each particle"
     if max(map(len, scene.neighbourhood.slots)) > 31:
         return "more than 31 neighbours"

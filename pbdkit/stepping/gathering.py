@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import Here, Nearness, Vector
-from pbdkit.interfaces.answers import as_move, as_values
+from pbdkit.interfaces import Components, Here, Nearness, RenewsParticles
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.vector import vector
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, Neighbour
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.remembering import changing, renew
 from pbdkit.stepping.state import Floats, State
@@ -29,35 +30,37 @@ class GatheringFollowers(Followers):
     def __init__(self, scene: Scene, near: Nearness) -> None:
         raster = scene.raster
         self._scene = scene
-        self._rule = scene.experiment.rule
-        self._parameters = scene.constants.rule
+        self._evaluator = Evaluator(scene)
+        self._none = next(iter(scene.constants.weights.values()))
+        self._own = scene.constants.of_particle
         everybody = np.arange(raster.count)
         self._place, self._body = raster.place_of(everybody), raster.body_rows
         self._site = raster.cells_of(everybody)
-        self._X = np.stack(positions(raster.lattice.cell(), *self._site))
+        local = positions(raster.lattice.cell(), *self._site)
+        self._X = np.stack(local)
+        self._at = local.each(np.add, raster.lattice.origin)
+        self._centred = local.each(np.subtract, scene.middle)
         self._rank, self._rest = _tables(scene.neighbourhood)
         self._scale = np.sqrt(np.array(near.weights))
         self._radius = near.radius * (1 + 1e-9)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Bonds do not last here, so that none can be broken."""
-        u = m.reshape(2, -1)[:, self._place]
+        u = m.reshape(len(m), -1)[:, self._place]
         j, k, rest = self._pairs(self._X + u)
-        d, r = Vector(*(u[:, k] - u[:, j])), Vector(*rest)
         count = len(self._place)
-        total = tuple(
-            np.bincount(j, np.broadcast_to(part, j.shape), count)
-            for part in self._rule.gather(d, r, (), self._parameters)
-        )
-        own = tuple(value.ravel()[self._place] for value in state.particle_values)
-        here = Here(Vector(*u), Vector(*self._X), own)
-        move = as_move(self._rule.apply(total, here, self._parameters))
+        to = Neighbour(vector(rest), self._none)
+        d = vector(u[:, k] - u[:, j])
+        parts = self._evaluator.contribution(d, vector(u[:, j]), to)
+        total = tuple(_summed(part, j, count) for part in parts)
+        own = [value.ravel()[self._place] for value in state.particle_values]
+        here = Here(vector(u), self._at, self._centred, self._own(*own))
+        move = self._evaluator.move(total, here)
         movable = self._body[np.bincount(j, minlength=count)[self._body] > 0]
         place = self._place[movable]
-        if self._rule.remembers():
+        if isinstance(self._evaluator.rule, RenewsParticles):
             self._remember(total, here, state, movable)
-        flat = new.reshape(2, -1)
-        for u_here, step, plane in zip(u, move, flat, strict=True):
+        for u_here, step, plane in zip(u, move, new.reshape(len(new), -1), strict=True):
             before = plane[self._place]
             moved = target(u_here, step, before, self._scene.experiment.solver)
             plane[self._place[self._body]] = u_here[self._body]
@@ -67,8 +70,7 @@ class GatheringFollowers(Followers):
         """`here` holds copies, so that what is written is not read again."""
         numbers, place = particle_numbers(self._scene.experiment), self._place[movable]
         fresh = changing(numbers, here.own)
-        new = as_values(self._rule.remember(total, here, self._parameters), "remember")
-        renew(fresh, new, None)
+        renew(fresh, self._evaluator.remember(total, here), None)
         for plane, values in zip(changing(numbers, state.particle_values), fresh, strict=True):
             plane.reshape(-1)[place] = values[movable]
 
@@ -112,3 +114,10 @@ def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
     for number, slot in enumerate(slots):
         rank[slot.source, slot.target, slot.cell[0] + m, slot.cell[1] + n] = number
     return rank, np.array([slot.rest for slot in slots]).T
+
+
+def _summed(part: Any, owner: Indices, count: int) -> Any:
+    """Σ over the pairs of each owner, in their order."""
+    if isinstance(part, Components):
+        return part.each(lambda values: _summed(values, owner, count))
+    return np.bincount(owner, np.broadcast_to(part, owner.shape), count)

@@ -24,7 +24,7 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
             continue
         begun = starts[n]
         if begun is None:
-            starts[n] = begun = state.u.reshape(2, -1)[:, leading.place].copy()
+            starts[n] = begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
         n_th = step - leading.group.from_ + 1
         offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
         led.append((leading.place, begun + np.atleast_2d(offset).T))
@@ -90,6 +90,6 @@ def is_cut_short(leading: Leading, steps: int) -> bool:
 
 def place(u: Floats, led: Led) -> None:
     """Puts leaders where they are prescribed."""
-    flat = u.reshape(2, -1)
+    flat = u.reshape(len(u), -1)
     for places, values in led:
         flat[:, places] = values

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Bonds, FollowerRule, FractureModel, Particles, Remembered
+from pbdkit.interfaces import Bonds, Draws, FollowerRule, FractureModel, Particles, Remembered
 from pbdkit.interfaces.naming import did_you_mean
-from pbdkit.interfaces.remembered import Drawn
+from pbdkit.interfaces.values import Drawn
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
@@ -28,7 +28,7 @@ def initial_bond_values(scene: Scene) -> Values:
     shape = (len(table), *scene.raster.shape[1:])
     numbers = bond_numbers(scene.experiment)
     values = _started(scene, numbers, shape)
-    if numbers and model.draws():
+    if numbers and isinstance(model, Draws):
         bonds = scene.bonds
         where = bonds.plane, *np.unravel_index(bonds.place, scene.raster.shape[1:])
         owners = describe_bonds(scene)
@@ -40,7 +40,7 @@ def initial_particle_values(scene: Scene) -> Values:
     """(sublattice, cell, cell) a number, as the rule starts them; frame points are left out."""
     rule, numbers = scene.experiment.rule, particle_numbers(scene.experiment)
     values = _started(scene, numbers, scene.raster.shape)
-    if numbers and rule.draws():
+    if numbers and isinstance(rule, Draws):
         owners, place = describe_particles(scene), scene.raster.place_of(scene.raster.body_rows)
         where = np.unravel_index(place, scene.raster.shape)
         _draw(scene, "rule", numbers, values, partial(rule.draw, owners), len(owners), where)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Pair, Vector
+from pbdkit.interfaces import Pair, StartsCracked
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.cracks import crosses
 from pbdkit.scene.leading import kinds_at
@@ -76,10 +76,10 @@ def _each(value: Any) -> tuple[Any, ...]:
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
     the given cracks broken at step 0. Nothing has moved before."""
-    shape, precision = (2, *scene.raster.shape), scene.experiment.solver.precision
+    shape, precision = (scene.axes, *scene.raster.shape), scene.experiment.solver.precision
     u, previous = np.zeros(shape, precision), np.zeros(shape, precision)
     if not scene.experiment.initial.at_rest:
-        _displace(scene, u.reshape(2, -1))
+        _displace(scene, u.reshape(scene.axes, -1))
         previous[...] = u
     broken = _broken_by_cracks(scene) if scene.has_fracture else None
     lengths = None if broken is None else np.zeros(broken.shape, precision)
@@ -100,15 +100,16 @@ def _displace(scene: Scene, u: Floats) -> None:
 
 def _broken_by_cracks(scene: Scene) -> NDArray[np.int32]:
     """(plane, cell, cell): 0 where a bond crosses a crack of the experiment, else -1."""
-    raster, planes = scene.raster, scene.neighbourhood.planes
+    raster, planes, model = scene.raster, scene.neighbourhood.planes, scene.experiment.fracture
+    cracks = model.segments() if isinstance(model, StartsCracked) else ()
     broken = np.full((len(planes), *raster.shape[1:]), -1, np.int32)
     for n, plane in enumerate(planes):
         block = plane_block(raster, plane)
-        for a, b in scene.experiment.fracture.segments() if block else ():
+        for a, b in cracks if block else ():
             assert block is not None
             crack = (_from_origin(scene, a), _from_origin(scene, b))
             start = raster.reference_planes(block)
-            end = Vector(start.x + plane.slot.rest.x, start.y + plane.slot.rest.y)
+            end = start + plane.slot.rest
             crossed = crosses(start, end, crack) & bonds_in(raster, block, plane, frame_too=True)
             broken[(n, *block.slices()[1:])][crossed] = 0
     return broken

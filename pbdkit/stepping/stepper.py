@@ -28,7 +28,7 @@ class Stepper(Engine):
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         near = scene.experiment.neighbours.nearness()
         self._followers: Followers = (
-            GatheringFollowers(scene, near) if near else SlotFollowers(scene, self._fracturing)
+            GatheringFollowers(scene, near) if near else SlotFollowers(scene)
         )
 
     def advance(self, state: State, steps: int = 1) -> State:
@@ -40,7 +40,7 @@ class Stepper(Engine):
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
         led, starts = prescribe(self._scene, state, step)
-        before = [(places, u.reshape(2, -1)[:, places].copy()) for places, _ in led]
+        before = [(places, u.reshape(len(u), -1)[:, places].copy()) for places, _ in led]
         place(u, led)
         if self._fracturing:
             self._fracturing.break_bonds(u, state, step)
@@ -56,4 +56,4 @@ class Stepper(Engine):
         """u of every frame point from the body's, of this step or, with lag, of the last."""
         if self._scene.frame:
             body = old if self._scene.frame.map.lag else new
-            self._scene.frame.follow(body.reshape(2, -1), new.reshape(2, -1))
+            self._scene.frame.follow(body.reshape(len(body), -1), new.reshape(len(new), -1))

@@ -7,9 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import FollowerRule, FractureModel, Here, Slot, Vector
-from pbdkit.interfaces.answers import as_move, as_values, as_vector
+from pbdkit.interfaces import (
+    Components,
+    FollowerRule,
+    FractureModel,
+    Here,
+    RenewsBonds,
+    RenewsParticles,
+    Slot,
+    Softens,
+    Vector,
+)
+from pbdkit.interfaces.answers import as_vector
+from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, summed
 from pbdkit.testing.numbers import (
     SHAPE,
     draws,
@@ -41,88 +53,80 @@ def here(scene: Scene, seed: int) -> Arrays:
     return u | X | remembered_of_particles(scene, seed)
 
 
-def gathered(rule: FollowerRule, scene: Scene, arrays: Arrays) -> list[tuple[Any, ...]]:
+def gathered(scene: Scene, arrays: Arrays) -> list[tuple[Any, ...]]:
     """The contributions of every slot."""
-    constants = scene.constants
-    return [
-        tuple(rule.gather(vector(arrays, f"d{k}"), s.rest, constants.weights[s], constants.rule))
-        for k, s in enumerate(scene.neighbourhood.slots[0])
-    ]
+    evaluator, slots = Evaluator(scene), scene.neighbourhood.slots[0]
+    differences = [vector(arrays, f"d{k}") for k in range(len(slots))]
+    neighbours = zip(differences, evaluator.everywhere(slots), strict=True)
+    return [evaluator.contribution(d, d, to) for d, to in neighbours]
 
 
-def summed(contributions: list[tuple[Any, ...]]) -> list[Any]:
-    """Their sums, in the order of the slots."""
-    totals = list(contributions[0])
-    for parts in contributions[1:]:
-        totals = [a + b for a, b in zip(totals, parts, strict=True)]
-    return totals
+def applied(scene: Scene, contributions: list[tuple[Any, ...]], arrays: Arrays) -> Arrays:
+    """The move that the sums of contributions make."""
+    total = summed((parts, None) for parts in contributions)
+    return _parts("move", Evaluator(scene).move(total, _standing(scene, arrays)))
 
 
-def applied(rule: FollowerRule, scene: Scene, totals: list[Any], arrays: Arrays) -> Arrays:
-    """The move."""
-    x, y = as_move(rule.apply(tuple(totals), _standing(rule, arrays), scene.constants.rule))
-    return {"move.x": x, "move.y": y}
-
-
-def _standing(rule: FollowerRule, arrays: Arrays) -> Here:
-    X = vector(arrays, "X") if rule.uses_reference else Vector(None, None)
-    return Here(vector(arrays, "u"), X, own_of(arrays))
+def _standing(scene: Scene, arrays: Arrays) -> Here:
+    X = vector(arrays, "X") if scene.experiment.rule.uses_reference else None
+    own = scene.constants.of_particle(*own_of(arrays))
+    return Here(vector(arrays, "u"), X, X, own)
 
 
 def ask_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
     """`gather` and `apply`; `remember`, `force` and `draw` where it has them."""
-    d, standing, p = differences(scene, seed), here(scene, seed), scene.constants.rule
+    d, standing, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
 
     def gather(arrays: Arrays) -> Arrays:
-        found = gathered(rule, scene, arrays)
-        return {f"{n} of slot {k}": c for k, parts in enumerate(found) for n, c in enumerate(parts)}
+        found = gathered(scene, arrays)
+        return {
+            f"{name} of slot {k}": part
+            for k, parts in enumerate(found)
+            for name, part in _flat(parts).items()
+        }
 
-    contributions = gathered(rule, scene, {k: v.copy() for k, v in d.items()})
-    if len({len(parts) for parts in contributions}) > 1:
+    contributions = gathered(scene, {k: v.copy() for k, v in d.items()})
+    if len({len(_flat(parts)) for parts in contributions}) > 1:
         return [_each("gather", d, gather)]  # they cannot be summed, which is found elsewhere
-    totals = summed(contributions)
-    named = {f"total[{n}]": np.broadcast_to(t, SHAPE).copy() for n, t in enumerate(totals)}
+    totals = summed((parts, None) for parts in contributions)
+    named = {name: np.broadcast_to(t, SHAPE).copy() for name, t in _flat(totals).items()}
+
+    def total(arrays: Arrays) -> tuple[Any, ...]:
+        values = iter([arrays[name] for name in named])
+        return tuple(
+            t.each(lambda _: next(values)) if isinstance(t, Components) else next(values)
+            for t in totals
+        )
 
     def apply(arrays: Arrays) -> Arrays:
-        return applied(rule, scene, [arrays[name] for name in named], arrays)
+        return _parts("move", evaluator.move(total(arrays), _standing(scene, arrays)))
 
     def remember(arrays: Arrays) -> Arrays:
-        total = tuple(arrays[name] for name in named)
-        return _counted(as_values(rule.remember(total, _standing(rule, arrays), p), "remember"))
+        return _counted(evaluator.remember(total(arrays), _standing(scene, arrays)))
 
     def force(arrays: Arrays) -> Arrays:
-        total = tuple(arrays[name] for name in named)
-        return dict(zip("xy", rule.force(total, _standing(rule, arrays), p), strict=True))
+        return _parts("force", evaluator.force(total(arrays), _standing(scene, arrays)))
 
     questions = [
         _each("gather", d, gather),
         _each("apply", named | standing, apply),
     ]
-    if rule.remembers():
+    if isinstance(rule, RenewsParticles):
         questions.append(_each("remember", named | standing, remember))
-    if rule.stiffness() is not None:
+    if material_of(rule) is not None:
         questions.append(_each("force", named | standing, force))
     return [*questions, *draws(rule, scene)]
 
 
-def constants(model: FractureModel, slot: Slot, arrays: Arrays) -> tuple[Any, ...]:
-    """The constants of a slot with the numbers of bonds behind them."""
-    return *model.constants(slot), *own_of(arrays)
-
-
-def breaking(
-    model: FractureModel, scene: Scene, slot: Slot, d: Vector, own: Any, r: Vector | None = None
-) -> Any:
+def breaking(scene: Scene, slot: Slot, d: Any, own: Any, r: Any = None) -> Any:
     """Whether bonds break that remember these numbers."""
-    return model.breaks(d, r or slot.rest, (*model.constants(slot), *own), scene.constants.fracture)
+    limits = scene.constants.limits[slot]
+    return Evaluator(scene).breaks(d, r or slot.rest, limits, own)
 
 
-def updated(
-    model: FractureModel, scene: Scene, slot: Slot, d: Vector, own: Any, r: Vector | None = None
-) -> tuple[Any, ...]:
+def updated(scene: Scene, slot: Slot, d: Any, own: Any, r: Any = None) -> tuple[Any, ...]:
     """The new values of the numbers that change."""
-    c, p = (*model.constants(slot), *own), scene.constants.fracture
-    return as_values(model.update(d, r or slot.rest, c, p), "update")
+    return Evaluator(scene).update(d, r or slot.rest, scene.constants.limits[slot], own)
 
 
 def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Question]:
@@ -133,13 +137,13 @@ def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
 
     def breaks(arrays: Arrays) -> Arrays:
         return {
-            f"slot {k}": breaking(model, scene, slot, vector(arrays, f"d{k}"), own_of(arrays))
+            f"slot {k}": breaking(scene, slot, vector(arrays, f"d{k}"), own_of(arrays))
             for k, slot in enumerate(slots)
         }
 
     def update(arrays: Arrays) -> Arrays:
         found = (
-            updated(model, scene, slot, vector(arrays, f"d{k}"), own_of(arrays))
+            updated(scene, slot, vector(arrays, f"d{k}"), own_of(arrays))
             for k, slot in enumerate(slots)
         )
         return {
@@ -150,10 +154,14 @@ def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         u = vector(arrays, "u")
         return _at_slots("fictitious", (model.fictitious(u, slot.rest, p) for slot in slots))
 
+    def c_of(slot: Slot, arrays: Arrays) -> Any:
+        return scene.constants.of_bond(*scene.constants.limits[slot], *own_of(arrays))
+
     def seen(arrays: Arrays) -> Arrays:
+        assert isinstance(model, Softens)
         lost = vector(arrays, "lost")
         found = (
-            model.seen(vector(arrays, f"d{k}"), lost, s.rest, constants(model, s, arrays), p)
+            model.seen(vector(arrays, f"d{k}"), lost, s.rest, c_of(s, arrays), p)
             for k, s in enumerate(slots)
         )
         return _at_slots("seen", found)
@@ -163,9 +171,9 @@ def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         _each("breaks", bonds, breaks),
         _each("fictitious", u, fictitious),
     ]
-    if model.updates():
+    if isinstance(model, RenewsBonds):
         questions.append(_each("update", bonds, update))
-    if model.softens():
+    if isinstance(model, Softens):
         questions.append(_each("seen", bonds | lost, seen))
     return [*questions, *draws(model, scene)]
 
@@ -174,12 +182,26 @@ def _each(what: str, inputs: Arrays, ask: Callable[[Arrays], Arrays]) -> Questio
     return Question(what, inputs, ask, elementwise=True)
 
 
-def _at_slots(what: str, found: Iterable[Vector]) -> Arrays:
+def _at_slots(what: str, found: Iterable[Any]) -> Arrays:
+    like = Vector(0.0, 0.0)
     return {
         f"{c} at slot {k}": value
         for k, answer in enumerate(found)
-        for c, value in zip("xy", as_vector(answer, what), strict=True)
+        for c, value in zip("xy", as_vector(answer, what, like), strict=True)
     }
+
+
+def _parts(name: str, v: Any) -> Arrays:
+    return {f"{name}.{c}": value for c, value in v._asdict().items()}
+
+
+def _flat(parts: tuple[Any, ...]) -> Arrays:
+    """Contributions by name, vectors component by component."""
+    found: Arrays = {}
+    for n, part in enumerate(parts):
+        name = f"total[{n}]"
+        found |= _parts(name, part) if isinstance(part, Components) else {name: part}
+    return found
 
 
 def _counted(values: tuple[Any, ...]) -> Arrays:

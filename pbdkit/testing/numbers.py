@@ -8,8 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Bonds, Component, FollowerRule, FractureModel, Particles, Remembered
-from pbdkit.interfaces.remembered import Drawn
+from pbdkit.interfaces import (
+    Bonds,
+    Component,
+    Draws,
+    FollowerRule,
+    FractureModel,
+    Particles,
+    Remembered,
+)
+from pbdkit.interfaces.values import Drawn
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.remembering import describe_bonds, describe_particles, generator_for
@@ -45,10 +53,7 @@ def owners(part: Component, scene: Scene) -> Bonds | Particles:
 
 def drawn(part: Component, shown: Bonds | Particles, generator: np.random.Generator) -> Drawn:
     """What it draws for them."""
-    if isinstance(part, FractureModel) and isinstance(shown, Bonds):
-        return part.draw(shown, generator)
-    assert isinstance(part, FollowerRule)
-    assert isinstance(shown, Particles)
+    assert isinstance(part, Draws)
     return part.draw(shown, generator)
 
 
@@ -58,7 +63,7 @@ def draws(part: FractureModel | FollowerRule, scene: Scene) -> list[Question]:
         numbers_of(part, scene)
     except NotAskedError:
         return []
-    if not part.draws():
+    if not isinstance(part, Draws):
         return []
     shown = owners(part, scene)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import operator
 import types
 import uuid
 from collections.abc import Callable, Iterator
@@ -14,19 +15,75 @@ import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from pbdkit.interfaces import where
+from pbdkit.interfaces import dot, where
+from pbdkit.interfaces.vector import Components
 
 Function = Callable[..., Any]
-_ready: set[Function] = {where}
+_ready: set[Function] = {where, dot}
+
+
+def _is_vector(kind: Any) -> bool:
+    return issubclass(getattr(kind, "instance_class", object), Components)
+
+
+def _written(kind: Any, arguments: str, component: str, whole: str = "Vector({})") -> Any:
+    """A function of vectors, written out for their components: `component` with `@` for each."""
+    names = kind.instance_class._fields
+    parts = [component.replace("@", name) for name in names]
+    scope: dict[str, Any] = {"Vector": kind.instance_class}
+    function = eval(f"lambda {arguments}: {whole.format(', '.join(parts))}", scope)
+    # numba wants the signature of the function that is overloaded, annotations included.
+    function.__annotations__ = dict.fromkeys([*arguments.split(", "), "return"], "Any")
+    return function
 
 
 @overload(where)
 def _where(condition: Any, yes: Any, no: Any) -> Any:
     # numpy's `where` on single numbers inside numba costs hundreds of times as much.
+    if _is_vector(yes):
+        return _written(yes, "condition, yes, no", "yes.@ if condition else no.@")
+
     def choose(condition: Any, yes: Any, no: Any) -> Any:
         return yes if condition else no
 
     return choose
+
+
+@overload(dot)
+def _dot(a: Any, b: Any) -> Any:
+    products = " + ".join(f"a.{name} * b.{name}" for name in a.instance_class._fields)
+    return _written(a, "a, b", "", products)
+
+
+@overload(operator.add)
+def _add(a: Any, b: Any) -> Any:
+    return _written(a, "a, b", "a.@ + b.@") if _is_vector(a) and _is_vector(b) else None
+
+
+@overload(operator.sub)
+def _sub(a: Any, b: Any) -> Any:
+    return _written(a, "a, b", "a.@ - b.@") if _is_vector(a) and _is_vector(b) else None
+
+
+@overload(operator.neg)
+def _neg(a: Any) -> Any:
+    return _written(a, "a", "-a.@") if _is_vector(a) else None
+
+
+@overload(operator.mul)
+def _mul(a: Any, b: Any) -> Any:
+    if _is_vector(a) and isinstance(b, numba.types.Number):
+        return _written(a, "a, b", "a.@ * b")
+    if _is_vector(b) and isinstance(a, numba.types.Number):
+        return _written(b, "a, b", "a * b.@")
+    return None
+
+
+@overload(operator.truediv)
+def _truediv(a: Any, b: Any) -> Any:
+    if _is_vector(a) and isinstance(b, numba.types.Number):
+        return _written(a, "a, b", "a.@ / b")
+    return None
 
 
 def compiled(function: Function) -> Any:

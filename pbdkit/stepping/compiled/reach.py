@@ -11,11 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Here, Vector
+from pbdkit.interfaces import StartsCracked
+from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, presence
 from pbdkit.stepping.leaders import Led
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.sums import presence
 
 Box = NDArray[np.int64]
 """(first row, last row + 1, first column, last column + 1) of repeat cells."""
@@ -82,22 +83,20 @@ class Reach:
 def _rests_by_construction(scene: Scene) -> bool:
     """Whether the reference configuration stays as it is: every neighbour is there, all start at
     rest, no bond is broken or breaks at rest, and the rule's move from there is zero."""
-    experiment, constants = scene.experiment, scene.constants
+    experiment, evaluator = scene.experiment, Evaluator(scene)
     rule, fracture = experiment.rule, experiment.fracture
-    if not experiment.initial.at_rest or rule.uses_reference or fracture.segments():
+    cracked = isinstance(fracture, StartsCracked) and fracture.segments()
+    if not experiment.initial.at_rest or rule.uses_reference or cracked:
         return False
-    home, zero = Vector(np.float64(0.0), np.float64(0.0)), np.float64(0.0)
+    still = vector(np.zeros(scene.axes))
     for s, slots in enumerate(scene.neighbourhood.slots):
         block = scene.raster.body_block(s)
         if block and any(there is not None for there in presence(scene.raster, block, slots)):
             return False
-        parts = [rule.gather(home, k.rest, constants.weights[k], constants.rule) for k in slots]
-        total = tuple(sum(part, zero) for part in zip(*parts, strict=True))
-        move = rule.apply(total, Here(home, Vector(None, None)), constants.rule)
-        if any(component != 0.0 for component in move):
+        if any(component != 0.0 for component in evaluator.at_rest(slots)):
             return False
         if fracture.can_break and any(
-            fracture.breaks(home, k.rest, constants.limits[k], constants.fracture) for k in slots
+            evaluator.breaks(still, k.rest, scene.constants.limits[k], ()) for k in slots
         ):
             return False
     return True

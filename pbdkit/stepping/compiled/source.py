@@ -17,7 +17,14 @@ def write_kernel(cell: Cell, neighbourhood: Neighbourhood, wanted: Wanted) -> st
     """The source of a module with `run`, which takes the scene `count` steps further."""
     out = Writer()
     out.add(0, '"""Made by pbdkit for one kind of scene; not to be edited."""', "")
-    for name, names in (("Rule", wanted.rule_parameters), ("Fracture", wanted.fracture_parameters)):
+    weights = next(iter(wanted.weights.values()))._fields
+    for name, names in (
+        ("Rule", wanted.rule_parameters),
+        ("Fracture", wanted.fracture_parameters),
+        ("Weights", weights),
+        ("Constants", wanted.limits),
+        ("Own", ()),
+    ):
         out.add(0, f'{name} = namedtuple("{name}", {list(names)!r})')
     for s, slots in enumerate(neighbourhood.slots):
         write_sweep(out, s, slots, cell, neighbourhood, wanted)

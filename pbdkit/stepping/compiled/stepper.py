@@ -8,8 +8,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from pbdkit.interfaces import Vector
+from pbdkit.interfaces import Components
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.bits import bits_for, lost_bits, presence_bits, spared_bits
@@ -18,6 +19,7 @@ from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.source import write_kernel
 from pbdkit.stepping.compiled.wanted import Wanted
 from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
 
@@ -100,24 +102,25 @@ class CompiledStepper(Engine):
     def _wanted(self) -> Wanted:
         scene = self._scene
         rule, solver, constants = scene.experiment.rule, scene.experiment.solver, scene.constants
-        slot = scene.neighbourhood.slots[0][0]
-        number = np.float64(1.0)
-        parts = rule.gather(
-            Vector(number, number), slot.rest, constants.weights[slot], constants.rule
+        evaluator, one = Evaluator(scene), vector(np.ones(scene.axes))
+        parts = evaluator.contribution(
+            one, one, evaluator.everywhere(scene.neighbourhood.slots[0])[0]
         )
         frame = scene.frame
         return Wanted(
-            contributions=len(parts),
+            contributions=tuple(len(p) if isinstance(p, Components) else 1 for p in parts),
             fracture=scene.has_fracture,
             some_bonds_last=self._spared.size > 1,
             some_missing=self._masks.size > 1,
-            reference=rule.uses_reference,
+            reference=(tuple(scene.experiment.lattice.origin), tuple(scene.middle))
+            if rule.uses_reference
+            else None,
             relaxed=solver.relaxation != 1.0,
             memory=solver.memory != 0.0,
             frame=frame is not None,
             frame_matrices=frame is not None and frame.map.weight.ndim == 3,
             lag=frame is not None and frame.map.lag == 1,
-            limits=max((len(c) for c in constants.limits.values()), default=0),
+            limits=next((c._fields for c in constants.limits.values()), ()),
             parallel=self.threads > 1,
             single=solver.precision == "float32",
             rule_parameters=constants.rule._fields,

@@ -59,8 +59,8 @@ def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> It
         # A bond is judged as its positive end sees it, so that both ends agree to the last bit.
         seen, sign = ("d", 1.0) if positive else ("Vector(-d.x, -d.y)", -1.0)
         rest = "Vector({}, {})".format(*(number(sign * value, wanted) for value in slot.rest))
-        limits = "".join(f"limits[{slot.source}, {k}, {n}], " for n in range(wanted.limits))
-        yield f"breaks_now = 1 if breaks({seen}, {rest}, ({limits}), q) else 0"
+        limits = "".join(f"limits[{slot.source}, {k}, {n}], " for n in range(len(wanted.limits)))
+        yield f"breaks_now = 1 if breaks({seen}, {rest}, Constants({limits}), q) else 0"
         if wanted.some_bonds_last:
             yield f"breaks_now = breaks_now & ~(int64(lasts[j]) >> {k}) & 1"
         yield f"is_lost = ((bits >> {k}) & 1) | breaks_now"
@@ -72,9 +72,8 @@ def _slot_lines(k: int, slot: Slot, around: Neighbourhood, wanted: Wanted) -> It
         own = wanted.weights[slot][: -len(WHOLE_CELLS)]
         sides = [f"{_share_name(slot, side, around)}[j], " for side in wanted.tiling.beside[slot]]
         weights = "".join([*(f"{number(w, wanted)}, " for w in own), *sides])
-    names = ", ".join(f"c{n}" for n in range(wanted.contributions))
-    yield f"{names}, = gather(d, {r}, ({weights}), p)"
-    for n in range(wanted.contributions):
+    yield f"{_pattern('c', wanted)}, = gather(d, {r}, Weights({weights}), p)"
+    for n in range(sum(wanted.contributions)):
         part = f"c{n}"
         if wanted.some_missing:
             part = f"(c{n} if (here[j] >> {k}) & 1 else {_ZERO[wanted.single]})"
@@ -108,9 +107,13 @@ def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -
             out.add(
                 3, f"{c} = {at!r} + ((i + first[0]) * {along!r} + (j + j0 + first[1]) * {across!r})"
             )
-    X = "Vector(X, Y)" if wanted.reference else f"Vector({zero}, {zero})"
-    totals = "".join(f"t{n}, " for n in range(wanted.contributions))
-    out.add(3, f"mx, my = apply(({totals}), Here(u, {X}), p)")
+    X = centred = f"Vector({zero}, {zero})"
+    if wanted.reference:
+        (ax, ay), (mx, my) = ([number(v, wanted) for v in v] for v in wanted.reference)
+        X, centred = f"Vector(X + {ax}, Y + {ay})", f"Vector(X - {mx}, Y - {my})"
+    totals = _pattern("t", wanted, "Vector")
+    here = f"Here(u, {X}, {centred}, Own())"
+    out.add(3, f"mx, my = apply(({totals},), {here}, p)")
     for c in "xy":
         move = f"solver[0] * m{c}" if wanted.relaxed else f"m{c}"
         line = f"{c}2 = {c} + {move}"
@@ -120,6 +123,16 @@ def _write_target(out: Writer, s: int, cell: Cell, slots: int, wanted: Wanted) -
         if wanted.some_missing:
             out.add(3, f"{c}2 = {c}2 if (here[j] >> {slots}) & 1 else {c}")
         out.add(3, f"o{c}[j] = {c}2")
+
+
+def _pattern(letter: str, wanted: Wanted, kind: str = "") -> str:
+    """The contributions by name, those of a vector together."""
+    found, n = [], 0
+    for size in wanted.contributions:
+        names = ", ".join(f"{letter}{n + k}" for k in range(size))
+        found.append(names if size == 1 else f"{kind}({names})")
+        n += size
+    return ", ".join(found)
 
 
 def _parameters(name: str, names: tuple[str, ...], source: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from pbdkit.interfaces import Slot
 from pbdkit.scene.cells import Tiling
@@ -14,22 +15,24 @@ INDENT = "    "
 class Wanted:
     """What of the general step a scene uses; the kernel holds that and nothing else."""
 
-    contributions: int
+    contributions: tuple[int, ...]
+    """The number of components of each."""
     fracture: bool
     some_bonds_last: bool
     some_missing: bool
-    reference: bool
+    reference: tuple[tuple[float, ...], tuple[float, ...]] | None
+    """Where the lattice's site (0, 0) lies, and the middle of the body from there."""
     relaxed: bool
     memory: bool
     frame: bool
     frame_matrices: bool
     lag: bool
-    limits: int
+    limits: tuple[str, ...]
     parallel: bool
     single: bool
     rule_parameters: tuple[str, ...]
     fracture_parameters: dict[str, float]
-    weights: dict[Slot, tuple[float, ...]]
+    weights: dict[Slot, Any]
     tiling: Tiling | None
 
 

@@ -11,7 +11,7 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
 )
-from pbdkit.testing.calls import applied, differences, gathered, here, summed
+from pbdkit.testing.calls import applied, differences, gathered, here
 from pbdkit.testing.property import PropertyError, asked_of
 from pbdkit.testing.question import Arrays, Question
 from pbdkit.testing.remembering import changed, remembered
@@ -118,7 +118,7 @@ def _meeting(subject: Subject) -> list[Question]:
             arrays[f"d{k}.{c}"] = np.full_like(arrays[f"d{k}.{c}"], -r)
 
     def ask(given: Arrays) -> Arrays:
-        return applied(rule, scene, summed(gathered(rule, scene, given)), given)
+        return applied(scene, gathered(scene, given), given)
 
     return [Question("apply, where all neighbours meet in the particle,", arrays, ask)]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import FollowerRule, FractureModel
-from pbdkit.testing.calls import applied, differences, gathered, here, summed
+from pbdkit.testing.calls import applied, differences, gathered, here
 from pbdkit.testing.numbers import SHAPE
 from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.property import PropertyError, asked_of
@@ -35,7 +35,7 @@ def returns_a_value_a_particle(subject: Subject) -> None:
                 raise PropertyError(f"`breaks` returns {value.dtype}: compare, as in `... > c[0]`")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene()
-        counts = {len(c) for c in gathered(subject.component, scene, differences(scene, 0))}
+        counts = {len(c) for c in gathered(scene, differences(scene, 0))}
         if len(counts) > 1:
             raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
 
@@ -83,9 +83,9 @@ def takes_particles_in_any_order(subject: Subject) -> None:
 def _refuse_an_order_of_slots(rule: FollowerRule, subject: Subject) -> None:
     scene = subject.scene()
     arrays = differences(scene, 0) | here(scene, 0)
-    contributions = gathered(rule, scene, arrays)
-    one = applied(rule, scene, summed(contributions), arrays)
-    other = applied(rule, scene, summed(contributions[::-1]), arrays)
+    contributions = gathered(scene, arrays)
+    one = applied(scene, contributions, arrays)
+    other = applied(scene, contributions[::-1], arrays)
     for name, value in one.items():
         if _apart(np.asarray(value), np.asarray(other[name])) is not None:
             raise PropertyError(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import FractureModel, Slot, Vector
+from pbdkit.interfaces import BreaksAtStrain, FractureModel, RenewsBonds, Slot
 from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.calls import breaking, differences, updated, vector
@@ -35,9 +36,12 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
     own = own_of(remembered_of_bonds(scene, 0))
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=2.0), f"d{k}")
-        back, r = Vector(-d.x, -d.y), Vector(-slot.rest.x, -slot.rest.y)
-        for what, ask in (("breaks", breaking), ("update", updated)):
-            one, other = ask(model, scene, slot, d, own), ask(model, scene, slot, back, own, r)
+        back, r = -d, -slot.rest
+        asks = [("breaks", breaking)]
+        if isinstance(model, RenewsBonds):
+            asks.append(("update", updated))
+        for what, ask in asks:
+            one, other = ask(scene, slot, d, own), ask(scene, slot, back, own, r)
             if not np.array_equal(np.asarray(one), np.asarray(other)):
                 raise PropertyError(
                     f"`{what}` answers otherwise for (-d, -r) than for (d, r) along {slot.site}"
@@ -51,7 +55,8 @@ def breaks_as_declared(subject: Subject) -> None:
     model, scene = _model(subject), subject.scene()
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=1e3), f"d{k}")
-        if not model.can_break and np.any(breaking(model, scene, slot, d, ())):
+        c, p = SimpleNamespace(**model.constants(slot)), scene.constants.fracture
+        if not model.can_break and np.any(model.breaks(d, slot.rest, c, p)):
             raise PropertyError("it declares `can_break = False`, and `breaks` says yes")
 
 
@@ -62,16 +67,16 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
     model, scene = _model(subject), subject.scene()
     own, p = own_of(remembered_of_bonds(scene, 0)), scene.constants.fracture
     for slot in scene.neighbourhood.slots[0]:
-        r, c = slot.rest, (*model.constants(slot), *own)
-        told = model.breaking_strain(r, c, p)
-        if told is None:
+        if not isinstance(model, BreaksAtStrain):
             raise NotAskedError("it tells no `breaking_strain`")
+        r, c = slot.rest, scene.constants.of_bond(*scene.constants.limits[slot], *own)
+        told = model.breaking_strain(r, c, p)
         limit = np.broadcast_to(told, SHAPE)
         for side, expected in ((CLOSE, True), (-CLOSE, False)):
             stretch = limit + side * (1.0 + np.abs(limit))
-            d = Vector(r.x * stretch, r.y * stretch)
+            d = r * stretch
             now = _renewed(model, scene, slot, d, own)
-            wrong = np.broadcast_to(breaking(model, scene, slot, d, now), SHAPE) != expected
+            wrong = np.broadcast_to(breaking(scene, slot, d, now), SHAPE) != expected
             if wrong.any():
                 at = float(stretch[wrong][0])
                 raise PropertyError(
@@ -81,12 +86,12 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
 
 
 def _renewed(
-    model: FractureModel, scene: Scene, slot: Slot, d: Vector, own: tuple[Any, ...]
+    model: FractureModel, scene: Scene, slot: Slot, d: Any, own: tuple[Any, ...]
 ) -> tuple[Any, ...]:
     """The numbers of bonds after an update."""
-    if not model.updates():
+    if not isinstance(model, RenewsBonds):
         return own
-    new = iter(updated(model, scene, slot, d, own))
+    new = iter(updated(scene, slot, d, own))
     numbers = bond_numbers(scene.experiment)
     return tuple(next(new) if n.changes else v for n, v in zip(numbers, own, strict=True))
 

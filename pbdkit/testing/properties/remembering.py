@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import FollowerRule, FractureModel, Remembered
+from pbdkit.interfaces import Draws, FollowerRule, FractureModel, Remembered
 from pbdkit.results.layout import base_columns, bond_columns, broken_columns
 from pbdkit.scene.remembering import remembered_names
 from pbdkit.testing.numbers import SEED, drawn, numbers_of, owners
@@ -47,7 +47,7 @@ def draws_what_it_remembers(subject: Subject) -> None:
     part = _part(subject)
     for scene in subject.scenes:
         numbers = {number.name: number for number in numbers_of(part, scene)}
-        if not part.draws():
+        if not isinstance(part, Draws):
             raise NotAskedError("all that it remembers starts at its `initial`")
         shown = owners(part, scene)
         for name, values in drawn(part, shown, np.random.default_rng(SEED)).items():

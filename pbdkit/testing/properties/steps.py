@@ -11,6 +11,7 @@ import numpy as np
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import (
     INTERFACES,
+    Anchors,
     Diagnostic,
     FollowerRule,
     FractureModel,
@@ -71,9 +72,9 @@ def _warned(scene: Scene) -> bool:
 @asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=SOUND)
 def follows_translations(subject: Subject) -> None:
     """A body that is translated as a whole moves as before, translated, to rounding; rules that
-    declare `uses_reference` and frames that say they `anchors` it need not."""
+    declare `uses_reference` and frames that take on `Anchors` need not."""
     component, most = subject.component, 0.0
-    anchors = isinstance(component, FramePolicy) and component.anchors()
+    anchors = isinstance(component, Anchors)
     for scene in _free(subject):
         u, size = displacements(scene, 1), spacing(scene)
         shift = size * np.array([0.75, -1.5])
@@ -82,7 +83,7 @@ def follows_translations(subject: Subject) -> None:
         if most > ROUNDING and not anchors:
             remedy = {
                 FollowerRule: "use differences `d`, not `here.u`, or declare `uses_reference`",
-                FramePolicy: "let the weights of each point sum to 1, or answer `anchors`",
+                FramePolicy: "let the weights of each point sum to 1, or take on `pbdkit.Anchors`",
             }.get(next(i for i in STEPPED if isinstance(component, i)), "")
             raise PropertyError(
                 f"a translated body moves otherwise, by {most:.3g} of its displacement, "
@@ -98,7 +99,8 @@ def _free(subject: Subject) -> list[Scene]:
     free = [
         scene
         for scene, e in parts
-        if not e.rule.uses_reference and (e.frame is subject.component or not e.frame.anchors())
+        if not e.rule.uses_reference
+        and (e.frame is subject.component or not isinstance(e.frame, Anchors))
     ]
     if not free:
         whose = "it" if isinstance(subject.component, FollowerRule) else "the rule"

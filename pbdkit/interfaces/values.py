@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +72,23 @@ Drawn = dict[str, NDArray[Any]]
 """Initial values by the name of the number; what is left out starts at its `initial`."""
 
 
-def is_own(part: Any, base: type, name: str) -> bool:
-    """Whether a part brings a method of its own where its interface has a default."""
-    own: Callable[..., Any] = getattr(type(part), name)
-    return own is not getattr(base, name)
+class Remembers(ABC):
+    """A part with numbers of its own: a fracture model's of each bond, seen by name in ``c``, a
+    rule's of each particle of the body, seen by name in ``here.own``."""
+
+    @abstractmethod
+    def remembered(self) -> tuple[Remembered, ...]:
+        """What it remembers."""
+
+
+class Draws(Remembers):
+    """A part whose numbers do not all start at their `initial`."""
+
+    @abstractmethod
+    def draw(self, owners: Any, generator: np.random.Generator) -> Drawn:
+        """Where they start, (owner,) by name, for `owners`: Bonds of a fracture model, Particles of
+        a rule.
+
+        The generator depends on the experiment's `seed` and on nothing else: neither on other
+        random parts, nor on engine or threads.
+        """

@@ -1,0 +1,96 @@
+"""Vectors, and the few words in which elementwise functions are written.
+
+A rule's functions are called with whole arrays, with single numbers or with probes, always one
+value a component. They use + - * /, the functions of numpy, and choose with `where`.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections import namedtuple
+from collections.abc import Callable, Iterable
+from typing import Any, Self
+
+import numpy as np
+
+
+class Components(tuple[Any, ...]):
+    """A vector by components; each is a number or an array, all of one shape.
+
+    Vectors add, subtract and are scaled as vectors are; with `+` no tuple is made longer.
+    """
+
+    __slots__ = ()
+    __array_ufunc__ = None  # so that array * vector asks the vector
+
+    def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
+        """The vector of function(component, ...), component by component."""
+        return type(self)(*map(function, self, *others))
+
+    def __add__(self, other: Any) -> Self:
+        return self.each(operator.add, other)
+
+    def __sub__(self, other: Any) -> Self:
+        return self.each(operator.sub, other)
+
+    def __neg__(self) -> Self:
+        return self.each(operator.neg)
+
+    def __mul__(self, factor: Any) -> Self:
+        return type(self)(*(component * factor for component in self))
+
+    def __rmul__(self, factor: Any) -> Self:
+        return type(self)(*(factor * component for component in self))
+
+    def __truediv__(self, divisor: Any) -> Self:
+        return type(self)(*(component / divisor for component in self))
+
+
+class Vector(Components, namedtuple("Vector", ("x", "y"))):
+    """A vector in the plane."""
+
+    __slots__ = ()
+
+
+class SpaceVector(Components, namedtuple("SpaceVector", ("x", "y", "z"))):
+    """A vector in space."""
+
+    __slots__ = ()
+
+
+KINDS: dict[int, type[Components]] = {2: Vector, 3: SpaceVector}
+"""The kind of vector by its number of components."""
+
+
+def vector(components: Iterable[Any]) -> Any:
+    """The vector with these components; ValueError where there are neither two nor three."""
+    values = tuple(components)
+    if len(values) not in KINDS:
+        raise ValueError(f"a vector has two or three components, not {len(values)}")
+    return KINDS[len(values)](*values)
+
+
+def where(condition: Any, yes: Any, no: Any) -> Any:
+    """`yes` where the condition holds, else `no`, elementwise; both numbers or both vectors.
+
+    Elementwise functions choose with this and not with `numpy.where`: a compiled engine knows it.
+    """
+    if isinstance(yes, Components):
+        return yes.each(lambda a, b: np.where(condition, a, b), no)
+    return np.where(condition, yes, no)
+
+
+def dot(a: Components, b: Components) -> Any:
+    """a·b = a_x b_x + a_y b_y."""
+    products = [one * other for one, other in zip(a, b, strict=True)]
+    return sum(products[1:], products[0])
+
+
+def squared_length(v: Components) -> Any:
+    """v·v; the same to the last bit for v and -v."""
+    return dot(v, v)
+
+
+def length(v: Components) -> Any:
+    """√(v·v)."""
+    return np.sqrt(squared_length(v))
