@@ -1,4 +1,4 @@
-"""A component under examination, with the scenes it takes part in."""
+"""A component under examination, with the scenes it takes part in, and examples of a class."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from pbdkit.errors import ExperimentError
+from pydantic import ValidationError
+
+from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Component
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.testing.examples import name_of
-from pbdkit.testing.property import PropertyError
-from pbdkit.testing.question import Question
+from pbdkit.testing.property import PropertyError, Question
 from pbdkit.testing.questions import questions_of
 from pbdkit.testing.scenes import experiments_with
 
@@ -22,7 +22,7 @@ class Subject:
     """One component; what is asked of it is made once and shared by the properties."""
 
     def __init__(self, component: Component, parts: Mapping[str, Any] | None = None) -> None:
-        self.component = component
+        self.component: Any = component
         self.parts = dict(parts or {})
 
     @property
@@ -63,3 +63,45 @@ def scenes_with(component: Component, parts: Mapping[str, Any]) -> list[Scene]:
             "with it, `conformance(..., lattice=..., neighbours=...)`"
         )
     return scenes
+
+
+def examples_of(component: type[Component]) -> list[Component]:
+    """One with the first example of each parameter that has no default, and one for each further
+    example, all else being the same.
+
+    Raises PluginError where a parameter has neither default nor example, an example is refused, or
+    the class lacks a method of its interface.
+    """
+    base: dict[str, Any] = {}
+    others: list[tuple[str, Any]] = []
+    for name, field in component.model_fields.items():
+        key, examples = field.alias or name, list(field.examples or [])
+        if field.is_required():
+            if not examples:
+                raise PluginError(
+                    f"{component.__name__}.{name} has neither default nor example: write "
+                    f"`{name}: ... = Field(description=..., examples=[...])`"
+                )
+            base[key] = examples.pop(0)
+        others += [(key, value) for value in examples]
+    return [_made(component, base), *(_made(component, base | {k: v}) for k, v in others)]
+
+
+def _made(component: type[Component], given: dict[str, Any]) -> Component:
+    try:
+        return component.model_validate(given)
+    except TypeError as error:  # an abstract method is missing
+        raise PluginError(f"{component.__name__} cannot be made: {error}") from None
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = ".".join(map(str, fault["loc"])) or "the whole"
+        raise PluginError(
+            f"{component.__name__} refuses its examples {given}: {where}: {fault['msg']}"
+        ) from None
+
+
+def name_of(component: Component) -> str:
+    """Its type with the parameters that are not at their defaults."""
+    dumped = component.model_dump(exclude_defaults=True, exclude={"type"}, mode="json")
+    given = ", ".join(f"{k}={v}" for k, v in dumped.items())
+    return f"{component.type} ({given})" if given else component.type

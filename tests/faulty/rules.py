@@ -125,6 +125,17 @@ class Throws(Sound):
         return total[0] * random.random(), total[1]
 
 
+class Seeds(Sound):
+    """Seeds the generator that all share."""
+
+    type: Literal["seeds"] = "seeds"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        np.random.seed(0)
+        return d.x, d.y, 1.0
+
+
 class Drifts(Sound):
     """Moves to the right, at rest too."""
 

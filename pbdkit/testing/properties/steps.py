@@ -26,8 +26,8 @@ from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.stepping.stepper import Stepper
-from pbdkit.testing.properties.answers import differing
 from pbdkit.testing.properties.elementwise import ORDERLY
+from pbdkit.testing.properties.repetition import differing
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
 from pbdkit.testing.scenes import place_of
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with

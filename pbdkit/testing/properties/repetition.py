@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import inspect
+import pickle
+import random
+import types
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 
 from pbdkit.interfaces import (
     INTERFACES,
+    Component,
     Diagnostic,
     FollowerRule,
     FractureModel,
     FramePolicy,
 )
 from pbdkit.testing.calls import applied, differences, gathered, here
-from pbdkit.testing.property import PropertyError, asked_of
-from pbdkit.testing.question import Arrays, Question
-from pbdkit.testing.remembering import changed, remembered
+from pbdkit.testing.property import Arrays, PropertyError, Question, asked_of
 from pbdkit.testing.subject import Subject
 
 ALL = tuple(INTERFACES.values())
@@ -82,14 +89,25 @@ def remembers_nothing(subject: Subject) -> None:
 
 @asked_of(*ALL, needs=(*NEEDS, "changes-no-input", "remembers-nothing"))
 def answers_the_same(subject: Subject) -> None:
-    """The same question gets the same answer to the last bit, so that every run can be repeated."""
+    """The same question gets the same answer to the last bit, and the generators of random numbers
+    that all share stay as they are, so that every run can be repeated."""
     for question in subject.questions():
-        if names := differing(question.answer(), question.answer()):
+        shared = _shared_generators()
+        names = differing(question.answer(), question.answer())
+        if not names and _shared_generators() != shared:
+            raise PropertyError(
+                f"`{question.what}` seeds or uses the generator of random numbers that all share"
+            )
+        if names:
             raise PropertyError(
                 f"`{question.what}` answers the same question otherwise the second time "
                 f"({_listed(names)}): it draws numbers at random that nobody gave "
                 "it, or looks at a clock"
             )
+
+
+def _shared_generators() -> bytes:
+    return pickle.dumps((random.getstate(), np.random.get_state()))
 
 
 @asked_of(*ALL, needs=(*REPEATABLE, "returns-a-value-a-particle"))
@@ -126,3 +144,59 @@ def _meeting(subject: Subject) -> list[Question]:
 def _listed(names: list[str]) -> str:
     shown = ", ".join(f"`{name}`" for name in names[:3])
     return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+Kept = dict[str, bytes]
+
+
+def remembered(component: Component) -> Kept:
+    """Every value that the component's functions can reach and change, by name, as bytes."""
+    return {name: _content(value) for name, value in _reached(component)}
+
+
+def changed(before: Kept, after: Kept) -> list[str]:
+    """The names of the values that differ."""
+    return sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
+
+
+def _reached(component: Component) -> Iterator[tuple[str, Any]]:
+    yield "private attributes", dict(component.__pydantic_private__ or {})
+    cached = {n for k in type(component).__mro__ for n, v in vars(k).items()
+              if isinstance(v, cached_property)}  # fmt: skip
+    for name, value in vars(component).items():
+        if name not in cached:
+            yield name, value
+    for owner in type(component).__mro__:
+        if owner.__module__.startswith(("pbdkit.interfaces", "pydantic", "builtins", "abc")):
+            continue
+        for name, value in list(vars(owner).items()):
+            if name.startswith(("__", "_abc_", "model_")):
+                continue
+            function = inspect.unwrap(getattr(value, "__func__", value))
+            if isinstance(function, types.FunctionType):
+                yield from _of_function(function)
+            elif not isinstance(value, types.FunctionType):
+                yield f"{owner.__name__}.{name}", value
+
+
+def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+    """Globals, closures, defaults and attributes of a function; helpers one call away."""
+    yield f"defaults of {function.__name__}", (function.__defaults__, function.__kwdefaults__)
+    yield f"attributes of {function.__name__}", vars(function)
+    reached = inspect.getclosurevars(function)
+    for name, value in {**reached.globals, **reached.nonlocals}.items():
+        if isinstance(value, types.FunctionType):
+            if not value.__module__.startswith(("pbdkit.", "numpy")):
+                yield f"attributes of {value.__name__}", vars(value)
+                yield from inspect.getclosurevars(value).globals.items()
+        else:
+            yield name, value
+
+
+def _content(value: Any) -> bytes:
+    if isinstance(value, (types.FunctionType, type, types.ModuleType)):
+        return b""
+    try:
+        return pickle.dumps(value)
+    except Exception:
+        return repr(value).encode()

@@ -11,10 +11,10 @@ from pbdkit.interfaces import BreaksAtStrain, FractureModel, RenewsBonds, Slot
 from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.calls import breaking, differences, updated, vector
-from pbdkit.testing.numbers import SHAPE, own_of, remembered_of_bonds
-from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.properties.elementwise import ORDERLY
+from pbdkit.testing.properties.repetition import REPEATABLE
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.states import SHAPE, own_of, remembered_of_bonds
 from pbdkit.testing.subject import Subject
 
 CLOSE = 1e-9
@@ -25,7 +25,7 @@ CLOSE = 1e-9
 def is_seen_alike_from_both_ends(subject: Subject) -> None:
     """A bond breaks for both ends or for none: `breaks` and `update` answer the same for (-d, -r)
     as for (d, r), and `constants` for a slot and its opposite; they are called for one end only."""
-    model, scene = _model(subject), subject.scene()
+    model, scene = subject.component, subject.scene()
     for plane in scene.neighbourhood.planes:
         here, there = model.constants(plane.slot), model.constants(plane.opposite)
         if here != there:
@@ -52,7 +52,7 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
 def breaks_as_declared(subject: Subject) -> None:
     """Where it declares `can_break = False` nothing breaks, however long: the scene then has no
     bond state."""
-    model, scene = _model(subject), subject.scene()
+    model, scene = subject.component, subject.scene()
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=1e3), f"d{k}")
         c, p = SimpleNamespace(**model.constants(slot)), scene.constants.fracture
@@ -64,11 +64,12 @@ def breaks_as_declared(subject: Subject) -> None:
 def breaks_beyond_its_strain(subject: Subject) -> None:
     """Where it tells a `breaking_strain`, a bond that is drawn out along itself breaks a little
     above it and, if it has not broken, not a little below: `pbdkit explain` tells users so."""
-    model, scene = _model(subject), subject.scene()
+    model, scene = subject.component, subject.scene()
+    tells = isinstance(model, BreaksAtStrain)
     own, p = own_of(remembered_of_bonds(scene, 0)), scene.constants.fracture
+    if not tells:
+        raise NotAskedError("it tells no `breaking_strain`")
     for slot in scene.neighbourhood.slots[0]:
-        if not isinstance(model, BreaksAtStrain):
-            raise NotAskedError("it tells no `breaking_strain`")
         r, c = slot.rest, scene.constants.of_bond(*scene.constants.limits[slot], *own)
         told = model.breaking_strain(r, c, p)
         limit = np.broadcast_to(told, SHAPE)
@@ -94,8 +95,3 @@ def _renewed(
     new = iter(updated(scene, slot, d, own))
     numbers = bond_numbers(scene.experiment)
     return tuple(next(new) if n.changes else v for n, v in zip(numbers, own, strict=True))
-
-
-def _model(subject: Subject) -> FractureModel:
-    assert isinstance(subject.component, FractureModel)
-    return subject.component

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Diagnostic, Variable
-from pbdkit.testing.properties.answers import REPEATABLE
+from pbdkit.testing.properties.repetition import REPEATABLE
 from pbdkit.testing.property import PropertyError, asked_of
 from pbdkit.testing.questions import moment_of
 from pbdkit.testing.sight import SeenMoment
@@ -23,7 +23,7 @@ ROUNDING = 1e-12
 def labels_its_variables(subject: Subject) -> None:
     """Every variable has a name in lower case, a long name and units ("1" where it has none), so
     that a dataset can be read without the program."""
-    for variable in _diagnostic(subject).variables():
+    for variable in subject.component.variables():
         if not re.fullmatch(NAME, variable.name):
             raise PropertyError(f"the variable '{variable.name}' is not named as `my_quantity` is")
         for what in ("long_name", "units"):
@@ -35,7 +35,7 @@ def labels_its_variables(subject: Subject) -> None:
 def measures_what_it_declares(subject: Subject) -> None:
     """`measure` returns one array for each of its variables, shaped as their `dims` say, of numbers
     that go into the declared dtype without loss of kind."""
-    diagnostic, scene = _diagnostic(subject), subject.scene()
+    diagnostic, scene = subject.component, subject.scene()
     sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     variables, measured = diagnostic.variables(), diagnostic.measure(moment_of(scene, 0))
@@ -84,7 +84,7 @@ def _refuse_unfit(variable: Variable, value: NDArray[Any], shape: tuple[int, ...
 def takes_rows_in_any_order(subject: Subject) -> None:
     """Particles in another order have the same values in that order, and all else stays, to
     rounding: rows are found by `now.rows(numbers)` and mean nothing else."""
-    diagnostic, scene = _diagnostic(subject), subject.scene()
+    diagnostic, scene = subject.component, subject.scene()
     moment, count = moment_of(scene, 0), scene.raster.count
     order = np.random.default_rng(0).permutation(count)
     seen = diagnostic.measure(SeenMoment(moment, order=order))
@@ -100,8 +100,3 @@ def takes_rows_in_any_order(subject: Subject) -> None:
                 f"'{variable.name}' depends on the order of the rows: ask `now.rows(numbers)` for "
                 "particles by number"
             )
-
-
-def _diagnostic(subject: Subject) -> Diagnostic:
-    assert isinstance(subject.component, Diagnostic)
-    return subject.component

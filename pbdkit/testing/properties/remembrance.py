@@ -10,11 +10,10 @@ import numpy as np
 from pbdkit.interfaces import Draws, FollowerRule, FractureModel, Remembered
 from pbdkit.results.layout import base_columns, bond_columns, broken_columns
 from pbdkit.scene.remembering import remembered_names
-from pbdkit.testing.numbers import SEED, drawn, numbers_of, owners
-from pbdkit.testing.properties.answers import REPEATABLE
-from pbdkit.testing.properties.diagnostics import NAME
-from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
-from pbdkit.testing.question import Arrays
+from pbdkit.testing.properties.measurements import NAME
+from pbdkit.testing.properties.repetition import REPEATABLE
+from pbdkit.testing.property import Arrays, NotAskedError, PropertyError, asked_of
+from pbdkit.testing.states import SEED, drawn, numbers_of, owners
 from pbdkit.testing.subject import Subject
 
 PARTS = (FollowerRule, FractureModel)
@@ -44,10 +43,11 @@ def declares_what_it_remembers(subject: Subject) -> None:
 def draws_what_it_remembers(subject: Subject) -> None:
     """`draw` gives one finite value a bond or particle, by the name of a number that it remembers,
     such as its dtype holds; all numbers at random are of the generator that it is given."""
-    part = _part(subject)
+    part: Any = subject.component
+    draws = isinstance(part, Draws)
     for scene in subject.scenes:
         numbers = {number.name: number for number in numbers_of(part, scene)}
-        if not isinstance(part, Draws):
+        if not draws:
             raise NotAskedError("all that it remembers starts at its `initial`")
         shown = owners(part, scene)
         for name, values in drawn(part, shown, np.random.default_rng(SEED)).items():
@@ -106,8 +106,3 @@ def _by_slot(answer: Arrays) -> list[list[Any]]:
     for name, value in answer.items():
         slots.setdefault(name.rpartition(": ")[0], []).append(value)
     return list(slots.values()) or [[]]
-
-
-def _part(subject: Subject) -> FractureModel | FollowerRule:
-    assert isinstance(subject.component, PARTS)
-    return subject.component
