@@ -156,10 +156,10 @@ def test_cells_between_given_sites_are_whole():
     assert scene().cells.share.sum() == 5 * 4
 
 
-class Tiring(StrainGradient):
+class Tiring(pbdkit.Remembers, StrainGradient):
     type: Literal["tiring"] = "tiring"
 
-    def particle_state(self):
+    def remembered(self):
         return (pbdkit.Remembered("tiredness", "how tired it is", "1"),)
 
 

@@ -252,11 +252,11 @@ class Mine(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return SHARE * total[0] / total[2], total[1] / total[2]
+        return SHARE * total[0] / total[1]
 
 @pbdkit.hookimpl
 def pbdkit_components():
@@ -266,7 +266,7 @@ def pbdkit_components():
 
 @pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
 def test_one_line_is_enough_for_pytest(tmp_path, share, code):
-    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "1e-9 + ")
+    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +")
     (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
     (tmp_path / "test_mine.py").write_text(ONE_LINE)
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
@@ -280,7 +280,9 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
 
 def test_plugins_check_tries_a_distribution(install, call):
     install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
-    install("pbdkit-bad", SOURCE.replace("SHARE *", "1e-9 +").replace("mine", "bad"))
+    install(
+        "pbdkit-bad", SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +").replace("mine", "bad")
+    )
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0
     assert "FollowerRule mine: 19 properties ran, 0 failed; 3 skipped: it remembers" in good.out

@@ -242,7 +242,7 @@ def test_reactions_without_leaders_are_refused():
     assert str(caught.value) == "diagnostics.0: 'reaction' is of leader groups, and there is none"
 
 
-class Loose(pbdkit.FollowerRule):
+class Loose(pbdkit.Calibrated, pbdkit.FollowerRule):
     """A calibrated rule without weights, for neighbours that come and go."""
 
     type: Literal["loose"] = "loose"
@@ -252,11 +252,15 @@ class Loose(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2], total[1] / total[2]
+        return total[0] / total[1]
+
+    @staticmethod
+    def force(total, here, p):
+        return total[0]
 
 
 def test_forces_of_neighbours_that_come_and_go_are_refused():

@@ -57,11 +57,12 @@ class Poisoned(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y
+        return (d,)
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / 4 + 0.0 * np.log(-total[0] - 1e-9), total[1] / 4
+        x, y = total[0] / 4
+        return pbdkit.Vector(x + 0.0 * np.log(-4 * x - 1e-9), y)
 
 
 @pytest.mark.parametrize("every", [1, 5000])

@@ -31,12 +31,13 @@ class CurrentY(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        x, y = total[0] / total[2], total[1] / total[2]
-        return x, y + p.K * (here.u.x + x) * (here.X.y + here.u.y - p.middle)
+        move = total[0] / total[1]
+        above = here.X.y + here.u.y - p.middle
+        return pbdkit.Vector(move.x, move.y + p.K * (here.u.x + move.x) * above)
 
 
 def test_case_4_the_current_y_in_mixed_coordinates_diverges_and_is_known_to_beforehand():

@@ -240,12 +240,11 @@ class Leaning(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        share = 1.0 + 0.6 * r.x
-        return share * d.x, share * d.y
+        return ((1.0 + 0.6 * r.x) * d,)
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / 4, total[1] / 4
+        return total[0] / 4
 
 
 @pytest.mark.parametrize("columns", [9, 30])

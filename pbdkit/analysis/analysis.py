@@ -175,7 +175,7 @@ class Analysis:
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
         led[label[np.unique(operator.entries_led.rows)]] = True
-        numbers = operator.followers[np.arange(len(label)) // 2] + 1
+        numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)
 

@@ -27,10 +27,10 @@ def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Flo
     field = np.zeros(state.u.shape)
     field.reshape(len(field), -1)[:, everybody] = z.T
     moves, outer = _directly(scene, replace(state, u=field), place)
-    product = (outer.entries().sparse() @ inner.entries().sparse()).tobsr((2, 2))
+    product = (outer.entries().sparse() @ inner.entries().sparse()).tobsr((scene.axes, scene.axes))
     product.sum_duplicates()
     rows = np.repeat(np.arange(len(place)), np.diff(product.indptr))
-    couplings = Couplings((len(place), scene.raster.count))
+    couplings = Couplings((len(place), scene.raster.count), scene.axes)
     couplings.add(rows, product.indices, product.data)
     return moves, couplings
 
@@ -39,7 +39,8 @@ def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Coupl
     raster = scene.raster
     row = np.full(raster.kind.size, -1)
     row[raster.place_of(np.arange(raster.count))] = np.arange(raster.count)
-    moves, couplings = np.zeros((len(place), 2)), Couplings((len(place), raster.count))
+    moves = np.zeros((len(place), scene.axes))
+    couplings = Couplings((len(place), raster.count), scene.axes)
     sublattice = place // (raster.kind.size // raster.shape[0])
     for s in range(raster.shape[0]):
         some = np.flatnonzero(sublattice == s)

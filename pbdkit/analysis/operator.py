@@ -1,7 +1,7 @@
 """The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
 u(t+1) = now · u(t) + before · u(t-1) + led · u_L + source for the displacements of the followers,
-two unknowns a particle (x, y). `before` is empty but for frames with lag and for memory.
+an unknown a particle and axis. `before` is empty but for frames with lag and for memory.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ Integers = NDArray[np.signedinteger[Any]]
 class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
-    `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
-    2n + 1 its y, and the same for leaders. The couplings hold the same by particle; of those with
-    leaders, `couplings_shown` is the share that frame points show.
+    `followers` and `leaders` are rows of the particle table; in the plane unknown 2n is x of the
+    n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by
+    particle; of those with leaders, `couplings_shown` is the share that frame points show.
     """
 
     followers: Indices
@@ -126,9 +126,10 @@ class _Assembly:
             self._unknown[place] = np.arange(len(some))
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
-        self._now, self._before = Couplings((free, free)), Couplings((free, free))
-        self._led, self._shown = Couplings((free, led)), Couplings((free, led))
-        self._source = np.zeros((free, 2))
+        axes = scene.axes
+        self._now, self._before = Couplings((free, free), axes), Couplings((free, free), axes)
+        self._led, self._shown = Couplings((free, led), axes), Couplings((free, led), axes)
+        self._source = np.zeros((free, axes))
 
     def operator(self) -> StepOperator:
         memory = self._scene.experiment.solver.memory
@@ -204,7 +205,9 @@ class _Assembly:
         for e in range(int((last - first).max(initial=0))):
             has = first + e < last
             entry = (first + e)[has]
-            product = np.einsum("eab,ebc->eac", weight[has], _matrices(frame.map.weight[entry]))
+            product = np.einsum(
+                "eab,ebc->eac", weight[has], _matrices(frame.map.weight[entry], self._scene.axes)
+            )
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
@@ -213,8 +216,8 @@ class _Assembly:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
 
 
-def _matrices(weights: Floats) -> Floats:
-    return weights[:, None, None] * np.eye(2) if weights.ndim == 1 else weights
+def _matrices(weights: Floats, axes: int) -> Floats:
+    return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
 
 
 def _times(matrices: Floats, vectors: Floats) -> Floats:

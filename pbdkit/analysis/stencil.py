@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import add
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
-from pbdkit.interfaces import Here, Slot, Vector
+from pbdkit.interfaces import Here, Slot
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
@@ -55,7 +56,7 @@ def _composed(outer: Stencil, inner: Stencil) -> Stencil:
                 continue
             slot = _after(first, second)
             key = slot.source, slot.target, slot.cell
-            if slot.source == slot.target and slot.cell == (0, 0):
+            if slot.source == slot.target and not any(slot.cell):
                 own[slot.source] += W @ V
             else:
                 slot = known.setdefault(key, slot)
@@ -65,7 +66,8 @@ def _composed(outer: Stencil, inner: Stencil) -> Stencil:
 
 def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
     for s, own in enumerate(stencil.own):
-        yield Slot(s, s, (0, 0), (0, 0), Vector(0.0, 0.0), 0), own
+        nowhere = (0,) * len(own)
+        yield Slot(s, s, nowhere, nowhere, vector(np.zeros(len(own))), 0), own
     yield from stencil.neighbours.items()
 
 
@@ -74,8 +76,8 @@ def _after(first: Slot, second: Slot) -> Slot:
     return Slot(
         first.source,
         second.target,
-        (first.cell[0] + second.cell[0], first.cell[1] + second.cell[1]),
-        (first.site[0] + second.site[0], first.site[1] + second.site[1]),
+        tuple(map(add, first.cell, second.cell)),
+        tuple(map(add, first.site, second.site)),
         first.rest + second.rest,
         first.shell + second.shell,
     )

@@ -1,8 +1,8 @@
 """How a rule answers plane waves on the infinite lattice: a bound that costs milliseconds.
 
 A displacement exp(iθ·c) over repeat cells c is multiplied in a step by the symbol, a matrix of
-2 × 2 blocks over sublattices. Modes of a finite body lie within what the waves reach, as long as
-its frame copies or mirrors.
+blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as
+long as its frame copies or mirrors.
 """
 
 from __future__ import annotations
@@ -85,18 +85,21 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 
 def _symbols(scene: Scene) -> Complex:
-    """(wave, 2S, 2S): the rule's step on plane waves, of which opposite ones answer alike."""
+    """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
+    alike."""
     stencil = linearised(scene)
     angle = 2 * np.pi * np.arange(WAVES) / WAVES
     half = angle[: WAVES // 2 + 1]
-    theta = np.stack(np.meshgrid(half, angle, indexing="ij"), axis=-1).reshape(-1, 2)
-    symbols = np.zeros((len(theta), 2 * len(stencil.own), 2 * len(stencil.own)), complex)
-    symbols += np.eye(2 * len(stencil.own))
+    axes, waves = scene.axes, [half, *[angle] * (scene.axes - 1)]
+    theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
+    size = axes * len(stencil.own)
+    symbols: Complex = np.zeros((len(theta), size, size), complex)
+    symbols += np.eye(size)
+    of = [slice(axes * s, axes * (s + 1)) for s in range(len(stencil.own))]
     for s, own in enumerate(stencil.own):
-        symbols[:, 2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += own
+        symbols[:, of[s], of[s]] += own
     for slot, matrix in stencil.neighbours.items():
-        here = slice(2 * slot.source, 2 * slot.source + 2)
-        there = slice(2 * slot.target, 2 * slot.target + 2)
+        here, there = of[slot.source], of[slot.target]
         phase = np.exp(1j * theta @ np.array(slot.cell, float))
         symbols[:, here, there] += phase[:, None, None] * matrix
     return symbols

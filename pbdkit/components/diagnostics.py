@@ -151,7 +151,7 @@ class SmallestCellArea(Diagnostic):
         return (now.over_cells(smallest_corner_area).min(),)
 
 
-def smallest_corner_area(d: tuple[Vector, ...], r: tuple[Vector, ...]) -> Any:
+def smallest_corner_area(d: tuple[Any, ...], r: tuple[Any, ...]) -> Any:
     """min over the corners k of (x_k - x_k-1) × (x_k+1 - x_k), over the same at rest."""
     rest = [Vector(r[k].x - r[k - 1].x, r[k].y - r[k - 1].y) for k in range(len(r))]
     now = [

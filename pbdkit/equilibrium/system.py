@@ -44,7 +44,7 @@ class System:
         self._operator, self._method, self._X = operator, method, X
         self._watch = watch
         now, before = operator.couplings_now, operator.couplings_before
-        both = Couplings(now.shape, now.parts + before.parts)
+        both = Couplings(now.shape, now.axes, now.parts + before.parts)
         self._both = both
         self.amplification = 1.0
         """How much larger moves are, in rounding too, than the displacements that make them."""

@@ -44,7 +44,7 @@ class Hold(Motion):
 
     def offset(self, n: int, start: Floats) -> Floats:
         """None."""
-        return np.zeros(2)
+        return np.zeros(start.shape[1])
 
     def rests_after(self) -> int:
         """At once."""

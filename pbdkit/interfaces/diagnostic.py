@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.rule import Stiffness
 from pbdkit.interfaces.values import Bonds
-from pbdkit.interfaces.vector import Vector
 
 Floats = NDArray[np.floating[Any]]
 
@@ -64,7 +63,7 @@ class Moment(ABC):
 
     @abstractmethod
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """Σ_k function(d, r) over the reference neighbours k of each body particle, (particle,).
 
@@ -75,7 +74,7 @@ class Moment(ABC):
     @abstractmethod
     def over_cells(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> Floats:
@@ -83,7 +82,7 @@ class Moment(ABC):
 
         A cell is a polygon of neighbouring sites with no other site in its circumcircle: on the
         square and rectangular lattice the rectangles, on the others triangles; together they tile
-        the plane, whatever the neighbours are. d and r hold a Vector a corner, counter-clockwise:
+        the plane, whatever the neighbours are. d and r hold a vector a corner, counter-clockwise:
         d[k] = u_k - u_0, r[k] = X_k - X_0; r is constant. Elementwise, and called once a shape and
         part of the body. Cells with a broken bond between corners count unless `intact_only`.
         """

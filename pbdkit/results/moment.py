@@ -21,7 +21,8 @@ from pbdkit.results.gradient import displacement_gradient
 from pbdkit.results.tables import Tables
 from pbdkit.scene.leading import kinds_at, select
 from pbdkit.scene.mesh import Patch
-from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.stepping.evaluator import summed
 from pbdkit.stepping.remembering import describe_bonds
@@ -116,7 +117,7 @@ class StateMoment(Moment):
         raise ValueError(f"no part remembers '{name}'{did_you_mean(name, known)}")
 
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """The loop of the stepper, on the body's particles."""
         raster, state = self._tables.raster, self._state
@@ -137,7 +138,7 @@ class StateMoment(Moment):
 
     def over_cells(
         self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
         *,
         intact_only: bool = False,
     ) -> Floats:

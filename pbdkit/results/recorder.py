@@ -83,7 +83,11 @@ class Recorder:
         """Hands over the columns and everything that is known before the first step."""
         columns, experiment = self._columns(), self._scene.experiment
         known = self._known()
-        sizes = {"particle": self._scene.raster.count, "axis": 2, "index": 2}
+        sizes = {
+            "particle": self._scene.raster.count,
+            "axis": self._scene.axes,
+            "index": self._scene.axes,
+        }
         if self._scene.shows_bonds:
             sizes |= {"bond": len(self._scene.bonds.ends), "end": 2}
         if self._shows_leaders:
@@ -104,7 +108,7 @@ class Recorder:
         known: dict[str, Callable[[], Any]] = {
             "particle": lambda: numbers,
             "number": lambda: numbers,
-            "axis": lambda: np.array(["x", "y"]),
+            "axis": lambda: np.array(list("xyz"[: scene.axes])),
             "site": raster.site_table,
             "reference": raster.reference,
         }

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pbdkit.scene.mesh import Patch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.shares import cells_with_shares
-from pbdkit.stepping.evaluator import presence
 from pbdkit.stepping.slots import SlotFollowers
 from pbdkit.stepping.state import Floats
+from pbdkit.stepping.surroundings import presence
 
 
 class Tables:

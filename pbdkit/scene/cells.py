@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Slot
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import Where
+from pbdkit.scene.places import Where
 
 Floats = NDArray[np.float64]
 Share = NDArray[np.floating[Any]] | float

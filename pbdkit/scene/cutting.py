@@ -97,7 +97,7 @@ class _Cutter:
         x, y = positions(self._cell, self._sublattice, m, n)
         self._x, self._y = x + lattice.origin[0], y + lattice.origin[1]
         self._tolerance = rounding_of(self._cell, self._x, self._y)
-        self._distance = self._signed(Sites(i, j, self._x, self._y))
+        self._distance = self._signed(Sites((i, j), Vector(self._x, self._y)))
 
     def shares(
         self, sublattice: int, corners: Corners
@@ -135,7 +135,7 @@ class _Cutter:
         weights, small = _small_triangles()
         px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
         nowhere = np.zeros(px.shape, int)
-        distance = self._signed(Sites(nowhere, nowhere, px, py))
+        distance = self._signed(Sites((nowhere, nowhere), Vector(px, py)))
         share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
         cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
         a, b, c = (distance[corner][..., cut] for corner in small.T)

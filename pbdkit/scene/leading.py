@@ -79,12 +79,12 @@ def select(raster: Raster, selection: Selection, where: tuple[str | int, ...]) -
 def _edge(raster: Raster, edge: str) -> Indices:
     """The body particle of smallest or largest i in every row j, or j in every column i."""
     body = raster.body_rows
-    i, j = raster.site_of(body).T
-    along, line = (i, j) if edge in ("left", "right") else (j, i)
+    site, axis = raster.site_of(body), 0 if edge in ("left", "right") else 1
+    along, line = site[:, axis], np.delete(site, axis, axis=1)
     if edge in ("right", "top"):
         along = -along
-    order = np.lexsort((along, line))
-    _, first = np.unique(line[order], return_index=True)
+    order = np.lexsort((along, *line.T))
+    _, first = np.unique(line[order], axis=0, return_index=True)
     return body[order[first]]
 
 

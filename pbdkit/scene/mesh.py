@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Cell, Offset, Slot, Vector
+from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import FOLLOWER, Block, Raster
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER, Raster
 
 CELLS_AT_ONCE = 65536
 """So many are looked at together, so that temporaries stay small."""
@@ -32,7 +33,7 @@ class MeshCell:
     corners: tuple[Offset | Slot, ...]
 
     @cached_property
-    def rest(self) -> tuple[Vector, ...]:
+    def rest(self) -> tuple[Components, ...]:
         """X_k - X_0 of the corners, lattice units."""
         return tuple(corner.rest for corner in self.corners)
 

@@ -86,8 +86,8 @@ class Scene:
 
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
-        """The cells of the body."""
-        return body_cells(self.raster)
+        """The cells of the body; they are known in the plane."""
+        return body_cells(self.raster) if self.axes == 2 else ()
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -109,7 +109,7 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked for its depth", "frame"):
         layers = frame.depth(neighbourhood.reach)
     low, high = window(experiment.body, experiment.lattice)
-    extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
+    extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
     refuse_too_large(experiment, neighbourhood, extent, layers)
     if frame.weighs_cells:
         filling, tiling = _cells(experiment, neighbourhood)
@@ -201,7 +201,7 @@ def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -
             "one line than its longer cell vector is long, so that neighbours by distance lie "
             "along that line; take chebyshev neighbours, or open the angle between the vectors"
         )
-    if not neighbourhood.spans_plane():
+    if not neighbourhood.spans_space():
         doubts.append(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
             "more shells, or chebyshev neighbours, connect them"

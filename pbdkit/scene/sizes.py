@@ -40,8 +40,8 @@ def estimate(
 ) -> Sizes:
     """From the window of site indices that the body fills at most, with Python's integers."""
     cell = experiment.lattice.cell()
-    share = len(cell.sites) / (cell.period[0] * cell.period[1])
-    particles = math.ceil((window[0] + 2 * layers) * (window[1] + 2 * layers) * share)
+    share = len(cell.sites) / math.prod(cell.period)
+    particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
     return sizes_of(experiment, neighbourhood, particles)
 
 

@@ -31,7 +31,7 @@ class Guard:
     def __init__(self, scene: Scene, start: State) -> None:
         self._scene = scene
         ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
-        spacing = max(abs(s.rest.x) + abs(s.rest.y) for s in scene.neighbourhood.slots[0])
+        spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
         ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
         self._size = size + sum(ways)

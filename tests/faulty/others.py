@@ -166,13 +166,10 @@ class Shrinks(Following):
         return replace(found, weight=0.9 * found.weight)
 
 
-class SaysItAnchors(Following):
+class SaysItAnchors(pbdkit.Anchors, Following):
     """Says that it ties the body to its place, and does not."""
 
     type: Literal["says-it-anchors"] = "says-it-anchors"
-
-    def anchors(self):
-        return True
 
 
 class WritesSites(Following):
@@ -192,15 +189,15 @@ class Strain(pbdkit.FractureModel):
     limit: float = Field(0.5, description="The strain at which bonds break.")
 
     def constants(self, slot):
-        return ((1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest),)
+        return {"square": (1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest)}
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) > c[0]
+        return pbdkit.squared_length(r + d) > c.square
 
     @staticmethod
     def fictitious(u, r, p):
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
 
 class Lopsided(Strain):
@@ -219,7 +216,7 @@ class Directed(Strain):
     type: Literal["directed"] = "directed"
 
     def constants(self, slot):
-        return (1e3 + slot.rest.x,)
+        return {"square": 1e3 + slot.rest.x}
 
 
 class DeniesBreaking(Strain):
@@ -243,7 +240,7 @@ class Measures(Strain):
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) - c[0]
+        return pbdkit.squared_length(r + d) - c.square
 
 
 class Tupled(Strain):

@@ -11,8 +11,8 @@ from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import presence
 from pbdkit.stepping.state import State
+from pbdkit.stepping.surroundings import presence
 
 Bits = NDArray[np.unsignedinteger[Any]]
 

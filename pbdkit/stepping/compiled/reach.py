@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import StartsCracked
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator, presence
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.leaders import Led
 from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import presence
 
 Box = NDArray[np.int64]
 """(first row, last row + 1, first column, last column + 1) of repeat cells."""

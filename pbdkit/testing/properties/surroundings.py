@@ -39,10 +39,8 @@ def has_a_sound_cell(subject: Subject) -> None:
         cell = checked_cell(lattice)
     except ExperimentError as error:
         raise PropertyError(str(error)) from None
-    a, b = cell.vectors
-    _refuse_equal(cell, "place", np.array([a, b]), lambda site: site.at)
-    (pa, qa), (pb, qb) = cell.primitive
-    if pa * qb == qa * pb:
+    _refuse_equal(cell, "place", np.array(cell.vectors), lambda site: site.at)
+    if np.linalg.det(cell.primitive) == 0.0:
         raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
     _refuse_equal(cell, "primitive index", np.array(cell.primitive), lambda site: site.primitive)
     for n, site in enumerate(cell.sites):
@@ -77,11 +75,13 @@ def _refuse_miscounted(cell: Cell) -> None:
 
 
 def _refuse_equal(
-    cell: Cell, what: str, steps: np.ndarray, of: Callable[[BasisSite], tuple[float, float]]
+    cell: Cell, what: str, steps: np.ndarray, of: Callable[[BasisSite], tuple[float, ...]]
 ) -> None:
     """Raises where two sites have the same value up to whole steps of the cell."""
     for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        apart = np.linalg.solve(steps.T, np.subtract(of(other), of(one)).astype(float))
+        apart = np.linalg.solve(
+            steps.T, np.subtract(tuple(of(other)), tuple(of(one))).astype(float)
+        )
         if np.abs(apart - np.round(apart)).max() < 1e-9:
             raise PropertyError(
                 f"basis sites {m} and {n} have the same {what} {tuple(of(one))}, up to whole "
@@ -99,7 +99,7 @@ def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
         raise PropertyError("another origin gives another cell: leave `self.origin` out of `cell`")
 
 
-Chosen = set[tuple[int, int, tuple[int, int]]]
+Chosen = set[tuple[int, tuple[int, ...]]]
 
 
 @asked_of(NeighbourMetric)
@@ -190,11 +190,7 @@ def _flat(metric: NeighbourMetric, cell: Cell, sublattice: int) -> list[Offset]:
 def _chosen(metric: NeighbourMetric, cell: Cell, sublattice: int) -> Chosen:
     """(shell, step between sites) of every neighbour."""
     shells = metric.shells_around(cell, sublattice)
-    return {(n, *_index(o)) for n, shell in enumerate(shells, 1) for o in shell}
-
-
-def _index(offset: Offset) -> tuple[int, tuple[int, int]]:
-    return 0, offset.site
+    return {(n, o.site) for n, shell in enumerate(shells, 1) for o in shell}
 
 
 @asked_of(FramePolicy, needs=REPEATABLE)
