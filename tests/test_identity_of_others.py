@@ -18,7 +18,7 @@ from identity_cases import (
 )
 
 import pbdkit
-from pbdkit.identity.picture import by_direction
+from pbdkit.identity.polar import by_direction
 
 HONEYCOMB = {"type": "honeycomb"}
 

@@ -22,7 +22,7 @@ COMMANDS = {
     "explain": "explain",
     "bench": "bench",
     "plugins": "plugins",
-    "schema": "schema",
+    "schema": "experiments",
 }
 """Every command with the module of pbdkit.cli in which it stands."""
 COMPLETING = "_PBDKIT_COMPLETE"

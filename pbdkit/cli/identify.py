@@ -32,7 +32,7 @@ def identify(
     else:
         from rich.console import Console
 
-        from pbdkit.identity.report import table
+        from pbdkit.identity.verdict import table
 
         console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH, highlight=False)
         click.echo(f"{found.name}: {found.rule}, {found.lattice} lattice, {found.neighbours}")
@@ -40,6 +40,6 @@ def identify(
         for note in found.notes:
             click.echo(f"note: {note}")
     if picture:
-        from pbdkit.identity.picture import by_direction
+        from pbdkit.identity.polar import by_direction
 
         save(picture, by_direction(found), quiet=as_json)

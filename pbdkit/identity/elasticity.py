@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 PAIRS = ((0, 0), (1, 1), (0, 1))
+DIFFUSION, ELASTICITY, NEITHER = "diffusion", "elasticity", "neither"
 SAME = 1e-8
 """Shares below this are nothing; what central differences give is good to 1e-9."""
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.identity.elasticity import Elasticity
-from pbdkit.identity.identity import DIFFUSION, ELASTICITY, Identity, LongWaves
-from pbdkit.identity.report import verdict
+from pbdkit.identity.dispersion import LongWaves
+from pbdkit.identity.elasticity import DIFFUSION, ELASTICITY, Elasticity
+from pbdkit.identity.identity import Identity
+from pbdkit.identity.verdict import verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
