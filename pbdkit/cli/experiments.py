@@ -1,4 +1,4 @@
-"""``pbdkit experiments``, ``init`` and ``schema``: what there is to start from, also for a shell."""
+"""``pbdkit experiments``, ``init`` and ``schema``: what there is to start from, for a shell too."""
 
 from __future__ import annotations
 

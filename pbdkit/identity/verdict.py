@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from pbdkit.identity.dispersion import LongWaves
-from pbdkit.identity.identity import Identity
+    from pbdkit.identity.identity import Identity
 
 SYMMETRIES = {
     "isotropic": "isotropic {}",
