@@ -24,6 +24,7 @@ from pbdkit.components.springs import Springs
 from pbdkit.components.straining import StrainFracture
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
+from pbdkit.scene.cells import tiling_of
 from pbdkit.scene.neighbourhood import build_neighbourhood
 
 REQUIRED = {
@@ -122,7 +123,7 @@ def locked(array):
 def constants_of(rule):
     cell = Hexagonal(a=1.0).cell()
     slots = build_neighbourhood(cell, Coordination()).slots
-    setting = Setting(cell, slots, Vector(0.0, 0.0), Vector(4.0, 3.0))
+    setting = Setting(cell, slots, Vector(0.0, 0.0), Vector(4.0, 3.0), tiling_of(cell, slots))
     w = SimpleNamespace(**rule.weights(slots[0][0], setting), left=1.0, right=0.5)
     return slots[0][0], w, SimpleNamespace(**rule.parameters(setting))
 

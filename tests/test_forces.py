@@ -28,7 +28,6 @@ import pbdkit
 from pbdkit.components.cell_stiffness import rectangle_matrix
 from pbdkit.interfaces import Stiffness
 from pbdkit.scene.scene import build_scene
-from pbdkit.scene.shares import cells_with_shares
 
 E, T = 7.0, 2.0
 REACTION = {"type": "reaction", "youngs_modulus": E, "thickness": T}
@@ -124,7 +123,8 @@ def test_the_energy_of_any_state_is_that_of_its_cells(lattice, body):
     lattice = scene.experiment.lattice
     K = rectangle_matrix(stiffness, lattice.a, getattr(lattice, "b", lattice.a))
     K = K.reshape(8, 8)
-    for patch, share in cells_with_shares(scene.raster, scene.cells):
+    for patch in scene.patches:
+        share = scene.cells.of(patch)
         for place in np.flatnonzero(share):
             corners = u[patch.rows(scene.raster, place)].ravel()
             expected += share.flat[place] * 0.5 * corners @ K @ corners

@@ -172,7 +172,7 @@ class Writing(pbdkit.RenewsBonds, Keeping):
         (Loose, "asked what it remembers: `remembered` returned Remembered, not a tuple"),
         (
             Tangled,
-            "'tangled' failed to place .*: `fictitious` returned tuple: return `pbdkit.Vector",
+            "'tangled' failed to place .*: `fictitious` returned tuple: return a vector, as",
         ),
         (Measured, "'plain' failed at step 1: `breaks` returned float64: compare, as in"),
         (Silent, "'plain' failed at step 1: `breaks` returned None: compare, as in"),

@@ -107,7 +107,7 @@ def test_other_numbers_of_components_are_refused():
         vector(range(4))
     plane, space = pbdkit.Vector(1.0, 2.0), pbdkit.SpaceVector(1.0, 2.0, 3.0)
     for one, other in ((plane, space), (space, plane)):
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
             one + other
-        with pytest.raises(ValueError, match="argument 2 is (longer|shorter)"):
+        with pytest.raises(ValueError, match=r"argument 2 is (longer|shorter)"):
             pbdkit.dot(one, other)

@@ -89,6 +89,11 @@ def is_one(blocks: Floats) -> bool:
     return len(blocks) > 1 and blocks.strides[0] == 0
 
 
+def frame_matrices(weights: Floats, axes: int) -> Floats:
+    """(entry, axis, axis): a frame's weights as matrices."""
+    return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
+
+
 def _of_one(blocks: Floats) -> Floats:
     return blocks[:1] if is_one(blocks) else blocks
 

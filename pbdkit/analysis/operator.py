@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import Couplings, some_of
+from pbdkit.analysis.composition import moves_and_couplings
+from pbdkit.analysis.couplings import Couplings, frame_matrices, some_of
 from pbdkit.analysis.linearising import Response, has_neighbours, respond
 from pbdkit.analysis.matrices import Entries
-from pbdkit.analysis.nesting import moves_and_couplings
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
@@ -205,19 +205,14 @@ class _Assembly:
         for e in range(int((last - first).max(initial=0))):
             has = first + e < last
             entry = (first + e)[has]
-            product = np.einsum(
-                "eab,ebc->eac", weight[has], _matrices(frame.map.weight[entry], self._scene.axes)
-            )
+            follows = frame_matrices(frame.map.weight[entry], self._scene.axes)
+            product = np.einsum("eab,ebc->eac", weight[has], follows)
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
             sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
             for couplings, those in sums:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
-
-
-def _matrices(weights: Floats, axes: int) -> Floats:
-    return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
 
 
 def _times(matrices: Floats, vectors: Floats) -> Floats:

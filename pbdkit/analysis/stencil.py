@@ -7,9 +7,8 @@ from the rule's own `gather` and `apply`; exact for linear rules.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from operator import add
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
 from pbdkit.interfaces import Here, Slot
-from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
@@ -35,52 +33,12 @@ class Stencil:
     neighbours: dict[Slot, Floats]
 
 
-def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
-    """The stencil of the scene's rule; `at` says where for rules that ask."""
-    if scene.inner:
-        return _composed(linearised(replace(scene, inner=None), at), linearised(scene.inner, at))
+def stencil_of(scene: Scene, at: Here = NOWHERE) -> Stencil:
+    """The stencil of the scene's rule alone; `at` says where for rules that ask."""
     every = scene.neighbourhood.slots
     own = np.array([_derivative(scene, slots, None, at) for slots in every])
     neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
     return Stencil(own, neighbours)
-
-
-def _composed(outer: Stencil, inner: Stencil) -> Stencil:
-    """The stencil of a rule that works on the moves of another."""
-    own = np.zeros_like(outer.own)
-    neighbours: dict[Slot, Floats] = {}
-    known: dict[tuple[int, int, Index], Slot] = {}
-    for first, W in _with_itself(outer):
-        for second, V in _with_itself(inner):
-            if first.target != second.source:
-                continue
-            slot = _after(first, second)
-            key = slot.source, slot.target, slot.cell
-            if slot.source == slot.target and not any(slot.cell):
-                own[slot.source] += W @ V
-            else:
-                slot = known.setdefault(key, slot)
-                neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
-    return Stencil(own, neighbours)
-
-
-def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
-    for s, own in enumerate(stencil.own):
-        nowhere = (0,) * len(own)
-        yield Slot(s, s, nowhere, nowhere, vector(np.zeros(len(own))), 0), own
-    yield from stencil.neighbours.items()
-
-
-def _after(first: Slot, second: Slot) -> Slot:
-    """Where two slots lead, one after the other."""
-    return Slot(
-        first.source,
-        second.target,
-        tuple(map(add, first.cell, second.cell)),
-        tuple(map(add, first.site, second.site)),
-        first.rest + second.rest,
-        first.shell + second.shell,
-    )
 
 
 def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:

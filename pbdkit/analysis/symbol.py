@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pbdkit.analysis.composition import linearised
 from pbdkit.analysis.region import Complex, modes
-from pbdkit.analysis.stencil import linearised
 from pbdkit.scene.scene import Scene
 
 WAVES = 48

@@ -187,7 +187,7 @@ class Experiment(Strict):
     @property
     def shows_bonds(self) -> bool:
         """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
-        return self.fracture.can_break or any(d.uses_bonds for d in self.diagnostics)
+        return self.fracture.can_break or any("bonds" in d.needs for d in self.diagnostics)
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""

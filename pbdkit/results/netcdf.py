@@ -13,8 +13,8 @@ import netCDF4
 import numpy as np
 
 from pbdkit.errors import StorageError
-from pbdkit.results.layout import Column, When
-from pbdkit.results.recorder import Sink, Values
+from pbdkit.results.layout import Column, Values, When
+from pbdkit.results.recorder import Sink
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading

@@ -206,7 +206,8 @@ def _dots(ax: Axes, now: Snapshot, norm: Normalize | None, size: float, crowded:
     dense = {"marker": "s", "edgecolors": "none", "rasterized": True}
     style: dict[str, Any] = dense if crowded else {"edgecolors": INK, "lw": 0.08 * size}
     if values is not None and mesh is None:
-        ax.scatter(x, y, (1.2 * size) ** 2, values, cmap=DOT_COLOURS, norm=norm, **style)
+        style |= {"cmap": DOT_COLOURS, "norm": norm, "plotnonfinite": True}
+        ax.scatter(x, y, (1.2 * size) ** 2, values, **style)
         return
     if values is not None and mesh is not None and len(mesh) and isinstance(norm, BoundaryNorm):
         fill, levels = Triangulation(x, y, mesh), norm.boundaries

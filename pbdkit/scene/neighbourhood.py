@@ -13,6 +13,8 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Cell, Components, Lattice, NeighbourMetric, Offset, Slot
 from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.polygons import Tiling
+from pbdkit.scene.cells import tiling_of
 
 FLATTEST = 1e-3
 """Cells flatter than this are refused: within a cell vector of a site lie π/flatness others."""
@@ -33,11 +35,17 @@ class BondPlane:
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """`slots[s]` are the neighbours of sublattice s, the nearest shells first and inversion
-    partners side by side; `planes` holds each pair of opposite slots once."""
+    """`slots[s]` are the neighbours of sublattice s of `cell`, the nearest shells first and
+    inversion partners side by side; `planes` holds each pair of opposite slots once."""
 
+    cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
     planes: tuple[BondPlane, ...]
+
+    @cached_property
+    def tiling(self) -> Tiling:
+        """The cells of the lattice, and which of them lie beside the slots."""
+        return tiling_of(self.cell, self.slots)
 
     @property
     def reach(self) -> int:
@@ -131,7 +139,7 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
             planes.append(BondPlane(slot, opposite))
     for own in slots:
         _refuse_lopsided(own, metric)
-    return Neighbourhood(slots, tuple(planes))
+    return Neighbourhood(cell, slots, tuple(planes))
 
 
 def _refuse_lopsided(own: tuple[Slot, ...], metric: NeighbourMetric) -> None:

@@ -56,7 +56,7 @@ class Evaluator:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self.rule: FollowerRule = scene.experiment.rule
-        self._model = scene.experiment.fracture if scene.has_fracture else None
+        self._model = scene.experiment.fracture
         self._softens = self._model if isinstance(self._model, Softens) else None
         self._p, self._q = scene.constants.rule, scene.constants.fracture
 
@@ -74,7 +74,7 @@ class Evaluator:
         """The difference that the rule sees: softened, or that of the fictitious point where the
         bond broke."""
         model = self._model
-        if model is None or (to.broken is None and to.c is None):
+        if to.broken is None and to.c is None:
             return d
         with blaming(model, "to place a fictitious point"):
             lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
@@ -115,7 +115,6 @@ class Evaluator:
 
     def breaks(self, d: Components, r: Components, limits: Any, own: Sequence[Any]) -> Any:
         """Whether bonds break that remember these numbers."""
-        assert self._model
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
 

@@ -75,7 +75,13 @@ class SlotFollowers(Followers):
 
     def _seen(self, m: Floats, state: State) -> Floats:
         """What the rule works on: displacements, or the moves of its inner rule."""
-        return self._inner.moves(m, state) if self._inner else m
+        if self._inner is None:
+            return m
+        z = self._inner.moves(m, state)
+        if self._scene.frame:
+            flat = z.reshape(len(z), -1)
+            self._scene.frame.follow(flat, flat)
+        return z
 
     def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
         """Every block with the sums of its neighbours' contributions and what stands there."""

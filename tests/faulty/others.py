@@ -274,6 +274,21 @@ class NoUnits(Extent):
         return (pbdkit.Variable("extent", ("particle",), "displacement", ""),)
 
 
+class TakesOurName(Extent):
+    """Calls its dimension as the dataset calls one of its own."""
+
+    type: Literal["takes-our-name"] = "takes-our-name"
+
+    def variables(self):
+        return (pbdkit.Variable("extent", ("site",), "displacement", "lattice unit"),)
+
+    def coordinates(self):
+        return {"site": np.arange(3)}
+
+    def measure(self, now):
+        return (np.zeros(3),)
+
+
 class OneShort(Extent):
     """Leaves the last particle out."""
 

@@ -247,10 +247,6 @@ class WearsOneWay(Wearing):
     def update(d, r, c, p):
         return pbdkit.where(d.x > c.wear, d.x, c.wear), c.times
 
-    @staticmethod
-    def breaking_strain(r, c, p):
-        return None
-
 
 class Misstates(Wearing):
     """Says that bonds bear twice as much as they do."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from pbdkit.interfaces import Cell, Slot
-from pbdkit.scene.cells import Side, Tiling
+from pbdkit.interfaces.polygons import Side, Tiling
 from pbdkit.scene.constants import WHOLE_CELLS
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.stepping.compiled.events import write_events

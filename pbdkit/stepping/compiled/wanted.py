@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pbdkit.interfaces import Slot
-from pbdkit.scene.cells import Tiling
+from pbdkit.interfaces.polygons import Tiling
 
 INDENT = "    "
 

@@ -158,7 +158,7 @@ def finds_the_same_anew(subject: Subject) -> None:
             met = {
                 o.site
                 for o in cell.offsets(s, far)
-                if np.hypot(*(scale * o.rest)) <= near.radius * (1 + 1e-9)
+                if np.hypot(*(scale * np.array(o.rest))) <= near.radius * (1 + 1e-9)
             }
             if met != {o.site for o in _flat(metric, cell, s)}:
                 raise PropertyError(
