@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.region import Complex, largest_stable_relaxation
-from pbdkit.identity.elasticity import Elasticity, at_direction
+from pbdkit.identity.elastic_constants import Elasticity, at_direction
 from pbdkit.identity.waves import Primitive, SlowWaves, operator
 
 Floats = NDArray[np.float64]

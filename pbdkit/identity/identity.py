@@ -10,7 +10,7 @@ import numpy as np
 from pbdkit.analysis.stencil import Stencil
 from pbdkit.errors import ExperimentError
 from pbdkit.identity.dispersion import LongWaves, Spectrum, gradients, ranges, spectrum
-from pbdkit.identity.elasticity import (
+from pbdkit.identity.elastic_constants import (
     DIFFUSION,
     ELASTICITY,
     NEITHER,

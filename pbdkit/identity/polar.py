@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.identity.dispersion import LongWaves
-from pbdkit.identity.elasticity import DIFFUSION, ELASTICITY, Elasticity
+from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, Elasticity
 from pbdkit.identity.identity import Identity
 from pbdkit.identity.verdict import verdict
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.analysis.region import NEUTRAL
 from pbdkit.identity.dispersion import Gradient, Range
-from pbdkit.identity.elasticity import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
+from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
 from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:

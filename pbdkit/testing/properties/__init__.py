@@ -7,11 +7,11 @@ from pbdkit.testing.properties import (
     breakage,
     elementwise,
     every,
+    lattice_parts,
     measurements,
     remembrance,
     repetition,
     steps,
-    surroundings,
 )
 from pbdkit.testing.property import Property
 
@@ -19,7 +19,7 @@ PROPERTIES: tuple[Property, ...] = tuple(
     found
     for room in (
         every,
-        surroundings,
+        lattice_parts,
         remembrance,
         repetition,
         elementwise,
