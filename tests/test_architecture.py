@@ -1,4 +1,4 @@
-"""Imports follow the data: experiment, scene, stepping, results, running, command line."""
+"""Imports follow the data: experiment, scene, stepping, results, runs, command line."""
 
 import ast
 from pathlib import Path
@@ -15,11 +15,11 @@ ORDER = [
     "experiment",
     "scene",
     "stepping",
+    "results",
     "analysis",
     "identity",
     "equilibrium",
-    "results",
-    "running",
+    "runs",
     "api",
     "bench",
     "testing",

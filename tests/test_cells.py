@@ -141,6 +141,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 5), (6, 1), (1, 1)])
+@pytest.mark.filterwarnings("ignore:leaders. everybody leads")
 def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
@@ -166,6 +167,7 @@ class Areas(pbdkit.Diagnostic):
         return (now.cells.over(area).sum(),)
 
 
+@pytest.mark.filterwarnings("ignore:leaders. there are none")
 def test_a_diagnostic_of_ones_own_gets_the_cells():
     given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
     ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)

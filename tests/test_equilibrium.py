@@ -60,6 +60,7 @@ def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size
     assert abs(ds.u.isel(time=-1, axis=1)).max() <= known["distance"]
 
 
+@pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
 @settings(
     max_examples=15,
     deadline=None,

@@ -11,7 +11,7 @@ from pbdkit.bench import measurement
 from pbdkit.bench.decay import Decay, decay_of, followers_of
 from pbdkit.bench.measurement import Row, measure
 from pbdkit.bench.work_precision import gains, lines, picture, table
-from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

@@ -29,6 +29,13 @@ from pbdkit.components.cell_stiffness import rectangle_matrix
 from pbdkit.interfaces import Stiffness
 from pbdkit.scene.scene import build_scene
 
+# Forces are those of given starts, and of any frame.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:leaders. there are none"),
+    pytest.mark.filterwarnings("ignore:diagnostics.. .* counts what frame points pull"),
+    pytest.mark.filterwarnings("ignore:frame. under 'none' edges"),
+]
+
 E, T = 7.0, 2.0
 REACTION = {"type": "reaction", "youngs_modulus": E, "thickness": T}
 ENERGY = {"type": "strain-energy", "youngs_modulus": E, "thickness": T}
@@ -274,14 +281,17 @@ def test_forces_of_neighbours_that_come_and_go_are_refused():
     )
 
 
-def test_a_rule_without_forces_is_named():
-    parts = SQUARE | {"rule": {"type": "loose"}, "frame": {"type": "none"}}
-    with pytest.raises(pbdkit.PluginError) as caught:
-        pbdkit.run(pulled(parts), components=[Loose], progress=False)
-    assert str(caught.value) == (
-        "FollowerRule 'loose' failed when asked for forces at step 0: NotImplementedError: the "
-        "rule is not calibrated to a material: it knows no forces"
-    )
+class Forceless(pbdkit.Calibrated, pbdkit.FollowerRule):
+    """A calibrated rule that does not say what its forces are."""
+
+    type: Literal["forceless"] = "forceless"
+    stiffness, gather, apply = Loose.stiffness, Loose.gather, Loose.apply
+
+
+def test_a_calibrated_rule_without_forces_is_named():
+    parts = SQUARE | {"rule": {"type": "forceless"}, "frame": {"type": "none"}}
+    with pytest.raises(pbdkit.ExperimentError, match="components: Forceless lacks force"):
+        pbdkit.run(pulled(parts), components=[Forceless], progress=False)
 
 
 @pytest.mark.parametrize(("name", "off"), [("bar", 0.045), ("cantilever", 0.67)])

@@ -28,6 +28,8 @@ def test_case_5_collinear_neighbours_are_warned_of():
     assert not scene_of(lattice=oblique, neighbours="chebyshev-1").warnings
 
 
+@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
+@pytest.mark.filterwarnings("ignore:leaders. there are none")
 def test_case_6_components_without_leader_are_named_and_stay_put():
     flat = {"type": "rectangular", "a": 1.0, "b": 2.5}
     scene = scene_of(lattice=flat)
@@ -46,6 +48,8 @@ def test_case_6_components_without_leader_are_named_and_stay_put():
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
+@pytest.mark.filterwarnings("ignore:leaders. there are none")
 def test_case_7_a_single_follower_in_its_frame_stays_put(lattice):
     start = np.array([[0.3, -0.2]])
     u = advanced(scene_of(1, 1, lattice=lattice), start, 50)

@@ -75,14 +75,6 @@ def test_what_is_no_move_is_caught_in_the_step(
     assert (result.code, f"{WHO}at step 1: {reason}" in result.err) == (3, True)
 
 
-def test_a_refusal_in_the_step_is_named(install: Install, call: Call) -> None:
-    refusing = "raise pbdkit.ExperimentError('not today')"
-    install("pbdkit-odd", rule("odd").replace(GATHER, refusing), "0.3")
-    result = call("run", "e.json", ODD)
-    assert result.code == 2
-    assert "FollowerRule 'odd' of pbdkit-odd 0.3: not today" in result.err
-
-
 def test_a_move_that_is_not_finite(install: Install, call: Call) -> None:
     source = rule("odd").replace(APPLY, "return float('nan') * total[0]")
     install("pbdkit-odd", source, "0.3")

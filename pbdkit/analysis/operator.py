@@ -132,7 +132,7 @@ class _Assembly:
         self._source = np.zeros((free, axes))
 
     def operator(self) -> StepOperator:
-        memory = self._scene.experiment.solver.memory
+        memory = self._scene.experiment.stepping.memory
         self._now.add_scaled_identity(np.arange(len(self._followers), dtype=np.int32), 1.0)
         place = self._scene.raster.place_of(self._followers)
         cells = self._kind.size // self._scene.raster.shape[0]
@@ -159,7 +159,7 @@ class _Assembly:
 
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
-        relaxation = self._scene.experiment.solver.relaxation
+        relaxation = self._scene.experiment.stepping.relaxation
         u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
         rows = self._unknown[place]
         own = response.of_each(relaxation * response.own)
@@ -179,7 +179,7 @@ class _Assembly:
 
     def _add_nested(self, place: Indices) -> None:
         """The rows of followers whose rule works on the moves of another."""
-        relaxation, rows = self._scene.experiment.solver.relaxation, self._unknown[place]
+        relaxation, rows = self._scene.experiment.stepping.relaxation, self._unknown[place]
         moves, couplings = moves_and_couplings(self._scene, self._state, place)
         everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
         u = self._state.u.reshape(self._scene.axes, -1)[:, everybody].T.astype(float, copy=False)

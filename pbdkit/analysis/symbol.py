@@ -18,7 +18,8 @@ from pbdkit.scene.scene import Scene
 WAVES = 48
 """Wave numbers along each axis; an even number, so that the shortest waves are among them."""
 
-
+MOST_ANSWERS = 100_000
+"""Of a rule that is asked what each neighbour does to each: about half a second."""
 LITTLE_MEMORY = 0.9
 """Up to which plane waves were seen to bound random bodies (tests/test_predictions.py)."""
 
@@ -46,9 +47,12 @@ def wave_bound(scene: Scene) -> Bound | None:
     """The bound for the scene's rule at rest.
 
     None for rules that depend on the place or take no single numbers, where neighbours are found
-    anew, and where the frame lags: its delay can make modes grow that no plane wave knows.
+    anew or are more than some 300, and where the frame lags: its delay can make modes grow that no
+    plane wave knows.
     """
-    solver, lags = scene.experiment.solver, scene.frame is not None and scene.frame.map.lag
+    if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MOST_ANSWERS:
+        return None
+    solver, lags = scene.experiment.stepping, scene.frame is not None and scene.frame.map.lag
     if lags or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
     try:
@@ -70,7 +74,7 @@ def bounds_the_body(scene: Scene) -> bool:
     modes of their own, and with much memory so have frames on leaning lattices."""
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach
-    return whole and abs(scene.experiment.solver.memory) <= LITTLE_MEMORY
+    return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY
 
 
 def _eigenvalues(matrices: Complex) -> Complex:

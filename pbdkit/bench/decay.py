@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.certificate import scale_of
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene

@@ -17,7 +17,6 @@ import numpy as np
 from pbdkit.api import load
 from pbdkit.bench.size import resized
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.experiment.solvers import Equilibrium
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
@@ -98,7 +97,7 @@ def measure(
     settings = (*settings, f"record={{every: {asked.steps}}}", "diagnostics=[]")
     if size is not None:
         settings += resized(load(experiment, settings=settings), size)
-    rows = _to_equilibrium if isinstance(asked.solver, Equilibrium) else _step_by_step
+    rows = _step_by_step if asked.solver.makes_steps else _to_equilibrium
     with tempfile.TemporaryDirectory(prefix="pbdkit-bench-") as name:
 
         def work(what: str, *more: str, cache: str = "shared", **job: Any) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from pbdkit.api import load
 from pbdkit.bench.decay import decay_of, followers_of
 from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.finding import UnconvergedError
-from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.increments import settle
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.scene.scene import Scene, build_scene
@@ -77,7 +77,7 @@ def _step(job: Job) -> Job:
     """Set-up, and for each number of steps `at`: the seconds to there, the best of several runs;
     the largest distance from the truth in `sizes`, the largest displacements."""
     experiment = load(job["experiment"], settings=job["settings"])
-    imports = _import(*[COMPILED] * (experiment.solver.engine == "compiled"))
+    imports = _import(*[COMPILED] * (experiment.stepping.engine == "compiled"))
     begun = _clock()
     scene = build_scene(experiment)
     built = _clock() - begun

@@ -87,7 +87,7 @@ class Track(Diagnostic):
 
     type: Literal["track"] = "track"
     numbers: Annotated[
-        tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)
+        tuple[Annotated[int, Field(ge=1, lt=2**62)], ...], Field(strict=False, min_length=1)
     ] = Field(description="The particles to follow, by number.", examples=[[3, 1]])
 
     every_step: ClassVar[bool] = True

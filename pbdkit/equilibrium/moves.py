@@ -22,7 +22,7 @@ class Moves:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._followers = SlotFollowers(
-            scene, Stepping(relaxation=scene.experiment.solver.relaxation)
+            scene, Stepping(relaxation=scene.experiment.stepping.relaxation)
         )
         self._after: Floats | None = None
 

@@ -13,7 +13,7 @@ from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State

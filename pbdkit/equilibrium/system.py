@@ -18,7 +18,7 @@ from pbdkit.analysis.matrices import DENSE, connected
 from pbdkit.analysis.operator import StepOperator
 from pbdkit.equilibrium.floating import Floating
 from pbdkit.equilibrium.parts import DriftingError, Held, Part
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 
 Floats = NDArray[np.float64]

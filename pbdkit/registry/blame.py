@@ -41,13 +41,16 @@ def blame(component: type[Component], when: str, error: BaseException) -> Plugin
 @contextmanager
 def blaming(component: Component, when: str, *field: str | int) -> Iterator[None]:
     """What a component's own code raises becomes a PluginError with its interface, type and
-    distribution; what it refuses with an ExperimentError is about its `field` of the experiment, or
-    names the component where it has none."""
+    distribution; what it refuses with an ExperimentError is about its `field` of the experiment,
+    where one is given. An interrupt says where it came."""
     try:
         yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"in {whose(type(component))} {when}") from None
     except ExperimentError as error:
-        who = "" if field else f"{whose(type(component))}: "
-        raise ExperimentError(f"{who}{error}", (*field, *error.where)) from None
+        if not field:
+            raise blame(type(component), when, error) from error
+        raise ExperimentError(str(error), (*field, *error.where)) from None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
     except (Exception, SystemExit) as error:

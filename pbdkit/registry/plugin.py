@@ -102,7 +102,7 @@ def load_plugin(point: Point) -> Plugin:
         except IncompatibleError as error:
             state, reason = "incompatible", str(error)
         except KeyboardInterrupt:
-            raise
+            raise KeyboardInterrupt(f"while {point.distribution} was loaded") from None
         except BaseException as error:  # SystemExit at import is a plugin's fault too
             state, reason = "broken", worded(error, package)
     return Plugin(point.name, point.distribution, point.version, state, reason, offers)

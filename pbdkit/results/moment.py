@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, length
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
@@ -20,7 +19,7 @@ from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
 from pbdkit.results.tables import Tables, broken_along, read_only
-from pbdkit.scene.leading import kinds_at, select
+from pbdkit.scene.leading import Selecting, kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.stepping.evaluator import summed
@@ -59,8 +58,7 @@ class StateMoment(Moment):
 
     def nearest(self, points: tuple[Pair, ...]) -> Indices:
         """As leaders are selected."""
-        rows = [select(self._raster, Selection(nearest=(point,)), ()) for point in points]
-        return np.concatenate(rows)
+        return Selecting(self._raster).nearest(points)
 
     @cached_property
     def _u(self) -> Floats:

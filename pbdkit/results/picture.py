@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.results.snapshot import Array, Snapshot, label, take_snapshots, variable_label
+from pbdkit.results.snapshot import Array, Snapshot, label, plain, take_snapshots, variable_label
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 if TYPE_CHECKING:
@@ -68,8 +68,9 @@ def draw(
     look = _look(dataset, snapshots, numbers)
     axes = _canvas(1, look) if ax is None else [ax]
     _paint(axes[0], dataset, snapshots[0], look)
-    title = f"{dataset.attrs.get('title', '')}, step {snapshots[0].step}"
-    axes[0].set_title(title.lstrip(", "))
+    axes[0].set_title(
+        f"{plain(dataset.attrs.get('title', ''))}, step {snapshots[0].step}".lstrip(", ")
+    )
     _explain(axes, dataset, look, color, contours)
     return axes[0]
 
@@ -99,7 +100,7 @@ def figure(
     _explain(axes, dataset, look, color, contours)
     whole = axes[0].get_figure(root=True)
     assert whole is not None
-    whole.suptitle(str(dataset.attrs.get("title", "")))
+    whole.suptitle(plain(dataset.attrs.get("title", "")))
     return whole
 
 

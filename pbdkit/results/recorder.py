@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.forecast import prediction
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.measured import Measured
@@ -103,13 +102,6 @@ class Recorder:
         experiment = self._scene.experiment
         return experiment.recording.keeps(step, experiment.steps)
 
-    def next_after(self, step: int) -> int:
-        """The next step after `step` at which something is taken."""
-        experiment = self._scene.experiment
-        if self._measured.every_step:
-            return step + 1
-        return experiment.recording.next_after(step, experiment.steps)
-
     def observe_last(self, state: State) -> None:
         """Records the step at which a run stops before its end."""
         if state.step > self.last_recorded:
@@ -134,9 +126,9 @@ class Recorder:
         if values:
             self._sink.put(values)
 
-    def finish(self, state: State, outcome: Outcome) -> None:
-        """Hands over what is known at the end, and the attributes; `warnings` says what the user
-        should know of the last state."""
+    def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
+        """Hands over what is known at the end, and the attributes, with what was predicted before
+        the first step; `warnings` says what the user should know of the last state."""
         # Where a run diverged, what broke since the last record is no result.
         diverged = outcome.status == "diverged"
         moment = StateMoment(state, self._tables, self.last_recorded if diverged else state.step)
@@ -147,7 +139,7 @@ class Recorder:
             self._sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
             self._sink.put(self._measured.at_end(moment))
-        self._sink.finish(self._attributes(outcome))
+        self._sink.finish(self._attributes(outcome, prediction))
 
     def _columns(self) -> list[Column]:
         columns = layout.base_columns()
@@ -170,7 +162,7 @@ class Recorder:
             else column
         )
 
-    def _attributes(self, outcome: Outcome) -> dict[str, str]:
+    def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment
         return {
             "Conventions": layout.CONVENTIONS,
@@ -179,7 +171,7 @@ class Recorder:
             "pbdkit_version": version("pbdkit"),
             "experiment": experiment.model_dump_json(by_alias=True),
             "plugins": json.dumps(experiment.distributions()),
-            "prediction": json.dumps(prediction(self._scene)),
+            "prediction": json.dumps(prediction),
             "status": outcome.status,
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),

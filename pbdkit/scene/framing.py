@@ -151,4 +151,4 @@ def _turned(matrices: Floats, u: Floats) -> Floats:
 
 def _with_ties(distance: Floats) -> Floats:
     """The distance up to which another particle counts as equally near (model.md, section 7)."""
-    return distance * (1 + 1e-9) + 1e-12
+    return distance * (1 + 1e-9)

@@ -83,8 +83,8 @@ class Neighbourhood:
 
 
 def checked_cell(lattice: Lattice) -> Cell:
-    """The lattice's cell; ExperimentError where it is degenerate or its sites share an index or a
-    place."""
+    """The lattice's cell; ExperimentError where it is degenerate, its sites share an index or a
+    place, or lie so far off that positions would."""
     cell = lattice.cell()
     named = " and ".join(str(tuple(v)) for v in cell.vectors)
     indices = [site.index for site in cell.sites]
@@ -97,6 +97,14 @@ def checked_cell(lattice: Lattice) -> Cell:
             f"{1 / flatness(cell):.3g} times closer along one line than the longer is long, and "
             f"{1 / FLATTEST:g} times is the most; open their angle, or make their lengths more "
             "alike"
+        )
+    far = max(map(abs, lattice.origin))
+    apart = min(math.hypot(*v) for v in cell.vectors)
+    if 4 * math.ulp(far) > apart:
+        raise ExperimentError(
+            f"at {far:g} double precision does not tell sites apart that lie {apart:g} from each "
+            "other; move the origin nearer to zero",
+            ("origin",),
         )
     if len(set(indices)) < len(indices) or not inside:
         raise ExperimentError(

@@ -20,7 +20,7 @@ from pbdkit.scene.constants import SceneConstants, ask_for_constants
 from pbdkit.scene.cut_cells import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
-from pbdkit.scene.leading import Leading, build_leading
+from pbdkit.scene.leading import Leading, build_leading, doubts
 from pbdkit.scene.measuring import check_diagnostics
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.nested import inner_experiment
@@ -119,6 +119,7 @@ def _build(experiment: Experiment) -> Scene:
     warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
+    warnings += doubts(raster, experiment.leaders)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(

@@ -34,6 +34,7 @@ DEFAULT_PARTS = {
 TEMPLATES = {
     "pyproject.toml": "pyproject.toml",
     "README.md": "README.md",
+    "LICENSE": "LICENSE",
     ".gitignore": "gitignore",
     "example.yaml": "example.yaml",
     "{module}.py": "{interface}.py",

@@ -63,7 +63,7 @@ class GatheringFollowers(Followers):
             self._remember(total, here, state, movable)
         for u_here, step, plane in zip(u, move, new.reshape(len(new), -1), strict=True):
             before = plane[self._place]
-            moved = target(u_here, step, before, self._scene.experiment.solver)
+            moved = target(u_here, step, before, self._scene.experiment.stepping)
             plane[self._place[self._body]] = u_here[self._body]
             plane[place] = moved[movable]
 

@@ -103,7 +103,7 @@ def changing(numbers: Sequence[Remembered], values: Sequence[Array]) -> list[Arr
 
 
 def _started(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Values:
-    precision = scene.experiment.solver.precision
+    precision = scene.experiment.stepping.precision
     dtypes = [precision if number.dtype == "f8" else number.dtype for number in numbers]
     return tuple(np.full(shape, n.initial, d) for n, d in zip(numbers, dtypes, strict=True))
 

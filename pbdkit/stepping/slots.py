@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.experiment.solvers import Equilibrium, Stepping
+from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import Here, RenewsParticles, StoresEnergy
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
@@ -23,9 +23,9 @@ Summed = tuple[Surroundings, Contributions, Here]
 class SlotFollowers(Followers):
     """Moves the followers of a scene whose neighbours stay as they are."""
 
-    def __init__(self, scene: Scene, solver: Stepping | Equilibrium | None = None) -> None:
+    def __init__(self, scene: Scene, solver: Stepping | None = None) -> None:
         self._scene = scene
-        self._solver = solver or scene.experiment.solver
+        self._solver = solver or scene.experiment.stepping
         self._rule = scene.experiment.rule
         self._inner = SlotFollowers(scene.inner, Stepping()) if scene.inner else None
         self._numbers = particle_numbers(scene.experiment)

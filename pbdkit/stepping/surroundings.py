@@ -81,7 +81,7 @@ class Surroundings:
         weights, cells = self._scene.constants.weights[slot], self._scene.cells
         if cells is None:
             return weights
-        left, right = cells.beside(slot, self.where, self._scene.experiment.solver.precision)
+        left, right = cells.beside(slot, self.where, self._scene.experiment.stepping.precision)
         return weights._replace(left=left, right=right)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:

@@ -142,7 +142,7 @@ def _roles(steps: Iterable[Step]) -> list[tuple[Step, Role]]:
     return [(_found(known, rest), role) for role, rest in rests.items()]
 
 
-def _families(rests: list[pbdkit.Vector]) -> tuple[pbdkit.Vector, pbdkit.Vector]:
+def _families(rests: list[pbdkit.Components]) -> tuple[pbdkit.Components, pbdkit.Components]:
     """The two shortest that are not in line, of equal ones those of the smallest angle to x."""
     shortest = min(math.hypot(*rest) for rest in rests)
     flat = 1e-6 * shortest
@@ -153,7 +153,7 @@ def _families(rests: list[pbdkit.Vector]) -> tuple[pbdkit.Vector, pbdkit.Vector]
     return one, other
 
 
-def _found(steps: list[Step], rest: pbdkit.Vector) -> Step:
+def _found(steps: list[Step], rest: pbdkit.Components) -> Step:
     for step in steps:
         if pbdkit.length(step.rest - rest) < 1e-6 * pbdkit.length(rest):
             return step

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import StartsCracked
 from pbdkit.interfaces.vector import vector
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.leaders import Led
@@ -94,12 +95,15 @@ def _rests_by_construction(scene: Scene) -> bool:
         block = scene.raster.body_block(s)
         if block and any(there is not None for there in presence(scene.raster, block, slots)):
             return False
-        if any(component != 0.0 for component in evaluator.at_rest(slots)):
-            return False
-        if fracture.can_break and any(
-            evaluator.breaks(still, k.rest, scene.constants.limits[k], ()) for k in slots
-        ):
-            return False
+        with blaming(rule, "when asked whether it rests"):
+            if any(component != 0.0 for component in evaluator.at_rest(slots)):
+                return False
+        with blaming(fracture, "when asked what breaks at rest"):
+            limits = scene.constants.limits
+            if fracture.can_break and any(
+                evaluator.breaks(still, k.rest, limits[k], ()) for k in slots
+            ):
+                return False
     return True
 
 

@@ -92,7 +92,7 @@ class CompiledStepper(Engine):
 
     def _compile(self) -> None:
         """A call of no steps, so that what does not compile is known before the first."""
-        u = np.zeros((2, 1, 1, 1), self._scene.experiment.solver.precision)
+        u = np.zeros((2, 1, 1, 1), self._scene.experiment.stepping.precision)
         broken = np.zeros((1, 1, 1), np.int32) if self._scene.has_fracture else None
         lengths = None if broken is None else np.zeros(broken.shape, u.dtype)
         state = State(0, u, u.copy(), broken, lengths, ())
@@ -101,7 +101,7 @@ class CompiledStepper(Engine):
 
     def _wanted(self) -> Wanted:
         scene = self._scene
-        rule, solver, constants = scene.experiment.rule, scene.experiment.solver, scene.constants
+        rule, solver, constants = scene.experiment.rule, scene.experiment.stepping, scene.constants
         evaluator, one = Evaluator(scene), vector(np.ones(scene.axes))
         parts = evaluator.contribution(
             one, one, evaluator.everywhere(scene.neighbourhood.slots[0])[0]
@@ -131,7 +131,7 @@ class CompiledStepper(Engine):
 
     def _constant_arguments(self) -> dict[str, Any]:
         scene = self._scene
-        solver, constants, frame = scene.experiment.solver, scene.constants, scene.frame
+        solver, constants, frame = scene.experiment.stepping, scene.constants, scene.frame
         slots = scene.neighbourhood.slots
         number = np.dtype(solver.precision)
         width = max((len(c) for c in constants.limits.values()), default=0)
