@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.naming import did_you_mean
-from pbdkit.registry.wording import one_line
+from pbdkit.registry.blame import one_line
 from pbdkit.scene.raster import FRAME
 
 if TYPE_CHECKING:
