@@ -19,8 +19,8 @@ from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
+from pbdkit.results.sinks import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

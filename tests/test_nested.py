@@ -7,8 +7,8 @@ import pytest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 FRAMES = [
     "{type: mean}",

@@ -12,7 +12,7 @@ from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.certificate import scale_of
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
-from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import initial_state

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pbdkit.api import load
 from pbdkit.bench.decay import decay_of, followers_of
 from pbdkit.equilibrium.certificate import Certificate, scale_of
-from pbdkit.equilibrium.finding import UnconvergedError
 from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.scene.scene import Scene, build_scene

@@ -51,7 +51,7 @@ def bench(
     from pbdkit.api import load
     from pbdkit.bench import work_precision
     from pbdkit.bench.measurement import measure
-    from pbdkit.cli.pictures import refuse_unwritable, save
+    from pbdkit.cli.output import refuse_unwritable, save
     from pbdkit.errors import StorageError
 
     refuse_unwritable(picture, json_file)

@@ -23,7 +23,7 @@ def identify(
 ) -> None:
     """Say what the experiment's rule is physically, on its lattice and neighbours."""
     from pbdkit.api import identify, load
-    from pbdkit.cli.pictures import refuse_unwritable, save
+    from pbdkit.cli.output import refuse_unwritable, save
 
     refuse_unwritable(picture)
     found = identify(load(experiment, settings=settings))

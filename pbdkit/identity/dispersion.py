@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.region import Complex, largest_stable_relaxation
+from pbdkit.analysis.spectrum import Complex, largest_stable_relaxation
 from pbdkit.identity.elastic_constants import Elasticity, at_direction
 from pbdkit.identity.waves import Primitive, SlowWaves, operator
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pbdkit.analysis.region import NEUTRAL
+from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.identity.dispersion import Gradient, Range
 from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
 from pbdkit.scene.scene import Scene

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.region import Complex
+from pbdkit.analysis.spectrum import Complex
 from pbdkit.analysis.stencil import Stencil
 from pbdkit.interfaces import Cell
 

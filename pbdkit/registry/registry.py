@@ -8,7 +8,7 @@ from functools import cached_property
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.interfaces import Component
-from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.registry.blame import one_line
 from pbdkit.registry.discovery import (
     ALL,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.registry.blame import one_line
 from pbdkit.scene.raster import FRAME
 

@@ -20,11 +20,11 @@ from pbdkit.interfaces import (
     Remembered,
 )
 from pbdkit.interfaces.values import Drawn
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembering import describe_bonds, describe_particles, generator_for
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.remembered_values import describe_bonds, describe_particles, generator_for
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.stepping.stepper import Stepper
 from pbdkit.testing.property import Arrays, NotAskedError, Question
 
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import BreaksAtStrain, FractureModel, RenewsBonds, Slot
-from pbdkit.scene.remembering import bond_numbers
+from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.calls import breaking, differences, updated, vector
 from pbdkit.testing.properties.elementwise import ORDERLY

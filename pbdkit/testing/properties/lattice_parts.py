@@ -20,13 +20,12 @@ from pbdkit.interfaces import (
     Offset,
 )
 from pbdkit.registry.registry import Registry
-from pbdkit.scene.framing import sites_of_frame
+from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
 from pbdkit.testing.properties.repetition import REPEATABLE
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
-from pbdkit.testing.scenes import LATTICES, alternatives, place_of
 from pbdkit.testing.sight import SeenFrame
-from pbdkit.testing.subject import Subject
+from pbdkit.testing.subject import LATTICES, Subject, alternatives, place_of
 
 
 @asked_of(Lattice)

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.interfaces import Draws, FollowerRule, FractureModel, Remembered
 from pbdkit.results.layout import base_columns, bond_columns, broken_columns
-from pbdkit.scene.remembering import remembered_names
+from pbdkit.scene.declarations import remembered_names
 from pbdkit.testing.properties.measurements import NAME
 from pbdkit.testing.properties.repetition import REPEATABLE
 from pbdkit.testing.property import Arrays, NotAskedError, PropertyError, asked_of

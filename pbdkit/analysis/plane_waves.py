@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pbdkit.analysis.composition import linearised
-from pbdkit.analysis.region import Complex, modes
+from pbdkit.analysis.spectrum import Complex, modes
 from pbdkit.scene.scene import Scene
 
 WAVES = 48

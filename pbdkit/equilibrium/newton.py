@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.equilibrium.certificate import Certificate
+from pbdkit.equilibrium.certificate import Certificate, Moves, owed_by, rounding
 from pbdkit.equilibrium.krylov import product
-from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.scene import Scene
@@ -190,3 +190,21 @@ class _Search:
 def _size(moves: Vectors) -> float:
     with np.errstate(over="ignore"):
         return math.sqrt(product(moves.ravel(), moves.ravel()))
+
+
+Floats = NDArray[np.float64]
+
+
+class LinearSolver(ABC):
+    """Solves A x = b for one matrix, with an unknown a row."""
+
+    name: str
+    iterations = 0
+
+    @abstractmethod
+    def solve(self, b: Floats, accuracy: float) -> Floats:
+        """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
+
+    @abstractmethod
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """The same for Aᵀ."""

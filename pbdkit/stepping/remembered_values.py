@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Bonds, Draws, FollowerRule, FractureModel, Particles, Remembered
-from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.values import Drawn
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 
 Array = NDArray[Any]

@@ -6,7 +6,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leading import Leading
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
 

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.matrices import connected
+from pbdkit.analysis.couplings import connected
 from pbdkit.analysis.operator import step_operator
 from pbdkit.experiment.motions import Oscillation
-from pbdkit.scene.leading import Leading
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 
 Floats = NDArray[np.float64]

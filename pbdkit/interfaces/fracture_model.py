@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.values import Remembers
 
 Segment = tuple[Pair, Pair]

@@ -10,13 +10,13 @@ import numpy as np
 from pbdkit.interfaces import Components, Here, Nearness, RenewsParticles
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
+from pbdkit.scene.declarations import particle_numbers
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
-from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, Neighbour
-from pbdkit.stepping.following import Followers, target
-from pbdkit.stepping.remembering import changing, renew
+from pbdkit.stepping.followers import Followers, target
+from pbdkit.stepping.remembered_values import changing, renew
 from pbdkit.stepping.state import Floats, State
 
 

@@ -1,20 +1,32 @@
-"""One step of the model (model.md, section 5) on whole arrays of numpy."""
+"""The engine interface: what takes a state some steps further."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 
 import numpy as np
 
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.engine import Engine
-from pbdkit.stepping.following import Followers
-from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.gathering import GatheringFollowers
-from pbdkit.stepping.leaders import place, prescribe
-from pbdkit.stepping.slots import SlotFollowers
+from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.followers import Followers, SlotFollowers
+from pbdkit.stepping.moving_neighbours import GatheringFollowers
+from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import Floats, State
+
+
+class Engine(ABC):
+    """Steps the states of one scene. All engines give the same numbers, to the last bit where
+    rules keep to + - × ÷ and square roots."""
+
+    name: str
+    threads: int = 1
+
+    @abstractmethod
+    def advance(self, state: State, steps: int = 1) -> State:
+        """The state so many steps on. It takes over the arrays of `state`, which is void
+        afterwards."""
 
 
 class Stepper(Engine):

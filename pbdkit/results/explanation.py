@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Bonds, BreaksAtStrain
-from pbdkit.interfaces.fracture import breaking_order
+from pbdkit.interfaces.fracture_model import breaking_order
+from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.raster import FRAME
-from pbdkit.scene.remembering import bond_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembering import describe_bonds
+from pbdkit.stepping.remembered_values import describe_bonds
 
 if TYPE_CHECKING:
     import xarray

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.matrices import DENSE
-from pbdkit.equilibrium.deflated import Deflated, Shifted
-from pbdkit.equilibrium.linear import Dense
-from pbdkit.equilibrium.parts import SAFETY, SINGULAR, DriftingError, Part, estimated_norm
-from pbdkit.equilibrium.solving import LinearSolver
+from pbdkit.analysis.couplings import DENSE
+from pbdkit.equilibrium.krylov import Deflated, Shifted
+from pbdkit.equilibrium.linear_solver import Dense
+from pbdkit.equilibrium.newton import LinearSolver
+from pbdkit.equilibrium.system_parts import SAFETY, SINGULAR, DriftingError, Part, estimated_norm
 
 Floats = NDArray[np.float64]
 

@@ -1,19 +1,47 @@
-"""One step after the other."""
+"""What a solver does to a scene: one interface, with two implementations."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Generator
 from typing import TYPE_CHECKING
 
+from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
-from pbdkit.runs.driver import Driver, States
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State
 
 if TYPE_CHECKING:
     from pbdkit.equilibrium.settlement import Settling
+
+States = Generator[State, None, Outcome]
+
+
+class Driver(ABC):
+    """Takes one scene from a state to its end, once.
+
+    `state` is where it stands, `choice` what steps it. `ending` says of a state just given out that
+    it is the last of a run that ends before its last step, to be kept whatever the plan.
+    """
+
+    choice: Choice
+
+    def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
+        self.scene, self.state, self.watch = scene, state, watch
+        self.ending = False
+        self.rejection: FloatingPointError | None = None
+        """Why whoever looked at the last state could not use it; its next move is up to the
+        driver."""
+
+    @abstractmethod
+    def states(self) -> States:
+        """The states on the way, the first included, each valid until the next is asked for; then
+        how it ended. Raises ExperimentError where there is no way."""
+
 
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
@@ -122,3 +150,30 @@ def _settling(scene: Scene, start: State, watch: Watch) -> Settling | None:
     from pbdkit.equilibrium.settlement import Settling  # only where it is asked for
 
     return Settling(scene, asked, start, watch)
+
+
+class Straight(Driver):
+    """The driver of the solver `equilibrium`: gives out the start and the equilibrium."""
+
+    choice = Choice("equilibrium", 1, "asked for")
+
+    def states(self) -> States:
+        """Interrupted, it gives out how far it had come."""
+        state, steps = self.state, self.scene.experiment.steps
+        yield state
+        try:
+            certificate = settle(self.scene, state, self.watch)
+            outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
+        except UnconvergedError as error:
+            found = error.certificate
+            outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+        except StoppedError:
+            self.ending = True
+            yield state
+            reason = f"stopped on the way to equilibrium, after step {state.step}"
+            return Outcome("interrupted", reason, state.step)
+        state.step = steps
+        yield state
+        if self.rejection:
+            return Outcome("unconverged", f"{self.rejection} left all bounds", steps)
+        return outcome

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.derivatives import derivatives
+from pbdkit.analysis.stencil import derivatives
 from pbdkit.interfaces import Components, Slot, Softens
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
