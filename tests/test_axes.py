@@ -8,7 +8,7 @@ import plain_space
 import pytest
 
 import pbdkit
-from pbdkit.experiment.bodies import Body, Box
+from pbdkit.experiment.body import Body, Box
 from pbdkit.experiment.motions import Velocity
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.choice import choose, make_engine

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.bodies import Grid
+from pbdkit.experiment.body import Grid
 from pbdkit.experiment.model import Experiment
 
 

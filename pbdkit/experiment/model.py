@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.experiment.bodies import AnyBody
+from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.parts import brief, fault, located, open_part, report

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from pbdkit.experiment.bodies import Body, Box, Floats, Sites
+from pbdkit.experiment.body import Body, Box, Floats, Sites
 from pbdkit.interfaces import Pair
 
 Positive = Annotated[float, Field(gt=0.0, le=1e100)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.bodies import Body, Sites
+from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index

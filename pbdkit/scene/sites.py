@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.bodies import Body, Box, Floats, Sites
+from pbdkit.experiment.body import Body, Box, Floats, Sites
 from pbdkit.interfaces import Cell, Lattice
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
