@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import DENSE
-from pbdkit.equilibrium.krylov import Krylov
+from pbdkit.equilibrium.krylov import Krylov, LinearSolver
 from pbdkit.equilibrium.multigrid import aggregated, classical
-from pbdkit.equilibrium.newton import LinearSolver
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 

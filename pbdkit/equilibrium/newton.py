@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import replace
 
 import numpy as np
@@ -193,18 +192,3 @@ def _size(moves: Vectors) -> float:
 
 
 Floats = NDArray[np.float64]
-
-
-class LinearSolver(ABC):
-    """Solves A x = b for one matrix, with an unknown a row."""
-
-    name: str
-    iterations = 0
-
-    @abstractmethod
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
-
-    @abstractmethod
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """The same for Aᵀ."""

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.krylov import Krylov
+from pbdkit.equilibrium.krylov import Krylov, LinearSolver
 from pbdkit.equilibrium.linear_solver import Dense, is_symmetric, linear_solver
-from pbdkit.equilibrium.newton import LinearSolver
 from pbdkit.equilibrium.watch import Watch
 
 Floats = NDArray[np.float64]
