@@ -14,8 +14,8 @@ from pbdkit.stepping import choice
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.compiled.functions import source_key
 from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 TORN = {
     "type": "threshold",

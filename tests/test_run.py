@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.pace import Pace
+from pbdkit.equilibrium.settlement import Pace
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Equilibrium, Solver
-from pbdkit.results.memory import MemorySink
+from pbdkit.results.sinks import MemorySink
 from pbdkit.runs.course import DRIVERS, Run, record
-from pbdkit.runs.stepwise import Stepwise
+from pbdkit.runs.drivers import Stepwise
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State

@@ -11,10 +11,10 @@ from scipy import sparse
 
 import pbdkit
 from pbdkit.analysis import linearising
-from pbdkit.analysis.derivatives import derivative, derivatives
 from pbdkit.analysis.operator import step_operator
+from pbdkit.analysis.stencil import derivative, derivatives
 from pbdkit.equilibrium import linear
-from pbdkit.equilibrium.dissection import FEWEST, dissected
+from pbdkit.equilibrium.linear_solver import FEWEST, dissected
 from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state

@@ -16,7 +16,7 @@ from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.stepping.leaders import Led
+from pbdkit.stepping.prescription import Led
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.surroundings import presence
 

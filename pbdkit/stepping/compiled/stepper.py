@@ -18,9 +18,9 @@ from pbdkit.stepping.compiled.kernels import load_kernel
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.source import write_kernel
 from pbdkit.stepping.compiled.wanted import Wanted
-from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.stepping.leaders import prescribe, steady_steps
+from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.prescription import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
 
 
