@@ -68,9 +68,8 @@ def draw(
     look = _look(dataset, snapshots, numbers)
     axes = _canvas(1, look) if ax is None else [ax]
     _paint(axes[0], dataset, snapshots[0], look)
-    axes[0].set_title(
-        f"{plain(dataset.attrs.get('title', ''))}, step {snapshots[0].step}".lstrip(", ")
-    )
+    title = f"{plain(dataset.attrs.get('title', ''))}, step {snapshots[0].step}"
+    axes[0].set_title(title.lstrip(", "))
     _explain(axes, dataset, look, color, contours)
     return axes[0]
 
