@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import linear
+from pbdkit.equilibrium import linear_solver as linear
 from pbdkit.equilibrium.krylov import conjugate_gradients
 from pbdkit.equilibrium.linear_solver import linear_solver
 from pbdkit.equilibrium.watch import StoppedError, Watch
