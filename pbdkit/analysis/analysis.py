@@ -230,10 +230,8 @@ class Analysis:
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"
             )
         elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
-            words = (
-                "a mode that changes its sign in every step never decays; take a relaxation below 1"
-            )
-            found.append(f"solver.relaxation: {words}")
+            what = "a mode that changes its sign in every step never decays"
+            found.append(f"solver.relaxation: {what}; take a relaxation below 1")
         return found + self._late() + self.left_out
 
     def _late(self) -> list[str]:
