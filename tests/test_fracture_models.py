@@ -7,7 +7,7 @@ from property_cases import pull_right
 import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.choice import choose
-from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.state import initial_state
 from pbdkit.stepping.stepper import Stepper
 

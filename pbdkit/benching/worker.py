@@ -78,7 +78,7 @@ def _do_equilibrium(job: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def _import_engine(experiment: Experiment) -> None:
     if experiment.solver.engine == "compiled":
-        import_module("pbdkit.stepping.compiled.stepper")
+        import_module("pbdkit.stepping.compiled.compiled_stepper")
 
 
 def _first_run(scene: Scene, engine: Engine, folder: Path) -> float:

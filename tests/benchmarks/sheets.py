@@ -9,7 +9,7 @@ import numpy as np
 import pbdkit
 from pbdkit.experiment.source import Source
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.state import initial_state
 
 

@@ -1,0 +1,130 @@
+"""Writes the source of a scene's kernel: the sweeps that move particles, and the loop over steps.
+
+Row by row the shortest code is run that serves: rest offsets and steps to neighbours are literals
+where all neighbours are there. What varies from run to run (the rule's parameters, thresholds,
+places) are arguments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
+from pbdkit.stepping.compiled.plan import Function, Level, Plan
+from pbdkit.stepping.compiled.rows import GENERAL, plain, write_row
+from pbdkit.stepping.compiled.slot_loop import write_general
+
+
+def write_kernel(plan: Plan) -> tuple[str, list[str]]:
+    """The source of a module with ``run(given, step, count, chunks)``, which takes the scene
+    `count` steps further, and the names of the arrays that it is given."""
+    events = write_events(plan) if plan.judged else None
+    passes = [write_bond_pass(plan)] if plan.bonds_first else []
+    functions = [*passes, *([events] if events else [])]
+    for level in plan.levels:
+        rows = _rows(plan, level, events)
+        passes.append(_sweep(plan, level, rows))
+        functions += [*rows.values(), passes[-1]]
+    run = Function(plan.shared, "run")
+    _write_run(run, plan, passes)
+    used = [name for name in run.used if name != "step"]
+    head = [
+        f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)',
+        "def run(given, step, count, chunks):",
+        f"    {', '.join(used)}, = given",
+    ]
+    lines = [*write_tuples(plan), *(line for f in functions for line in f.source), "", "", *head]
+    lines += ["    " + line for line in run.lines]
+    return "\n".join(lines) + "\n", used
+
+
+def write_tuples(plan: Plan) -> list[str]:
+    """The named tuples that elementwise functions are called with."""
+    seen = plan.levels[-1].seen
+    names = {"Fracture": seen.fracture, "Constants": seen.bond}
+    for level in plan.levels:
+        n, own = level.number, level.seen
+        names |= {f"Rule{n}": own.rule, f"Weights{n}": own.weights, f"Own{n}": own.own}
+    found = ['"""Made by pbdkit for one kind of scene; not to be edited."""', ""]
+    if plan.scene.axes == 3:
+        found.append("Vector = SpaceVector")
+    for kind, numbers in names.items():
+        found.append(f'{kind} = namedtuple("{kind}", {[number.name for number in numbers]!r})')
+    return found
+
+
+def _rows(plan: Plan, level: Level, events: Function | None) -> dict[int, Function]:
+    """The functions for the kinds of rows that occur."""
+    found = {}
+    if GENERAL in plan.kinds:
+        found[GENERAL] = write_general(plan, level, events)
+    for s in range(len(plan.scene.neighbourhood.slots)):
+        for cells in (False, True):
+            if plain(s, cells) in plan.kinds:
+                found[plain(s, cells)] = write_row(plan, level, s, cells, events)
+    return found
+
+
+def _sweep(plan: Plan, level: Level, rows: dict[int, Function]) -> Function:
+    """The function that moves the particles of some rows as far as motion has come."""
+    out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
+    axes = len(plan.axes)
+    out.add(0, "for s in range(len(starts)):")
+    out.add(1, "for n in range(starts[s, first_row], starts[s, last_row]):")
+    for a, name in enumerate(plan.lead):
+        out.add(2, f"{name} = runs[n, {a}]")
+        if a:
+            out.add(2, f"if {name} < box[{2 * a}] or {name} >= box[{2 * a + 1}]:", "    continue")
+    out.add(2, f"j0 = max(runs[n, {axes - 1}], box[{2 * axes - 2}])")
+    out.add(2, f"j1 = min(runs[n, {axes}], box[{2 * axes - 1}])", "if j0 >= j1:", "    continue")
+    for n, (kind, row) in enumerate(rows.items()):
+        out.add(2, f"{'elif' if n else 'if'} runs[n, {axes + 1}] == {kind}:")
+        sublattice = ["s"] if kind == GENERAL else []
+        out.add(3, row.call(*sublattice, *plan.lead, "j0", "j1"))
+    if not rows:
+        out.add(2, "continue")
+    return out
+
+
+def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
+    flat = [(f"f{side}_{c}", f"{side}_{c}") for side in "uv" for c in plan.axes]
+    out.add(0, "for _ in range(count):")
+    out.add(1, "step += 1", *(f"{name} = {plane}.reshape(-1)" for name, plane in flat))
+    out.add(1, "for e in range(led.size):")
+    out.add(2, *(f"led_kept[{a}, e] = fu_{c}[led[e]]" for a, c in enumerate(plan.axes)))
+    out.add(1, "for e in range(led.size):")
+    out.add(2, *(f"fu_{c}[led[e]] = led_values[{a}, e]" for a, c in enumerate(plan.axes)))
+    out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
+    out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
+    for one in passes:
+        if plan.parallel:
+            out.add(1, "for c in prange(chunks):")
+            span = ", ".join(f"i0 + (i1 - i0) * {c} // chunks" for c in ("c", "(c + 1)"))
+            out.add(2, one.call(span))
+        else:
+            out.add(1, one.call("i0", "i1"))
+    out.add(1, "for e in range(led.size):")
+    out.add(2, *(f"fv_{c}[led[e]] = led_values[{a}, e]" for a, c in enumerate(plan.axes)))
+    out.add(1, "for e in range(led.size):")
+    out.add(2, *(f"fu_{c}[led[e]] = led_kept[{a}, e]" for a, c in enumerate(plan.axes)))
+    if plan.scene.frame:
+        _write_frame(out, plan)
+    u, v = plan.planes("u"), plan.planes("v")
+    out.add(1, f"{u}, {v} = {v}, {u}")
+
+
+def _write_frame(out: Function, plan: Plan) -> None:
+    assert plan.scene.frame
+    source = "fu" if plan.scene.frame.map.lag else "fv"
+    out.add(1, "for f in range(points.size):")
+    out.add(2, *(f"t_{c} = {plan.number(0.0)}" for c in plan.axes))
+    out.add(2, "for e in range(entries[f], entries[f + 1]):")
+    for a, c in enumerate(plan.axes):
+        if plan.scene.frame.map.weight.ndim == 3:
+            terms = [
+                f"mapped[e, {a}, {b}] * {source}_{d}[bodies[e]]" for b, d in enumerate(plan.axes)
+            ]
+            out.add(3, f"t_{c} = t_{c} + ({' + '.join(terms)})")
+        else:
+            out.add(3, f"t_{c} = t_{c} + mapped[e] * {source}_{c}[bodies[e]]")
+    out.add(2, *(f"fv_{c}[points[f]] = t_{c}" for c in plan.axes))
