@@ -92,16 +92,21 @@ class CellElastic(Calibrated, FollowerRule):
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Vector:
         """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
-        pull, xx, xy, yy = total
-        det = xx * yy - xy * xy
-        some = det > 0.0
-        move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
-        return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
+        return mean_move(total)
 
     @staticmethod
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · Σ W d."""
         return p.modulus * total[0]
+
+
+def mean_move(total: Any) -> Vector:
+    """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
+    pull, xx, xy, yy = total
+    det = xx * yy - xy * xy
+    some = det > 0.0
+    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
+    return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
 
 
 class IsotropicElastic(CellElastic):

@@ -34,22 +34,22 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(depth, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
     out.add(depth, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(len(bonds))))
     c = values(seen.bond, {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]"})
-    can = f"(one[j] == {FOLLOWER} and other[j] == {FOLLOWER})"
+    can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
     if model.breaks_frame_bonds():
         can = (
-            f"(one[j] == {FOLLOWER} and other[j] != {EMPTY} or "
-            f"one[j] != {EMPTY} and other[j] == {FOLLOWER})"
+            f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
+            f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
     d = f"d = {plan.vector(f'n{c}[j] - h{c}[j]' for c in plan.axes)}"
     # One loop that vectorises, and another where something breaks: rare.
     out.add(depth, "some = 0", "for j in range(j1 - j0):")
-    out.add(depth + 1, d, f"intact = since[j] < 0 and {can}")
+    out.add(depth + 1, d, f"intact = (since[j] < 0) & {can}")
     if isinstance(model, RenewsBonds):
         out.add(depth + 1, f"new = update(d, r, Constants({c}), q)")
         changing = [m for m, number in enumerate(bonds) if number.changes]
         for position, m in enumerate(changing):
             out.add(depth + 1, f"b{m}[j] = new[{position}] if intact else b{m}[j]")
-    out.add(depth + 1, f"some = some | (1 if intact and breaks(d, r, Constants({c}), q) else 0)")
+    out.add(depth + 1, f"some = some | (1 if breaks(d, r, Constants({c}), q) & intact else 0)")
     out.add(depth, "if some:")
     out.add(depth + 1, "for j in range(j1 - j0):")
     out.add(depth + 2, d, f"if since[j] < 0 and {can} and breaks(d, r, Constants({c}), q):")
@@ -63,8 +63,8 @@ def write_events(plan: Plan) -> Function:
     out = Function(plan.shared, "note_broken", "s", *plan.lead, "j0", "j1")
     axes = range(len(plan.axes))
     step = [f"steps[s, k, {a + 1}]" for a in axes]
-    here, there = plan.place("s"), plan.place("steps[s, k, 0]", step)
-    home = plan.place("homes[s, k, 0]", [f"homes[s, k, {a + 1}]" for a in axes])
+    here, there = plan.place("s", None, "j"), plan.place("steps[s, k, 0]", step, "j")
+    home = plan.place("homes[s, k, 0]", [f"homes[s, k, {a + 1}]" for a in axes], "j")
     out.add(0, "for j in range(j0, j1):")
     out.add(1, f"bits = int64(lost[{here}])", "for k in range(counts[s]):")
     # The home end notes it, or this end where that is no particle of the body.

@@ -45,9 +45,9 @@ class CompiledStepper(Engine):
         self._reach = Reach(scene)
         self._last: State | None = None
         levels = levels_of(scene)
-        plan = Plan(scene, levels, frozenset(), self.threads > 1)
-        runs, starts = find_runs(scene, plan.long)
-        self._plan = plan = replace(plan, kinds=frozenset(np.unique(runs[:, -1]).tolist()))
+        plan = Plan(scene, levels, (), self.threads > 1)
+        runs, starts, rows = find_runs(scene, plan.long)
+        self._plan = plan = replace(plan, rows=rows)
         self._arrays = constant_arrays(scene, levels) | {"runs": runs, "starts": starts}
         for level in levels[:-1]:
             moves = np.zeros((scene.axes, *scene.raster.shape), scene.experiment.solver.precision)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
-from pbdkit.stepping.compiled.rows import GENERAL, plain, write_row
+from pbdkit.stepping.compiled.rows import GENERAL, write_row
 from pbdkit.stepping.compiled.slot_loop import write_general
 
 
@@ -24,7 +24,7 @@ def write_kernel(plan: Plan) -> tuple[str, list[str]]:
     for level in plan.levels:
         rows = _rows(plan, level, events)
         passes.append(_sweep(plan, level, rows))
-        functions += [*rows.values(), passes[-1]]
+        functions += [*dict.fromkeys(rows.values()), passes[-1]]
     run = Function(plan.shared, "run")
     _write_run(run, plan, passes)
     used = [name for name in run.used if name != "step"]
@@ -53,36 +53,23 @@ def write_tuples(plan: Plan) -> list[str]:
     return found
 
 
-def _rows(plan: Plan, level: Level, events: Function | None) -> dict[int, Function]:
-    """The functions for the kinds of rows that occur."""
-    found = {}
-    if GENERAL in plan.kinds:
-        found[GENERAL] = write_general(plan, level, events)
-    for s in range(len(plan.scene.neighbourhood.slots)):
-        for cells in (False, True):
-            if plain(s, cells) in plan.kinds:
-                found[plain(s, cells)] = write_row(plan, level, s, cells, events)
+def _rows(plan: Plan, level: Level, events: Function | None) -> dict[tuple[int, int], Function]:
+    """The functions for the rows that occur, by sublattice and kind."""
+    found, general = {}, None
+    for s, kind in plan.rows:
+        if kind == GENERAL:
+            found[s, kind] = general = general or write_general(plan, level, events)
+        else:
+            found[s, kind] = write_row(plan, level, s, kind, events)
     return found
 
 
-def _sweep(plan: Plan, level: Level, rows: dict[int, Function]) -> Function:
-    """The function that moves the particles of some rows as far as motion has come."""
+def _sweep(plan: Plan, level: Level, rows: dict[tuple[int, int], Function]) -> Function:
+    """The function that moves the particles of some rows."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
-    axes = len(plan.axes)
-    out.add(0, "for s in range(len(starts)):")
-    out.add(1, "for n in range(starts[s, first_row], starts[s, last_row]):")
-    for a, name in enumerate(plan.lead):
-        out.add(2, f"{name} = runs[n, {a}]")
-        if a:
-            out.add(2, f"if {name} < box[{2 * a}] or {name} >= box[{2 * a + 1}]:", "    continue")
-    out.add(2, f"j0 = max(runs[n, {axes - 1}], box[{2 * axes - 2}])")
-    out.add(2, f"j1 = min(runs[n, {axes}], box[{2 * axes - 1}])", "if j0 >= j1:", "    continue")
-    for n, (kind, row) in enumerate(rows.items()):
-        out.add(2, f"{'elif' if n else 'if'} runs[n, {axes + 1}] == {kind}:")
-        sublattice = ["s"] if kind == GENERAL else []
-        out.add(3, row.call(*sublattice, *plan.lead, "j0", "j1"))
-    if not rows:
-        out.add(2, "continue")
+    for n, ((s, kind), row) in enumerate(rows.items()):
+        runs = [f"starts[{n}, first_row]", f"starts[{n}, last_row]"]
+        out.add(0, row.call(*([str(s)] if kind == GENERAL else []), *runs))
     return out
 
 

@@ -33,7 +33,7 @@ class PairFollowers(Followers):
         raster, self._axes = scene.raster, scene.axes
         everybody = np.arange(raster.count)
         (level,) = levels_of(scene)
-        self._plan = Plan(scene, (level,), frozenset(), threads > 1)
+        self._plan = Plan(scene, (level,), (), threads > 1)
         self._arrays = rule_arrays(scene, [level]) | {
             "place": raster.place_of(everybody),
             "body": raster.body_rows,

@@ -19,6 +19,19 @@ def named_tuples(plan: Plan, level: Level) -> list[str]:
     return lines
 
 
+def row_head(plan: Plan) -> list[str]:
+    """The loop over some runs, as far as motion has come."""
+    lines, last = ["for n in range(first_run, last_run):"], len(plan.axes) - 1
+    for a, name in enumerate(plan.lead):
+        lines.append(f"    {name} = runs[n, {a}]")
+        if a:
+            lines.append(f"    if {name} < box[{2 * a}] or {name} >= box[{2 * a + 1}]:")
+            lines.append("        continue")
+    lines.append(f"    j0 = max(runs[n, {last}], box[{2 * last}])")
+    lines.append(f"    j1 = min(runs[n, {last + 1}], box[{2 * last + 1}])")
+    return [*lines, "    if j0 >= j1:", "        continue"]
+
+
 def here_rows(plan: Plan, level: Level, s: str) -> list[str]:
     """The rows of what stands at the particles themselves, and of where their moves go."""
     lines = []

@@ -48,11 +48,12 @@ class Level:
 
 @dataclass(frozen=True)
 class Plan:
-    """A scene's levels, the kinds of rows that occur, and on how many threads it is stepped."""
+    """A scene's levels, the (sublattice, kind) of the rows that occur, and whether it is stepped on
+    several threads."""
 
     scene: Scene
     levels: tuple[Level, ...]
-    kinds: frozenset[int]
+    rows: tuple[tuple[int, int], ...]
     parallel: bool
 
     @cached_property
@@ -130,10 +131,10 @@ class Plan:
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"
 
-    def place(self, first: object, step: Sequence[object] | None = None) -> str:
-        """The index of one place, or of that a step of cells away."""
+    def place(self, first: object, step: Sequence[object] | None = None, j: str = "j0 + j") -> str:
+        """The index of the j-th place of a row, or of that a step of cells away."""
         step = step or [0] * self.scene.axes
-        at = [_sum(name, m) for name, m in zip((*self.lead, "j"), step, strict=True)]
+        at = [_sum(name, m) for name, m in zip((*self.lead, j), step, strict=True)]
         return ", ".join([str(first), *at])
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pbdkit.scene.raster import FOLLOWER, Block
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.rows import GENERAL, NOBODY, plain
+from pbdkit.stepping.compiled.rows import GENERAL, NOBODY, PLAIN, WITH_CELLS
 from pbdkit.stepping.evaluator import presence
 
 SHORT = 4
@@ -17,28 +17,28 @@ SHORT = 4
 Ints = NDArray[np.integer[Any]]
 
 
-def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints]:
-    """(run, (leading cells of the row, begin, end, kind)), sorted by sublattice and row, and
-    (sublattice, row): the first run of each row of the first axis, with one row more at the end."""
-    found = []
-    sublattices, rows, *_ = scene.raster.shape
-    starts = np.zeros((sublattices, rows + 1), np.int64)
-    total = 0
-    for s in range(sublattices):
+def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[int, int], ...]]:
+    """(run, (leading cells of its row, begin, end)), sorted by sublattice, kind and row; (group,
+    row): the first run of each row of the first axis, with one row more at the end; and sublattice
+    and kind of each group."""
+    found, starts, groups, total = [], [], [], 0
+    rows = np.arange(scene.raster.shape[1] + 1)
+    for s in range(scene.raster.shape[0]):
         if block := scene.raster.body_block(s):
-            kinds = _kinds(scene, block, all_general)
-            own = _runs_of(kinds, plain(s, False)) + [*block.start, block.start[-1], 0]
-            found.append(own)
-            starts[s] = total + np.searchsorted(own[:, 0], np.arange(rows + 1))
-            total += len(own)
-    axes = scene.axes
-    return np.concatenate([*found, np.empty((0, axes + 2), np.int64)]), starts
+            runs = _runs_of(_kinds(scene, block, all_general))
+            runs[:, :-1] += [*block.start, block.start[-1]]
+            for kind in np.unique(runs[:, -1]).tolist():
+                own = runs[runs[:, -1] == kind, :-1]
+                found.append(own)
+                starts.append(total + np.searchsorted(own[:, 0], rows))
+                groups.append((s, kind))
+                total += len(own)
+    return np.concatenate(found), np.stack(starts), tuple(groups)
 
 
 def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
     """The kind of row that serves each place of a block."""
-    raster, s = scene.raster, block.sublattice
-    slots = scene.neighbourhood.slots[s]
+    raster, slots = scene.raster, scene.neighbourhood.slots[block.sublattice]
     follows = block.of(raster.kind) == FOLLOWER
     kinds = np.where(follows, GENERAL, NOBODY)
     fits = follows & (not all_general)
@@ -47,21 +47,21 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
     if scene.has_fracture and not scene.experiment.fracture.breaks_frame_bonds():
         for slot in slots:
             fits &= block.seen_through(slot).of(raster.kind) == FOLLOWER
-    kinds[fits] = plain(s, False)
+    kinds[fits] = PLAIN
     if scene.cells:
         precision = scene.experiment.solver.precision
         for slot in slots:
             for share in scene.cells.beside(slot, block, precision):
-                kinds[fits & (share != 1.0)] = plain(s, True)
+                kinds[fits & (share != 1.0)] = WITH_CELLS
     return kinds
 
 
-def _runs_of(kinds: Ints, whole: int) -> Ints:
+def _runs_of(kinds: Ints) -> Ints:
     """The stretches of one kind, in each row along the last axis."""
     closed = np.full((*kinds.shape[:-1], kinds.shape[-1] + 1), NOBODY)
     closed[..., :-1] = kinds
     flat = closed.ravel()
-    for these, beside in (([whole], whole + 1), ([whole, whole + 1], GENERAL)):
+    for these, beside in (([PLAIN], WITH_CELLS), ([PLAIN, WITH_CELLS], GENERAL)):
         begin, end, kind = _stretches(flat)
         touches = np.zeros(len(kind), bool)
         touches[1:] |= kind[:-1] == beside
