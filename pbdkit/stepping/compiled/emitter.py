@@ -68,8 +68,9 @@ def _sweep(plan: Plan, level: Level, rows: dict[tuple[int, int], Function]) -> F
     """The function that moves the particles of some rows."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
     for n, ((s, kind), row) in enumerate(rows.items()):
-        runs = [f"starts[{n}, first_row]", f"starts[{n}, last_row]"]
-        out.add(0, row.call(*([str(s)] if kind == GENERAL else []), *runs))
+        runs = [f"starts[{n}, first_row, 0]", f"starts[{n}, last_row, 1]"]
+        sublattice = [str(s)] if kind == GENERAL else []
+        out.add(0, row.call(*sublattice, *runs, "first_row", "last_row"))
     return out
 
 

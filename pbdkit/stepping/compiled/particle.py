@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pbdkit.scene.homes import Home
-from pbdkit.stepping.compiled.plan import Level, Plan, values
+from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
 
 
 def named_tuples(plan: Plan, level: Level) -> list[str]:
@@ -19,17 +19,23 @@ def named_tuples(plan: Plan, level: Level) -> list[str]:
     return lines
 
 
-def row_head(plan: Plan) -> list[str]:
-    """The loop over some runs, as far as motion has come."""
-    lines, last = ["for n in range(first_run, last_run):"], len(plan.axes) - 1
-    for a, name in enumerate(plan.lead):
-        lines.append(f"    {name} = runs[n, {a}]")
-        if a:
-            lines.append(f"    if {name} < box[{2 * a}] or {name} >= box[{2 * a + 1}]:")
-            lines.append("        continue")
-    lines.append(f"    j0 = max(runs[n, {last}], box[{2 * last}])")
-    lines.append(f"    j1 = min(runs[n, {last + 1}], box[{2 * last + 1}])")
-    return [*lines, "    if j0 >= j1:", "        continue"]
+RUNS = ("first_run", "last_run", "first_row", "last_row")
+"""What functions of rows are given: some runs, and the rows of the first axis to keep to."""
+
+
+def write_row_loop(out: Function, plan: Plan) -> None:
+    """The loop over the rows of some runs, as far as motion has come; what comes after stands in
+    it."""
+    out.add(0, "for n in range(first_run, last_run):")
+    *lead, name = plan.lead
+    for a, outer in enumerate(lead):
+        out.add(1, f"{outer} = runs[n, {a}]")
+    a = len(lead)
+    out.add(1, f"j0 = max(runs[n, {a + 2}], box[{2 * a + 2}])")
+    out.add(1, f"j1 = min(runs[n, {a + 3}], box[{2 * a + 3}])", "if j0 >= j1:", "    continue")
+    low, high = (f"box[{2 * a}]", f"box[{2 * a + 1}]") if a else ("first_row", "last_row")
+    out.add(1, f"for {name} in range(max(runs[n, {a}], {low}), min(runs[n, {a + 1}], {high})):")
+    out.depth += 2
 
 
 def here_rows(plan: Plan, level: Level, s: str) -> list[str]:

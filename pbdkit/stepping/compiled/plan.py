@@ -161,11 +161,12 @@ class Function:
 
     def __init__(self, shared: Sequence[str], name: str, *own: str) -> None:
         self.shared, self.name, self.own = shared, name, own
+        self.depth = 0
         self.lines: list[str] = []
 
     def add(self, depth: int, *lines: str) -> None:
-        """Adds lines at a depth of indentation."""
-        self.lines += ["    " * depth + line for line in lines]
+        """Adds lines at a depth of indentation, counted from `self.depth`."""
+        self.lines += ["    " * (self.depth + depth) + line for line in lines]
 
     @property
     def used(self) -> list[str]:

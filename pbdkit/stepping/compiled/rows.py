@@ -7,13 +7,14 @@ from pbdkit.interfaces import Slot
 from pbdkit.scene.cells import Side
 from pbdkit.scene.homes import Home
 from pbdkit.stepping.compiled.particle import (
+    RUNS,
     contributions,
     here_rows,
     local_places,
     lost_lines,
     named_tuples,
-    row_head,
     target_lines,
+    write_row_loop,
 )
 from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
 
@@ -27,33 +28,34 @@ def write_row(
 ) -> Function:
     """The function that moves the particles of such a row."""
     name, with_cells = f"row{level.number}_{s}_{kind}", kind == WITH_CELLS
-    out = Function(plan.shared, name, "first_run", "last_run")
+    out = Function(plan.shared, name, *RUNS)
     slots = plan.scene.neighbourhood.slots[s]
-    out.add(0, *named_tuples(plan, level), *row_head(plan))
-    out.add(1, *here_rows(plan, level, str(s)))
+    out.add(0, *named_tuples(plan, level))
+    write_row_loop(out, plan)
+    out.add(0, *here_rows(plan, level, str(s)))
     source = _source(level)
     for k, slot in enumerate(slots):
         for c in plan.axes:
-            out.add(1, f"n{k}{c} = {plan.row(f'{source}_{c}', slot.target, slot.cell)}")
-        out.add(1, *_bond_rows(plan, k, slot))
+            out.add(0, f"n{k}{c} = {plan.row(f'{source}_{c}', slot.target, slot.cell)}")
+        out.add(0, *_bond_rows(plan, k, slot))
     if with_cells:
-        out.add(1, *_share_rows(plan, s))
+        out.add(0, *_share_rows(plan, s))
     if plan.judged:
-        out.add(1, f"gone = {plan.row('lost', s)}", "changed = 0")
-    out.add(1, "for j in range(j1 - j0):")
-    out.add(2, f"u = {plan.vector(f'h{c}[j]' for c in plan.axes)}")
+        out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
+    out.add(0, "for j in range(j1 - j0):")
+    out.add(1, f"u = {plan.vector(f'h{c}[j]' for c in plan.axes)}")
     if level.number:
-        out.add(2, f"z = {plan.vector(f'z{c}[j]' for c in plan.axes)}")
+        out.add(1, f"z = {plan.vector(f'z{c}[j]' for c in plan.axes)}")
     if plan.judged:
-        out.add(2, "bits = int64(gone[j])", "now = bits")
+        out.add(1, "bits = int64(gone[j])", "now = bits")
     for k, slot in enumerate(slots):
         _write_slot(out, plan, level, k, slot, with_cells)
     totals = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(2, *target_lines(plan, level, local_places(plan, str(s)), totals))
+    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), totals))
     if events:
-        out.add(2, "changed = changed | (now ^ bits)", "gone[j] = now")
-        out.add(1, "if changed:")
-        out.add(2, events.call(str(s), *plan.lead, "j0", "j1"))
+        out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
+        out.add(0, "if changed:")
+        out.add(1, events.call(str(s), *plan.lead, "j0", "j1"))
     return out
 
 
@@ -63,7 +65,7 @@ def _write_slot(
     """The contributions of one neighbour."""
     r = plan.vector(map(plan.number, slot.rest))
     here = "z" if level.number else "u"
-    out.add(2, f"d = {plan.vector(f'n{k}{c}[j] - {here}.{c}' for c in plan.axes)}")
+    out.add(1, f"d = {plan.vector(f'n{k}{c}[j] - {here}.{c}' for c in plan.axes)}")
     if plan.model is not None:
         _, at_home = plan.scene.neighbourhood.home[slot]
         bond = {Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]", Home.BOND: f"b{k}_{{n}}[j]"}
@@ -72,12 +74,12 @@ def _write_slot(
             # A bond is judged as its home end sees it, so that both ends agree to the last bit.
             seen, sign = ("d", 1.0) if at_home else ("-d", -1.0)
             rest = plan.vector(plan.number(sign * value) for value in slot.rest)
-            out.add(2, f"breaks_now = 1 if breaks({seen}, {rest}, {c}, q) else 0")
-            out.add(2, f"is_lost = ((bits >> {k}) & 1) | breaks_now")
-            out.add(2, f"now = now | (is_lost << {k})")
+            out.add(1, f"breaks_now = 1 if breaks({seen}, {rest}, {c}, q) else 0")
+            out.add(1, f"is_lost = ((bits >> {k}) & 1) | breaks_now")
+            out.add(1, f"now = now | (is_lost << {k})")
         else:
-            out.add(2, f"is_lost = f{k}[j] >= 0")
-        out.add(2, *lost_lines(plan, r, c))
+            out.add(1, f"is_lost = f{k}[j] >= 0")
+        out.add(1, *lost_lines(plan, r, c))
     literal = [plan.number(value) for value in level.scene.constants.weights[slot]]
     if with_cells:
         left, right = (f"{_share_name(plan, slot, side)}[j]" for side in _beside(plan, slot))
@@ -86,9 +88,9 @@ def _write_slot(
             for name, text in zip(level.seen.weights, literal, strict=True)
         ]
     w = f"Weights{level.number}({values(level.seen.weights, {}, literal)})"
-    out.add(2, f"{contributions(level)}, = gather{level.number}(d, {r}, {w}, p)")
+    out.add(1, f"{contributions(level)}, = gather{level.number}(d, {r}, {w}, p)")
     for n in range(sum(level.parts)):
-        out.add(2, f"t{n} = c{n}" if k == 0 else f"t{n} = t{n} + c{n}")
+        out.add(1, f"t{n} = c{n}" if k == 0 else f"t{n} = t{n} + c{n}")
 
 
 def _source(level: Level) -> str:

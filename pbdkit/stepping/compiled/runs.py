@@ -18,22 +18,42 @@ Ints = NDArray[np.integer[Any]]
 
 
 def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[int, int], ...]]:
-    """(run, (leading cells of its row, begin, end)), sorted by sublattice, kind and row; (group,
-    row): the first run of each row of the first axis, with one row more at the end; and sublattice
-    and kind of each group."""
+    """(run, (leading cells, first row, last row + 1, begin, end)): stretches of one kind that rows
+    beside each other share, sorted by sublattice and kind, then as they lie; (group, row, 2): the
+    first run that reaches a row of the first axis, and the first that begins there or later; and
+    the sublattice and kind of each group."""
     found, starts, groups, total = [], [], [], 0
     rows = np.arange(scene.raster.shape[1] + 1)
     for s in range(scene.raster.shape[0]):
         if block := scene.raster.body_block(s):
-            runs = _runs_of(_kinds(scene, block, all_general))
-            runs[:, :-1] += [*block.start, block.start[-1]]
-            for kind in np.unique(runs[:, -1]).tolist():
-                own = runs[runs[:, -1] == kind, :-1]
+            lines = _lines_of(_kinds(scene, block, all_general))
+            lines[:, :-1] += [*block.start, block.start[-1]]
+            for kind in np.unique(lines[:, -1]).tolist():
+                own = _joined(lines[lines[:, -1] == kind, :-1])
+                last = own[:, 1] if scene.axes == 2 else own[:, 0] + 1
+                reach = np.searchsorted(np.maximum.accumulate(last), rows, side="right")
+                begin = np.searchsorted(own[:, 0], rows)
+                starts.append(total + np.stack([reach, begin], axis=1))
                 found.append(own)
-                starts.append(total + np.searchsorted(own[:, 0], rows))
                 groups.append((s, kind))
                 total += len(own)
     return np.concatenate(found), np.stack(starts), tuple(groups)
+
+
+def _joined(lines: Ints) -> Ints:
+    """Stretches at one place of rows that follow each other, as one."""
+    *lead, row, begin, end = lines.T
+    order = np.lexsort((row, end, begin, *reversed(lead)))
+    *lead, row, begin, end = lines[order].T
+    goes_on = np.ones(len(row) - 1, bool)
+    for places in (*lead, begin, end):
+        goes_on &= np.diff(places) == 0
+    goes_on &= np.diff(row) == 1
+    first = np.flatnonzero(np.concatenate([[True], ~goes_on]))
+    last = np.append(first[1:], len(row)) - 1
+    runs = np.stack([*(n[first] for n in lead), row[first], row[last] + 1, begin[first],
+                     end[first]], axis=1)  # fmt: skip
+    return runs[np.lexsort(tuple(runs.T[::-1]))]
 
 
 def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
@@ -56,7 +76,7 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
     return kinds
 
 
-def _runs_of(kinds: Ints) -> Ints:
+def _lines_of(kinds: Ints) -> Ints:
     """The stretches of one kind, in each row along the last axis."""
     closed = np.full((*kinds.shape[:-1], kinds.shape[-1] + 1), NOBODY)
     closed[..., :-1] = kinds
@@ -70,8 +90,8 @@ def _runs_of(kinds: Ints) -> Ints:
         flat = np.repeat(np.where(short, beside, kind), end - begin)
     begin, end, kind = _stretches(flat)
     *lead, first = np.unravel_index(begin, closed.shape)
-    runs = np.stack([*lead, first, first + end - begin, kind], axis=1)
-    return runs[kind != NOBODY].astype(np.int64)
+    lines = np.stack([*lead, first, first + end - begin, kind], axis=1)
+    return lines[kind != NOBODY].astype(np.int64)
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:

@@ -13,55 +13,57 @@ from collections.abc import Sequence
 from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
 from pbdkit.stepping.compiled.particle import (
+    RUNS,
     contributions,
     here_rows,
     local_places,
     lost_lines,
     named_tuples,
-    row_head,
     target_lines,
+    write_row_loop,
 )
 from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
 
 
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
     """The function that moves particles of sublattice s."""
-    out = Function(plan.shared, f"general{level.number}", "s", "first_run", "last_run")
-    out.add(0, *named_tuples(plan, level), *row_head(plan))
-    out.add(1, *here_rows(plan, level, "s"))
+    out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
+    out.add(0, *named_tuples(plan, level))
+    write_row_loop(out, plan)
+    out.add(0, *here_rows(plan, level, "s"))
     (_write_slot_after_slot if plan.long else _write_one_by_one)(out, plan, level)
     if events:
-        out.add(1, "if changed:")
-        out.add(2, events.call("s", *plan.lead, "j0", "j1"))
+        out.add(0, "if changed:")
+        out.add(1, events.call("s", *plan.lead, "j0", "j1"))
     return out
 
 
 def _write_one_by_one(out: Function, plan: Plan, level: Level) -> None:
     sums = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(1, *(["changed = 0"] if plan.judged else []), "for j in range(j1 - j0):")
+    out.add(0, *(["changed = 0"] if plan.judged else []), "for j in range(j1 - j0):")
     # -0.0 + x is x, whatever its sign.
-    out.add(2, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near = 0")
+    out.add(1, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near = 0")
     if plan.judged:
-        out.add(2, f"bits = int64(lost[{plan.place('s')}])", "now = bits")
-    out.add(2, *_displacements(plan, level), "for k in range(counts[s]):")
-    _write_slot(out, plan, level, 3, 3, sums, "near")
+        out.add(1, f"bits = int64(lost[{plan.place('s')}])", "now = bits")
+    out.add(1, *_displacements(plan, level), "for k in range(counts[s]):")
+    _write_slot(out, plan, level, 2, 2, sums, "near")
     kind = f"kind[{plan.place('s')}]"
-    out.add(2, f"moves = ({kind} == {FOLLOWER}) & (near > 0)")
-    out.add(2, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
+    out.add(1, f"moves = ({kind} == {FOLLOWER}) & (near > 0)")
+    out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
     if plan.judged:
-        out.add(2, "changed = changed | (now ^ bits)", f"lost[{plan.place('s')}] = now")
+        out.add(1, "changed = changed | (now ^ bits)", f"lost[{plan.place('s')}] = now")
 
 
 def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
     sums = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(1, f"t = np.full(({len(sums)}, j1 - j0), {plan.number(-0.0)})")
-    out.add(1, *(f"{t} = t[{n}]" for n, t in enumerate(sums)), "near = np.zeros(j1 - j0, np.int64)")
-    out.add(1, f"kinds = {plan.row('kind', 's')}", "for k in range(counts[s]):")
+    out.add(0, f"t = np.full(({len(sums)}, j1 - j0), {plan.number(-0.0)})")
+    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(sums)), "near = np.zeros(j1 - j0, np.int64)")
+    out.add(0, f"kinds = {plan.row('kind', 's')}", "for k in range(counts[s]):")
     sums = [f"{t}[j]" for t in sums]
-    _write_slot(out, plan, level, 2, 3, sums, "near[j]")
-    out.add(1, "for j in range(j1 - j0):", *[f"    {u}" for u in _displacements(plan, level)])
-    out.add(2, f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
-    out.add(2, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
+    _write_slot(out, plan, level, 1, 2, sums, "near[j]")
+    out.add(0, "for j in range(j1 - j0):", *[f"    {u}" for u in _displacements(plan, level)])
+    out.add(1, f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
+    out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
 
 
 def _displacements(plan: Plan, level: Level) -> list[str]:
