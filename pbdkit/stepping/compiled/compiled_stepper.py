@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,10 @@ from pbdkit.stepping.engine import Engine
 from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.stepper import Stepper
+
+BAND = 8192
+"""Places that bonds are judged on before they are swept, on one thread: what they take stays in the
+cache. On more threads starting them counts too."""
 
 
 class CompiledStepper(Engine):
@@ -105,7 +110,8 @@ class CompiledStepper(Engine):
         if self.threads > 1:
             numba.set_num_threads(self.threads)
         given = tuple(arrays[name] for name in self._names)
-        return given, state.step, count, 4 * self.threads
+        chunks, row = 4 * self.threads, math.prod(self._scene.raster.shape[2:])
+        return given, state.step, count, chunks, max(1, BAND * self.threads**2 // row)
 
     def _sample(self) -> tuple[Any, ...]:
         """Arguments for no step, so that what does not compile is known before the first."""

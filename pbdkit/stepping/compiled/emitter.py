@@ -16,7 +16,7 @@ from pbdkit.stepping.compiled.slot_loop import write_general
 
 
 def write_kernel(plan: Plan) -> tuple[str, list[str]]:
-    """The source of a module with ``run(given, step, count, chunks)``, which takes the scene
+    """The source of a module with ``run(given, step, count, chunks, band)``, which takes the scene
     `count` steps further, and the names of the arrays that it is given."""
     events = write_events(plan) if plan.judged else None
     passes = [write_bond_pass(plan)] if plan.bonds_first else []
@@ -30,7 +30,7 @@ def write_kernel(plan: Plan) -> tuple[str, list[str]]:
     used = [name for name in run.used if name != "step"]
     head = [
         f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)',
-        "def run(given, step, count, chunks):",
+        "def run(given, step, count, chunks, band):",
         f"    {', '.join(used)}, = given",
     ]
     lines = [*write_tuples(plan), *(line for f in functions for line in f.source), "", "", *head]
@@ -84,13 +84,18 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     out.add(2, *(f"fu_{c}[led[e]] = led_values[{a}, e]" for a, c in enumerate(plan.axes)))
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
-    for one in passes:
-        if plan.parallel:
-            out.add(1, "for c in prange(chunks):")
-            span = ", ".join(f"i0 + (i1 - i0) * {c} // chunks" for c in ("c", "(c + 1)"))
-            out.add(2, one.call(span))
-        else:
-            out.add(1, one.call("i0", "i1"))
+    if plan.bonds_first:
+        # Band by band, so that what the pass has read and written is still near when it is swept.
+        back, ahead = plan.home_reach
+        out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
+        out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
+        out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
+        _write_pass(out, plan, 2, passes[0], "judged", "ready")
+        out.add(2, "judged = ready")
+        _write_pass(out, plan, 2, passes[1], "low", "high")
+    else:
+        for sweep in passes:
+            _write_pass(out, plan, 1, sweep, "i0", "i1")
     out.add(1, "for e in range(led.size):")
     out.add(2, *(f"fv_{c}[led[e]] = led_values[{a}, e]" for a, c in enumerate(plan.axes)))
     out.add(1, "for e in range(led.size):")
@@ -99,6 +104,18 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
         _write_frame(out, plan)
     u, v = plan.planes("u"), plan.planes("v")
     out.add(1, f"{u}, {v} = {v}, {u}")
+
+
+def _write_pass(
+    out: Function, plan: Plan, depth: int, one: Function, low: str, high: str
+) -> None:
+    """A call for rows from `low` to `high`, or for parts of them on all threads."""
+    if not plan.parallel:
+        out.add(depth, one.call(low, high))
+        return
+    out.add(depth, "for c in prange(chunks):")
+    span = (f"{low} + ({high} - {low}) * {c} // chunks" for c in ("c", "(c + 1)"))
+    out.add(depth + 1, one.call(*span))
 
 
 def _write_frame(out: Function, plan: Plan) -> None:

@@ -104,6 +104,13 @@ class Plan:
         return self.model is not None and (isinstance(self.model, RenewsBonds) or self.long)
 
     @property
+    def home_reach(self) -> tuple[int, int]:
+        """How many rows before and after a particle's own its bonds may be kept."""
+        around = self.scene.neighbourhood
+        steps = [0, *(slot.cell[0] for slot, (_, here) in around.home.items() if not here)]
+        return -min(steps), max(steps)
+
+    @property
     def judged(self) -> bool:
         """Whether the sweep judges the bonds."""
         return self.model is not None and not self.bonds_first
