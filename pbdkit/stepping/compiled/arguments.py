@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import plane_block
+from pbdkit.scene.raster import slot_step
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.state import State
@@ -54,39 +56,40 @@ def rule_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
 
 
 def _by_slot(scene: Scene, levels: Sequence[Level], real: np.dtype[Any]) -> Arrays:
-    """Numbers of each slot, (sublattice, slot, ...): target and step of cells, rest offset, limits,
-    plane and step to the home of its bonds and the sign of d there, the cells beside it."""
-    around, cells = scene.neighbourhood, scene.cells
-    shape = len(around.slots), max(map(len, around.slots))
-    still, limits = [0] * scene.axes, scene.constants.limits
-    home = {
-        slot: ([plane, *(still if here else slot.cell)], 1.0 if here else -1.0)
-        for slot, (plane, here) in around.home.items()
-    }
-    beside = cells.tiling.beside if cells else {}
-    side_of = {
-        slot: [
-            [side.kind, *((side.first.target, *side.first.cell) if side.first else
-                          (slot.source, *still))]
-            for side in sides
+    """Numbers of each slot, (sublattice, slot, ...): rest offset, limits, weights, the sign of d at
+    the home of its bonds, and from a particle's place in flat arrays the way to the neighbour, to
+    the home of the bond in planes of bonds, and to the shares of the cells beside it."""
+    around, shape, limits = scene.neighbourhood, scene.raster.shape, scene.constants.limits
+    beside = scene.cells.tiling.beside if scene.cells else {}
+    plane_size, size = math.prod(shape[1:]), math.prod(shape)
+
+    def bonds_away(slot: Slot) -> int:
+        plane, here = around.home[slot]
+        source = slot.source if here else slot.target
+        return (plane - source) * plane_size + (0 if here else slot_step(shape, slot))
+
+    def cells_away(slot: Slot) -> list[int]:
+        return [
+            side.kind * size + (slot_step(shape, side.first) if side.first else 0)
+            for side in beside.get(slot, ())
         ]
-        for slot, sides in beside.items()
-    }  # fmt: skip
+
     numbers: dict[str, tuple[Any, Any]] = {
-        "steps": (lambda slot: [slot.target, *slot.cell], np.int64),
         "rests": (lambda slot: slot.rest, real),
         "limits": (lambda slot: limits.get(slot, ()), real),
-        "homes": (lambda slot: home[slot][0], np.int64),
-        "signs": (lambda slot: home[slot][1], real),
-        "sides": (lambda slot: side_of.get(slot, ()), np.int64),
+        "signs": (lambda slot: 1.0 if around.home[slot][1] else -1.0, real),
+        "away": (lambda slot: slot_step(shape, slot), np.int64),
+        "bonds_away": (bonds_away, np.int64),
+        "cells_away": (cells_away, np.int64),
     }
     for level in levels:
         weights = level.scene.constants.weights
         numbers[f"weights{level.number}"] = (weights.__getitem__, real)
+    most = max(map(len, around.slots))
     found: Arrays = {"counts": np.array([len(own) for own in around.slots])}
     for name, (value, dtype) in numbers.items():
         one = np.array(value(around.slots[0][0]), dtype)
-        found[name] = np.zeros((*shape, *one.shape), dtype)
+        found[name] = np.zeros((shape[0], most, *one.shape), dtype)
         for s, own in enumerate(around.slots):
             for k, slot in enumerate(own):
                 found[name][s, k] = np.array(value(slot), dtype)

@@ -41,37 +41,40 @@ def write_bond_pass(plan: Plan) -> Function:
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
     d = f"d = {plan.vector(f'n{c}[j] - h{c}[j]' for c in plan.axes)}"
-    # One loop that vectorises, and another where something breaks: rare.
-    out.add(depth, "some = 0", "for j in range(j1 - j0):")
-    out.add(depth + 1, d, f"intact = (since[j] < 0) & {can}")
+    news: list[str] = []
+    changing = [m for m, number in enumerate(bonds) if number.changes]
     if isinstance(model, RenewsBonds):
-        out.add(depth + 1, f"new = update(d, r, Constants({c}), q)")
-        changing = [m for m, number in enumerate(bonds) if number.changes]
-        for position, m in enumerate(changing):
-            out.add(depth + 1, f"b{m}[j] = new[{position}] if intact else b{m}[j]")
-    out.add(depth + 1, f"some = some | (1 if breaks(d, r, Constants({c}), q) & intact else 0)")
-    out.add(depth, "if some:")
-    out.add(depth + 1, "for j in range(j1 - j0):")
-    out.add(depth + 2, d, f"if since[j] < 0 and {can} and breaks(d, r, Constants({c}), q):")
-    out.add(depth + 3, "since[j] = step", "ways[j] = length(r + d)")
+        news = [f"new = update(d, r, Constants({c}), q)"]
+        news += [f"new{m} = new[{position}]" for position, m in enumerate(changing)]
+        for m in changing:
+            c = c.replace(f"b{m}[j]", f"new{m}")
+    breaks = f"breaks(d, r, Constants({c}), q)"
+    # One loop that looks, and vectorises; another one writes, where there is anything to write.
+    changing = changing if news else []
+    differ = "".join(f" | (new{m} != b{m}[j])" for m in changing)
+    out.add(depth, "some = 0", "for j in range(j1 - j0):")
+    out.add(depth + 1, d, *news, f"fresh = (since[j] < 0) & {can} & ({breaks}{differ})")
+    out.add(depth + 1, "some = some | (1 if fresh else 0)")
+    out.add(depth, "if some:", "    for j in range(j1 - j0):")
+    out.add(depth + 2, f"if (since[j] < 0) & {can}:")
+    out.add(depth + 3, d, *news, *(f"b{m}[j] = new{m}" for m in changing))
+    out.add(depth + 3, f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)")
     return out
 
 
 def write_events(plan: Plan) -> Function:
     """The function that notes step and length of the bonds in a row that the sweep has just broken,
-    as their home end sees them."""
-    out = Function(plan.shared, "note_broken", "s", *plan.lead, "j0", "j1")
-    axes = range(len(plan.axes))
-    step = [f"steps[s, k, {a + 1}]" for a in axes]
-    here, there = plan.place("s", None, "j"), plan.place("steps[s, k, 0]", step, "j")
-    home = plan.place("homes[s, k, 0]", [f"homes[s, k, {a + 1}]" for a in axes], "j")
-    out.add(0, "for j in range(j0, j1):")
-    out.add(1, f"bits = int64(lost[{here}])", "for k in range(counts[s]):")
+    as their home end sees them; `base` is the row's first place."""
+    out = Function(plan.shared, "note_broken", "s", "base", "width")
+    out.add(0, "since, ways = broken.reshape(-1), lengths.reshape(-1)", "kinds = kind.reshape(-1)")
+    out.add(0, *(f"w{c} = u_{c}.reshape(-1)" for c in plan.axes))
+    out.add(0, "for here in range(base, base + width):")
+    out.add(1, "bits = int64(lost.reshape(-1)[here])", "for k in range(counts[s]):")
+    out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
     # The home end notes it, or this end where that is no particle of the body.
-    out.add(2, f"ours = signs[s, k] > 0 or kind[{there}] != {FOLLOWER}")
-    out.add(2, f"if (bits >> k) & 1 and ours and broken[{home}] < 0:")
-    out.add(3, f"broken[{home}] = step")
-    d = plan.vector(f"u_{c}[{there}] - u_{c}[{here}]" for c in plan.axes)
-    r = plan.vector(f"rests[s, k, {a}]" for a in axes)
-    out.add(3, f"lengths[{home}] = length(signs[s, k] * {r} + signs[s, k] * {d})")
+    out.add(2, f"ours = signs[s, k] > 0 or kinds[there] != {FOLLOWER}")
+    out.add(2, "if (bits >> k) & 1 and ours and since[home] < 0:", "    since[home] = step")
+    d = plan.vector(f"w{c}[there] - w{c}[here]" for c in plan.axes)
+    r = plan.vector(f"rests[s, k, {a}]" for a in range(len(plan.axes)))
+    out.add(3, f"ways[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
     return out

@@ -16,8 +16,8 @@ MOST_BITS = 32
 """Neighbours of a sublattice up to which its slots are written out and lost bonds are bits."""
 
 NAMES = (
-    "kind", "share", "broken", "lengths", "lost", "counts", "steps", "rests", "limits", "homes",
-    "signs", "sides", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts", "first",
+    "kind", "share", "broken", "lengths", "lost", "counts", "rests", "limits", "signs", "away",
+    "bonds_away", "cells_away", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts", "first",
     "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies", "mapped",
     "box", "growth", "step",
 )  # fmt: skip
@@ -138,11 +138,12 @@ class Plan:
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"
 
-    def place(self, first: object, step: Sequence[object] | None = None, j: str = "j0 + j") -> str:
-        """The index of the j-th place of a row, or of that a step of cells away."""
-        step = step or [0] * self.scene.axes
-        at = [_sum(name, m) for name, m in zip((*self.lead, j), step, strict=True)]
-        return ", ".join([str(first), *at])
+    def flat(self, s: str, j: str = "j0") -> str:
+        """The place of a particle in flat arrays of all sublattices."""
+        found = s
+        for axis, name in enumerate((*self.lead, j)):
+            found = f"({found}) * kind.shape[{axis + 1}] + {name}"
+        return found
 
 
 def _sum(name: str, step: object) -> str:

@@ -55,7 +55,7 @@ def write_row(
     if events:
         out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
         out.add(0, "if changed:")
-        out.add(1, events.call(str(s), *plan.lead, "j0", "j1"))
+        out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
     return out
 
 

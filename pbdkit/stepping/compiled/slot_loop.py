@@ -30,38 +30,36 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
     out.add(0, *named_tuples(plan, level))
     write_row_loop(out, plan)
-    out.add(0, *here_rows(plan, level, "s"))
+    out.add(0, *here_rows(plan, level, "s"), f"base = {plan.flat('s')}", "width = j1 - j0")
     (_write_slot_after_slot if plan.long else _write_one_by_one)(out, plan, level)
     if events:
-        out.add(0, "if changed:")
-        out.add(1, events.call("s", *plan.lead, "j0", "j1"))
+        out.add(0, "if changed:", "    " + events.call("s", "base", "width"))
     return out
 
 
 def _write_one_by_one(out: Function, plan: Plan, level: Level) -> None:
     sums = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(0, *(["changed = 0"] if plan.judged else []), "for j in range(j1 - j0):")
+    out.add(0, *(["changed = 0"] if plan.judged else []), "for j in range(width):")
     # -0.0 + x is x, whatever its sign.
-    out.add(1, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near = 0")
+    out.add(1, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near, at_j = 0, base + j")
     if plan.judged:
-        out.add(1, f"bits = int64(lost[{plan.place('s')}])", "now = bits")
+        out.add(1, "bits = int64(lost.reshape(-1)[at_j])", "now = bits")
     out.add(1, *_displacements(plan, level), "for k in range(counts[s]):")
-    _write_slot(out, plan, level, 2, 2, sums, "near")
-    kind = f"kind[{plan.place('s')}]"
-    out.add(1, f"moves = ({kind} == {FOLLOWER}) & (near > 0)")
+    _write_slot(out, plan, level, sums, "near")
+    out.add(1, f"moves = (kind.reshape(-1)[at_j] == {FOLLOWER}) & (near > 0)")
     out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
     if plan.judged:
-        out.add(1, "changed = changed | (now ^ bits)", f"lost[{plan.place('s')}] = now")
+        out.add(1, "changed = changed | (now ^ bits)", "lost.reshape(-1)[at_j] = now")
 
 
 def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
     sums = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(0, f"t = np.full(({len(sums)}, j1 - j0), {plan.number(-0.0)})")
-    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(sums)), "near = np.zeros(j1 - j0, np.int64)")
+    out.add(0, f"t = np.full(({len(sums)}, width), {plan.number(-0.0)})")
+    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(sums)), "near = np.zeros(width, np.int64)")
     out.add(0, f"kinds = {plan.row('kind', 's')}", "for k in range(counts[s]):")
     sums = [f"{t}[j]" for t in sums]
-    _write_slot(out, plan, level, 1, 2, sums, "near[j]")
-    out.add(0, "for j in range(j1 - j0):", *[f"    {u}" for u in _displacements(plan, level)])
+    _write_slot(out, plan, level, sums, "near[j]")
+    out.add(0, "for j in range(width):", *("    " + u for u in _displacements(plan, level)))
     out.add(1, f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
     out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
 
@@ -73,71 +71,62 @@ def _displacements(plan: Plan, level: Level) -> list[str]:
     return lines
 
 
-class _Slot:
-    """Writes one slot: its rows before the loop over particles, or places within it."""
+class _Rows:
+    """The values of arrays some way off from each particle: rows of them where all particles take
+    in one slot after the other, else looked up."""
 
     def __init__(self, out: Function, plan: Plan, depth: int) -> None:
         self._out, self._plan, self._depth = out, plan, depth
 
-    def seen(self, name: str, array: str, first: str, step: Sequence[str]) -> str:
-        """The value of an array at a particle's neighbour, or at the home of something of it."""
+    def seen(self, array: str, away: str) -> str:
+        """The word for a value of an array, `away` from the particle's place in flat arrays."""
         if not self._plan.long:
-            return f"{array}[{self._plan.place(first, step)}]"
-        self._out.add(self._depth, f"{name} = {self._plan.row(array, first, step)}")
-        return f"{name}[j]"
+            return f"{array}.reshape(-1)[at_j + {away}]"
+        row = f"{array}.reshape(-1)[base + {away}:base + {away} + width]"
+        self._out.add(self._depth, f"row_{array} = {row}")
+        return f"row_{array}[j]"
 
 
 def _write_slot(
-    out: Function,
-    plan: Plan,
-    level: Level,
-    depth: int,
-    inner: int,
-    sums: Sequence[str],
-    near: str,
+    out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str
 ) -> None:
-    axes, slot = range(len(plan.axes)), _Slot(out, plan, depth)
-    step = [f"steps[s, k, {a + 1}]" for a in axes]
-    target, source = "steps[s, k, 0]", f"z{level.number - 1}" if level.number else "u"
-    there = [slot.seen(f"n{c}", f"{source}_{c}", target, step) for c in plan.axes]
-    kind = slot.seen("kinds_k", "kind", target, step)
+    axes, depth = range(len(plan.axes)), 1 if plan.long else 2
+    rows = _Rows(out, plan, depth)
+    source, here = (f"z{level.number - 1}", "z") if level.number else ("u", "u")
+    there = [rows.seen(f"{source}_{c}", "away[s, k]") for c in plan.axes]
+    kind = rows.seen("kind", "away[s, k]")
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]"}
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
-            cell = [f"sides[s, k, {side}, {a + 2}]" for a in axes]
-            first = f"sides[s, k, {side}, 0], sides[s, k, {side}, 1]"
-            out.add(depth, f"share_{side} = {slot.seen('', 'share', first, cell)}")
+            share = f"share.reshape(-1)[at_j + cells_away[s, k, {side}]]"
+            out.add(depth, f"share_{side} = {share}")
         named[Home.CELL] = "share_{n}"
-    home = [f"homes[s, k, {a + 1}]" for a in axes]
     bonds = sum(number.home is Home.BOND for number in level.seen.bond) if plan.model else 0
-    bond = [slot.seen(f"b{n}", f"bond{n}", "homes[s, k, 0]", home) for n in range(bonds)]
-    is_lost = "False"
-    if plan.bonds_first:
-        is_lost = f"{slot.seen('since', 'broken', 'homes[s, k, 0]', home)} >= 0"
+    bond = [rows.seen(f"bond{n}", "bonds_away[s, k]") for n in range(bonds)]
+    since = rows.seen("broken", "bonds_away[s, k]") if plan.bonds_first else ""
     out.add(depth, f"r = {plan.vector(f'rests[s, k, {a}]' for a in axes)}")
     if plan.long:
-        out.add(depth, "for j in range(j1 - j0):")
-        out.add(inner, *_displacements(plan, level))
-    here = "z" if level.number else "u"
-    out.add(inner, f"is_there = {kind} != {EMPTY}")
+        out.add(depth, "for j in range(width):")
+        out.add(2, *_displacements(plan, level))
+    out.add(2, f"is_there = {kind} != {EMPTY}")
     parts = zip(there, plan.axes, strict=True)
-    out.add(inner, f"d = {plan.vector(f'{value} - {here}.{c}' for value, c in parts)}")
+    out.add(2, f"d = {plan.vector(f'{value} - {here}.{c}' for value, c in parts)}")
     if plan.model is not None:
-        c = values(level.seen.bond, {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b_{n}"})
         for n, value in enumerate(bond):
-            c = c.replace(f"b_{n}", value)
+            out.add(2, f"b{n} = {value}")
+        c = values(level.seen.bond, {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}"})
         c = f"Constants({c})"
         if plan.judged:
             can = "is_there" if plan.model.breaks_frame_bonds() else f"({kind} == {FOLLOWER})"
             sign = "signs[s, k]"
-            out.add(inner, f"breaks_now = breaks({sign} * d, {sign} * r, {c}, q) and {can}")
-            out.add(inner, "is_lost = ((now >> k) & 1) | (1 if breaks_now else 0)")
-            out.add(inner, "now = now | (is_lost << k)")
+            out.add(2, f"breaks_now = breaks({sign} * d, {sign} * r, {c}, q) and {can}")
+            out.add(2, "is_lost = ((now >> k) & 1) | (1 if breaks_now else 0)")
+            out.add(2, "now = now | (is_lost << k)")
         else:
-            out.add(inner, f"is_lost = {is_lost}")
-        out.add(inner, *lost_lines(plan, "r", c))
+            out.add(2, f"is_lost = {since} >= 0")
+        out.add(2, *lost_lines(plan, "r", c))
     w = f"Weights{level.number}({values(level.seen.weights, named)})"
-    out.add(inner, f"{contributions(level)}, = gather{level.number}(d, r, {w}, p)")
+    out.add(2, f"{contributions(level)}, = gather{level.number}(d, r, {w}, p)")
     for n, t in enumerate(sums):
-        out.add(inner, f"{t} = {t} + (c{n} if is_there else {plan.number(0.0)})")
-    out.add(inner, f"{near} = {near} + (1 if is_there else 0)")
+        out.add(2, f"{t} = {t} + (c{n} if is_there else {plan.number(0.0)})")
+    out.add(2, f"{near} = {near} + (1 if is_there else 0)")
