@@ -66,15 +66,14 @@ def write_events(plan: Plan) -> Function:
     """The function that notes step and length of the bonds in a row that the sweep has just broken,
     as their home end sees them; `base` is the row's first place."""
     out = Function(plan.shared, "note_broken", "s", "base", "width")
-    out.add(0, "since, ways = broken.reshape(-1), lengths.reshape(-1)", "kinds = kind.reshape(-1)")
-    out.add(0, *(f"w{c} = u_{c}.reshape(-1)" for c in plan.axes))
     out.add(0, "for here in range(base, base + width):")
-    out.add(1, "bits = int64(lost.reshape(-1)[here])", "for k in range(counts[s]):")
+    out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
     # The home end notes it, or this end where that is no particle of the body.
-    out.add(2, f"ours = signs[s, k] > 0 or kinds[there] != {FOLLOWER}")
-    out.add(2, "if (bits >> k) & 1 and ours and since[home] < 0:", "    since[home] = step")
-    d = plan.vector(f"w{c}[there] - w{c}[here]" for c in plan.axes)
+    out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
+    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:", "    flat_broken[home] = step")
+    d = plan.vector(f"flat_u_{c}[there] - flat_u_{c}[here]" for c in plan.axes)
     r = plan.vector(f"rests[s, k, {a}]" for a in range(len(plan.axes)))
-    out.add(3, f"ways[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
+    out.add(3, f"flat_lengths[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
+    out.flatten()
     return out

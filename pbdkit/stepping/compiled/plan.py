@@ -176,6 +176,12 @@ class Function:
         """Adds lines at a depth of indentation, counted from `self.depth`."""
         self.lines += ["    " * (self.depth + depth) + line for line in lines]
 
+    def flatten(self) -> None:
+        """Makes flat what its lines name `flat_...` of the shared arrays, once."""
+        words = set(re.findall(r"\bflat_(\w+)", "\n".join(self.lines)))
+        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.shared if n in words]
+        self.lines[:0] = flat
+
     @property
     def used(self) -> list[str]:
         """Those of the shared names that its lines use."""

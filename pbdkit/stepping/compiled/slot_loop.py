@@ -34,6 +34,7 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
     (_write_slot_after_slot if plan.long else _write_one_by_one)(out, plan, level)
     if events:
         out.add(0, "if changed:", "    " + events.call("s", "base", "width"))
+    out.flatten()
     return out
 
 
@@ -43,13 +44,13 @@ def _write_one_by_one(out: Function, plan: Plan, level: Level) -> None:
     # -0.0 + x is x, whatever its sign.
     out.add(1, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near, at_j = 0, base + j")
     if plan.judged:
-        out.add(1, "bits = int64(lost.reshape(-1)[at_j])", "now = bits")
+        out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
     out.add(1, *_displacements(plan, level), "for k in range(counts[s]):")
     _write_slot(out, plan, level, sums, "near")
-    out.add(1, f"moves = (kind.reshape(-1)[at_j] == {FOLLOWER}) & (near > 0)")
+    out.add(1, f"moves = (flat_kind[at_j] == {FOLLOWER}) & (near > 0)")
     out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
     if plan.judged:
-        out.add(1, "changed = changed | (now ^ bits)", "lost.reshape(-1)[at_j] = now")
+        out.add(1, "changed = changed | (now ^ bits)", "flat_lost[at_j] = now")
 
 
 def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
@@ -81,8 +82,8 @@ class _Rows:
     def seen(self, array: str, away: str) -> str:
         """The word for a value of an array, `away` from the particle's place in flat arrays."""
         if not self._plan.long:
-            return f"{array}.reshape(-1)[at_j + {away}]"
-        row = f"{array}.reshape(-1)[base + {away}:base + {away} + width]"
+            return f"flat_{array}[at_j + {away}]"
+        row = f"flat_{array}[base + {away}:base + {away} + width]"
         self._out.add(self._depth, f"row_{array} = {row}")
         return f"row_{array}[j]"
 
@@ -98,7 +99,7 @@ def _write_slot(
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]"}
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
-            share = f"share.reshape(-1)[at_j + cells_away[s, k, {side}]]"
+            share = f"flat_share[at_j + cells_away[s, k, {side}]]"
             out.add(depth, f"share_{side} = {share}")
         named[Home.CELL] = "share_{n}"
     bonds = sum(number.home is Home.BOND for number in level.seen.bond) if plan.model else 0
