@@ -12,8 +12,8 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import choice
 from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.compiled.functions import source_key
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.compiled.functions import source_key
 from pbdkit.stepping.state import initial_state
 from pbdkit.stepping.stepper import Stepper
 

@@ -71,7 +71,9 @@ def write_events(plan: Plan) -> Function:
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
     # The home end notes it, or this end where that is no particle of the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
-    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:", "    flat_broken[home] = step")
+    out.add(
+        2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:", "    flat_broken[home] = step"
+    )
     d = plan.vector(f"flat_u_{c}[there] - flat_u_{c}[here]" for c in plan.axes)
     r = plan.vector(f"rests[s, k, {a}]" for a in range(len(plan.axes)))
     out.add(3, f"flat_lengths[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")

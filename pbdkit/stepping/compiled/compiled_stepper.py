@@ -25,7 +25,7 @@ from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.stepper import Stepper
 
-BAND = 8192
+BAND = 16384
 """Places that bonds are judged on before they are swept, on one thread: what they take stays in the
 cache. On more threads starting them counts too."""
 
@@ -102,8 +102,8 @@ class CompiledStepper(Engine):
             **{f"v_{c}": plane for c, plane in zip(self._plan.axes, state.previous, strict=True)},
             **{f"bond{n}": value for n, value in enumerate(state.bond_values)},
             **{f"own{n}": value for n, value in enumerate(state.particle_values)},
-            **{"led": places, "led_values": values, "led_kept": np.empty_like(values)},
-            **{"box": self._reach.box, "growth": self._reach.growth},
+            "led": places, "led_values": values, "led_kept": np.empty_like(values),
+            "box": self._reach.box, "growth": self._reach.growth,
         }
         if state.broken_step is not None and state.broken_length is not None:
             arrays |= {"broken": state.broken_step, "lengths": state.broken_length}

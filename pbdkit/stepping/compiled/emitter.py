@@ -106,9 +106,7 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     out.add(1, f"{u}, {v} = {v}, {u}")
 
 
-def _write_pass(
-    out: Function, plan: Plan, depth: int, one: Function, low: str, high: str
-) -> None:
+def _write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, high: str) -> None:
     """A call for rows from `low` to `high`, or for parts of them on all threads."""
     if not plan.parallel:
         out.add(depth, one.call(low, high))

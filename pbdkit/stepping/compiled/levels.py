@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import Components, FollowerRule, FractureModel, Here, Remembered
-from pbdkit.interfaces import RenewsBonds, RenewsParticles, Softens
+from pbdkit.interfaces import (
+    Components,
+    FollowerRule,
+    FractureModel,
+    Here,
+    Remembered,
+    RenewsBonds,
+    RenewsParticles,
+    Softens,
+)
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
@@ -27,9 +35,7 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
     scenes = [scene]
     while inner := scenes[0].inner:
         scenes.insert(0, inner)
-    return tuple(
-        Level(n, of, _parts(of), last=of is scene) for n, of in enumerate(scenes)
-    )
+    return tuple(Level(n, of, _parts(of), last=of is scene) for n, of in enumerate(scenes))
 
 
 def functions_of(levels: Sequence[Level]) -> dict[str, Function]:

@@ -11,7 +11,7 @@ from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.arguments import rule_arrays
 from pbdkit.stepping.compiled.emitter import write_tuples
-from pbdkit.stepping.compiled.levels import load_blamed, levels_of, sample_values
+from pbdkit.stepping.compiled.levels import levels_of, load_blamed, sample_values
 from pbdkit.stepping.compiled.particle import contributions, named_tuples, target_lines
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
 from pbdkit.stepping.following import Followers
@@ -81,7 +81,9 @@ def _write_kernel(plan: Plan, level: Level) -> tuple[str, list[str]]:
     for c in plan.axes:
         sweep.add(0, f"o{c} = v_{c}")
     sweep.add(0, *(f"a{n} = own{n}" for n in range(len(level.seen.own))))
-    sweep.add(0, "for e in range(first_body, last_body):", "    row = body[e]", "    j = place[row]")
+    sweep.add(
+        0, "for e in range(first_body, last_body):", "    row = body[e]", "    j = place[row]"
+    )
     sweep.add(1, f"u = {plan.vector(f'u_{c}[j]' for c in plan.axes)}")
     sweep.add(1, *(f"t{n} = 0.0" for n in sums))
     sweep.add(1, "for n in range(begin[e], begin[e + 1]):", "    there = place[other[n]]")

@@ -63,8 +63,8 @@ class Plan:
         seen, inner = self.levels[-1].seen, len(self.levels) - 1
         bonds = sum(number.home is Home.BOND for number in seen.bond)
         counted = {
-            **{"bond": bonds, "own": len(seen.own)},
-            **{"rule": len(self.levels), "weights": len(self.levels)},
+            "bond": bonds, "own": len(seen.own),
+            "rule": len(self.levels), "weights": len(self.levels),
         }
         planes = ["u", "v", *(f"z{n}" for n in range(inner))]
         return [

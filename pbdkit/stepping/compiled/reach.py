@@ -140,7 +140,7 @@ def _growth(scene: Scene) -> Box:
         for slot in slots:
             # The particle at `seeing` sees the frame point through this slot.
             seeing = np.stack(at) - np.array(slot.cell)[:, None]
-            inside = ((seeing.T >= 0) & (seeing.T < kinds.shape[1:])).all(axis=1)
+            inside = ((seeing.T >= 0) & (kinds.shape[1:] > seeing.T)).all(axis=1)
             seeing = seeing[:, inside]
             follows = kinds[(slot.source, *seeing)] == FOLLOWER
             carried.append((seeing - np.stack(body)[:, inside]).T[follows])

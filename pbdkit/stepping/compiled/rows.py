@@ -23,9 +23,7 @@ NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
 neighbours are there and cells are whole; where cells are not."""
 
 
-def write_row(
-    plan: Plan, level: Level, s: int, kind: int, events: Function | None
-) -> Function:
+def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | None) -> Function:
     """The function that moves the particles of such a row."""
     name, with_cells = f"row{level.number}_{s}_{kind}", kind == WITH_CELLS
     out = Function(plan.shared, name, *RUNS)

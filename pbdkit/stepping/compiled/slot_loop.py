@@ -88,9 +88,7 @@ class _Rows:
         return f"row_{array}[j]"
 
 
-def _write_slot(
-    out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str
-) -> None:
+def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str) -> None:
     axes, depth = range(len(plan.axes)), 1 if plan.long else 2
     rows = _Rows(out, plan, depth)
     source, here = (f"z{level.number - 1}", "z") if level.number else ("u", "u")
