@@ -6,9 +6,11 @@ The names below are loaded when first used, so that importing pbdkit costs next 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # to load `typing` takes longer than all that is here
 if TYPE_CHECKING:
+    from typing import Any
+
     # `as`: type checkers of those who say `import pbdkit` then find the names.
     from pbdkit.api import (
         analyse as analyse,

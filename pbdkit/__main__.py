@@ -1,5 +1,20 @@
-"""``python -m pbdkit`` is the program `pbdkit`."""
+"""The program `pbdkit`, which ``python -m pbdkit`` is too."""
 
-from pbdkit.cli import main
+from __future__ import annotations
 
-main()
+import sys
+
+
+def main() -> None:
+    """As `pbdkit.cli.main`; who interrupts it while it is being loaded sees no traceback either."""
+    try:
+        from pbdkit.cli import main as program
+
+        program()
+    except KeyboardInterrupt:
+        sys.stderr.write("pbdkit: interrupted\n")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.equilibrium.watch import Watch
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -18,7 +20,8 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.memory import MemorySink
-from pbdkit.running import run_into
+from pbdkit.results.progress import progress_bar
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
 if TYPE_CHECKING:
@@ -54,17 +57,30 @@ def run(
     `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
     ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
     DivergedError, with what was recorded before, when the run leaves the finite numbers. Warns,
-    with pbdkit.PbdkitWarning, where the last state is inside out.
+    with pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
+    diverge, and a last state that is inside out.
     """
-    sink, scene = MemorySink(), build_scene(_experiment(experiment, components))
+    return _run(_experiment(experiment, components), progress)
+
+
+def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
+    sink, scene = MemorySink(), build_scene(experiment)
     refuse_too_much_output(scene)
-    report = run_into(sink, scene, progress=progress)
+    with progress_bar(progress) as show:
+        run = Run(scene, watch=Watch(show=show))
+        _warn(run.warnings)
+        report = record(run, sink)
     dataset = sink.dataset()
     if report.outcome.status in ("diverged", "unconverged"):
         raise DivergedError(report.outcome.stop_reason, dataset)
-    for warning in report.warnings:
-        warnings.warn(warning, PbdkitWarning, stacklevel=2)
+    _warn(report.warnings)
     return dataset
+
+
+def _warn(texts: Iterable[str]) -> None:
+    """As coming from whoever called `run` or `rerun`."""
+    for text in texts:
+        warnings.warn(text, PbdkitWarning, stacklevel=4)
 
 
 def analyse(
@@ -88,8 +104,24 @@ def identify(
 def rerun(
     dataset: xarray.Dataset, *, components: Components = (), progress: bool = True
 ) -> xarray.Dataset:
-    """The same run again, bit for bit, from the experiment that the dataset carries."""
-    return run(experiment_of(dataset, components), progress=progress)
+    """The same run again, bit for bit, from the experiment that the dataset carries.
+
+    Warns, with pbdkit.PbdkitWarning, where other versions made the dataset than are installed.
+    """
+    experiment = experiment_of(dataset, components)
+    _warn_of_versions(dataset, experiment)
+    return _run(experiment, progress)
+
+
+def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
+    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | _carried(dataset, "plugins")
+    for name, now in here.items():
+        before = made_by.get(name)
+        if name != GIVEN and before != now:
+            whose = f"{name} {before}" if before else f"an unknown version of {name}"
+            text = f"made by {whose}, run again by {now}: the result may differ"
+            warnings.warn(text, PbdkitWarning, stacklevel=3)
 
 
 def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
@@ -97,14 +129,25 @@ def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Exper
     it wants components that are not there."""
     if "experiment" not in dataset.attrs:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", json.loads(dataset.attrs["experiment"]))
+    source = Source("dataset", _carried(dataset, "experiment"))
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = json.loads(dataset.attrs.get("plugins", "{}")).get(GIVEN)
+        given = _carried(dataset, "plugins").get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+
+
+def _carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
+    """What a dataset carries as JSON; StorageError where it is not."""
+    try:
+        found = json.loads(dataset.attrs.get(attribute, "{}"))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
+    if not isinstance(found, dict):
+        raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
+    return found
 
 
 def _experiment(

@@ -8,9 +8,34 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import xarray
 
+LONGEST = 3900
+"""So many characters a message has at most."""
+MOST_LINES = 20
+
 
 class PbdkitError(Exception):
-    """The common ancestor; its text is one message for the user, with place and remedy."""
+    """The common ancestor; its text is one message for the user, with place and remedy. Whatever it
+    repeats of the input is made fit to be shown."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
+
+
+def printable(text: str) -> str:
+    """The text as a terminal may show it: what does not print is escaped, and of long lines the
+    beginning, with the place, and the end, with the remedy, are kept."""
+    lines = text.split("\n")[:MOST_LINES]
+    longest = min(1000, LONGEST // len(lines))
+    return "\n".join(_cut(_escaped(_cut(line, longest)), longest) for line in lines)
+
+
+def _cut(line: str, longest: int) -> str:
+    half = longest // 2
+    return line if len(line) <= longest else f"{line[:half]} ... {line[6 - half :]}"
+
+
+def _escaped(line: str) -> str:
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 class ExperimentError(PbdkitError):
@@ -53,7 +78,7 @@ class StorageError(PbdkitError):
 
 
 class PbdkitWarning(UserWarning):
-    """A run went through, and its result deserves a doubt; the text says which, and the remedy."""
+    """A run, or its result, deserves a doubt; the text says which, and the remedy."""
 
 
 def dotted(where: Sequence[Any]) -> str:

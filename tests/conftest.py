@@ -16,10 +16,21 @@ import pbdkit
 from pbdkit.cli import main
 from pbdkit.scene.scene import Scene, build_scene
 
-# The same random scenes in every run that decides about landing; elsewhere new ones each time.
-settings.register_profile("landing", derandomize=True)
-if os.environ.get("CI"):
-    settings.load_profile("landing")
+# The same random scenes in every run that decides about landing; elsewhere new ones each time. No
+# deadline: what an example takes depends on what else the processors do.
+settings.register_profile("anywhere", deadline=None)
+settings.register_profile("landing", derandomize=True, deadline=None)
+settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What every worker, and every process that a test starts, finds in its environment: one folder
+    of compiled kernels, kept from run to run, and one thread of linear algebra, as the systems here
+    are small and the workers take the processors."""
+    if cache := getattr(config, "cache", None):
+        os.environ.setdefault("PBDKIT_CACHE_DIR", str(cache.mkdir("kernels")))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 Build = Callable[..., Scene]
 Refused = Callable[..., str]

@@ -64,11 +64,11 @@ class Mean(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2], total[1] / total[2]
+        return total[0] / total[1]
 
 
 class Central(Mean):
@@ -78,8 +78,7 @@ class Central(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        along = 2 * (d.x * r.x + d.y * r.y) / (r.x * r.x + r.y * r.y)
-        return along * r.x, along * r.y, 1.0
+        return (2 * pbdkit.dot(d, r) / pbdkit.squared_length(r)) * r, 1.0
 
 
 class Twice(Mean):
@@ -92,15 +91,15 @@ class Twice(Mean):
         steps = abs(slot.cell[0]) + abs(slot.cell[1])
         of_one = (1 + 2 * self.c) / 4 if steps == 1 else 0.0
         straight = 0 in slot.cell
-        return (of_one - (self.c / (16 if straight else 8) if steps == 2 else 0.0),)
+        return {"share": of_one - (self.c / (16 if straight else 8) if steps == 2 else 0.0)}
 
     @staticmethod
     def gather(d, r, w, p):
-        return w[0] * d.x, w[0] * d.y, 1.0
+        return w.share * d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0], total[1]
+        return total[0]
 
 
 class Odd(Mean):
@@ -110,7 +109,7 @@ class Odd(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x + 0.3 * d.y, d.y - 0.3 * d.x, 1.0
+        return Vector(d.x + 0.3 * d.y, d.y - 0.3 * d.x), 1.0
 
 
 class Slanted(Mean):
@@ -120,7 +119,7 @@ class Slanted(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x * (1.0 + 0.5 * r.x * r.y), d.y, 1.0
+        return Vector(d.x * (1.0 + 0.5 * r.x * r.y), d.y), 1.0
 
 
 class Windy(Mean):
@@ -130,7 +129,7 @@ class Windy(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (1.0 + 0.2 * r.x) * d.x, (1.0 + 0.2 * r.x) * d.y, 1.0
+        return (1.0 + 0.2 * r.x) * d, 1.0
 
 
 class Anchored(Mean):
@@ -140,7 +139,7 @@ class Anchored(Mean):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2] - 0.1 * here.u.x, total[1] / total[2]
+        return total[0] / total[1] - Vector(0.1 * here.u.x, 0.0)
 
 
 class Restless(Mean):
@@ -150,7 +149,7 @@ class Restless(Mean):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2] + 0.01, total[1] / total[2]
+        return total[0] / total[1] + Vector(0.01, 0.0)
 
 
 class Bent(Mean):
@@ -160,7 +159,7 @@ class Bent(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return pbdkit.where(d.x > 0.0, d.x, 0.5 * d.x), d.y, 1.0
+        return Vector(pbdkit.where(d.x > 0.0, d.x, 0.5 * d.x), d.y), 1.0
 
 
 class Idle(Mean):
@@ -170,7 +169,7 @@ class Idle(Mean):
 
     @staticmethod
     def apply(total, here, p):
-        return 0.0 * total[0], 0.0 * total[1]
+        return 0.0 * total[0]
 
 
 class Growing(Mean):
@@ -180,7 +179,7 @@ class Growing(Mean):
 
     @staticmethod
     def apply(total, here, p):
-        return -total[0] / total[2], -total[1] / total[2]
+        return -total[0] / total[1]
 
 
 class Sloping(Mean):
@@ -191,8 +190,7 @@ class Sloping(Mean):
 
     @staticmethod
     def apply(total, here, p):
-        share = (1.0 + 0.1 * here.X.x) / total[2]
-        return share * total[0], share * total[1]
+        return (1.0 + 0.1 * here.X.x) * total[0] / total[1]
 
 
 class Failing(Mean):
@@ -212,7 +210,7 @@ class Dividing(Mean):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x * d.x / (d.x * d.x + d.y * d.y), d.y, 1.0
+        return Vector(d.x * d.x / pbdkit.squared_length(d), d.y), 1.0
 
 
 def subclasses(of: type) -> list[type]:

@@ -356,9 +356,10 @@ def initial_positions(body: Body, experiment: Part, followers: set[int]) -> list
 
 
 def pe1(body: Body, j: int, x: list[Point], left_out: set[Bond]) -> float:
-    """Section 8: of a body particle, over its reference neighbours but the bonds left out."""
+    """Section 8: of a body particle, over its reference neighbours but the bonds left out; NaN at
+    frame points."""
     if not body.inside[j]:
-        return 0.0
+        return math.nan
     ks = [near.particle for near in body.neighbours[j]]
     kept = [k for k in ks if (min(j, k), max(j, k)) not in left_out]
     return math.fsum((distance(x[j], x[k]) - distance(body.X[j], body.X[k])) ** 2 for k in kept)

@@ -20,12 +20,11 @@ class Rule(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        dx, dy, n = total
-        return p.strength * dx / n, p.strength * dy / n
+        return p.strength * total[0] / total[1]
 
 @pbdkit.hookimpl
 def pbdkit_components():
@@ -45,7 +44,7 @@ def changed(old: str, new: str) -> str:
 TYPELESS = hook("return [Rule]") + (
     "class Rule(pbdkit.FollowerRule):\n"
     "    @staticmethod\n    def gather(d, r, w, p): return (1.0,)\n"
-    "    @staticmethod\n    def apply(total, here, p): return 0.0, 0.0\n"
+    "    @staticmethod\n    def apply(total, here, p): return 0.0 * here.u\n"
 )
 ABSTRACT = hook("return [Rule]") + (
     "class Rule(pbdkit.FollowerRule):\n    type: str = 'half'\n"

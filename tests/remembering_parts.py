@@ -1,13 +1,13 @@
 """Parts that remember, for tests: bonds that soften from their own onset, tiring particles."""
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 import pbdkit
 
 
-class Weakest(pbdkit.FractureModel):
+class Weakest(pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.FractureModel):
     """A bond's force falls linearly from strain `onset` to strain `failure`; the onset of each bond
     is drawn, uniform over `onset` (1 ± spread), and that of the bond in the middle is lower."""
 
@@ -22,9 +22,9 @@ class Weakest(pbdkit.FractureModel):
         return self.frame_bonds
 
     def constants(self, slot):
-        return (float(np.hypot(*slot.rest)),)
+        return {"rest": pbdkit.length(slot.rest)}
 
-    def bond_state(self):
+    def remembered(self):
         return (
             pbdkit.Remembered("onset", "strain at which softening begins", "1", changes=False),
             pbdkit.Remembered("damage", "damage", "1"),
@@ -39,36 +39,33 @@ class Weakest(pbdkit.FractureModel):
 
     @staticmethod
     def update(d, r, c, p):
-        strain = (pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y)) - c[0]) / c[0]
-        over = strain > c[1]
-        law = p.failure / (p.failure - c[1]) * (1.0 - c[1] / pbdkit.where(over, strain, 1.0))
-        more = over & (law > c[2])
-        return pbdkit.where(more, law, c[2]), pbdkit.where(more, c[3] + 1, c[3])
+        strain = (pbdkit.length(r + d) - c.rest) / c.rest
+        over = strain > c.onset
+        law = p.failure / (p.failure - c.onset) * (1.0 - c.onset / pbdkit.where(over, strain, 1.0))
+        more = over & (law > c.damage)
+        return pbdkit.where(more, law, c.damage), pbdkit.where(more, c.visits + 1, c.visits)
 
     @staticmethod
     def breaks(d, r, c, p):
-        return c[2] >= 1.0
+        return c.damage >= 1.0
 
     @staticmethod
     def fictitious(u, r, p):
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
     @staticmethod
     def seen(d, lost, r, c, p):
-        kept = 1.0 - c[2]
-        return pbdkit.Vector(kept * d.x + c[2] * lost.x, kept * d.y + c[2] * lost.y)
+        return (1.0 - c.damage) * d + c.damage * lost
 
 
-class Tiring(pbdkit.FollowerRule):
+class Tiring(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
     """Particles follow the barycentre the less, the farther they have come in all."""
 
     type: Literal["tiring"] = "tiring"
     rate: float = 0.5
     spread: float = 0.0
 
-    uses_reference: ClassVar[bool] = False
-
-    def particle_state(self):
+    def remembered(self):
         return (
             pbdkit.Remembered("way", "way made in x", "lattice unit"),
             pbdkit.Remembered("zeal", "share of the move that is made", "1", 0.9, changes=False),
@@ -79,15 +76,14 @@ class Tiring(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, r.x, r.y, 1.0
+        return d, r, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        dx, dy, rx, ry, n = total
-        share = here.own[1] / (1.0 + p.rate * here.own[0])
-        return share * (dx + rx) / n, share * (dy + ry) / n
+        d, r, n = total
+        return here.own.zeal / (1.0 + p.rate * here.own.way) * (d + r) / n
 
     @staticmethod
     def remember(total, here, p):
-        move = total[0] / total[4]
-        return (here.own[0] + pbdkit.where(move > 0.0, move, -move),)
+        move = total[0].x / total[2]
+        return (here.own.way + pbdkit.where(move > 0.0, move, -move),)

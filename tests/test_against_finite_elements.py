@@ -121,7 +121,7 @@ def test_the_layer_s_solution_is_exact():
 
 def test_plane_strain():
     """Against quadratic elements of scikit-fem, with Lamé's λ of plane strain."""
-    skfem = pytest.importorskip("skfem", reason="solved with scikit-fem, of the extra dev")
+    skfem = pytest.importorskip("skfem", reason="solved with scikit-fem, of the group test")
     from finite_elements import uniform
     from skfem.models.elasticity import lame_parameters, linear_elasticity
 

@@ -256,13 +256,13 @@ class Hypotenuse(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        x, y = r.x + d.x, r.y + d.y
-        distance = np.hypot(x, y)
-        return distance * x, distance * y, distance
+        there = r + d
+        distance = np.hypot(*there)
+        return distance * there, distance
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2], total[1] / total[2]
+        return total[0] / total[1]
 
 
 class Absolute(Hypotenuse):
@@ -272,9 +272,9 @@ class Absolute(Hypotenuse):
 
     @staticmethod
     def gather(d, r, w, p):
-        x, y = r.x + d.x, r.y + d.y
-        distance = np.sqrt(np.abs(x) ** 2 + np.abs(y) ** 2)
-        return distance * x, distance * y, distance
+        there = r + d
+        distance = np.sqrt(np.abs(there.x) ** 2 + np.abs(there.y) ** 2)
+        return distance * there, distance
 
 
 @pytest.mark.parametrize("rule", [Hypotenuse(type="hypotenuse"), Absolute(type="absolute")])

@@ -1,4 +1,4 @@
-"""Imports follow the data: experiment, scene, stepping, results, running, command line."""
+"""Imports follow the data: experiment, scene, stepping, results, runs, command line."""
 
 import ast
 from pathlib import Path
@@ -15,11 +15,11 @@ ORDER = [
     "experiment",
     "scene",
     "stepping",
+    "results",
     "analysis",
     "identity",
     "equilibrium",
-    "results",
-    "running",
+    "runs",
     "api",
     "benching",
     "testing",
@@ -43,6 +43,19 @@ def test_imports_lead_upstream_only(path):
     own = room(".".join(("pbdkit", *path.relative_to(PACKAGE).with_suffix("").parts)))
     downstream = [module for module in imported(path) if room(module) > own]
     assert downstream == []
+
+
+def calls_of(method, path):
+    """How often a file calls the method; what it writes as text, kernels, is no call."""
+    called = (n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call))
+    return sum(isinstance(f, ast.Attribute) and f.attr == method for f in called)
+
+
+def test_rules_are_evaluated_in_one_place():
+    """Whatever is added, values by bond or a third axis, is told to the evaluator alone."""
+    outside = [path for path in FILES if "components" not in path.relative_to(PACKAGE).parts]
+    found = {str(p.relative_to(PACKAGE)): calls_of("gather", p) for p in outside}
+    assert {path: n for path, n in found.items() if n} == {"stepping/evaluator.py": 1}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))

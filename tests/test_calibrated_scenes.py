@@ -6,7 +6,7 @@ import pytest
 
 import pbdkit
 from pbdkit.components.strain_gradient import StrainGradient
-from pbdkit.scene import cutting
+from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 
 SQUARE, HEXAGONAL = {"type": "square", "a": 1.0}, {"type": "hexagonal", "a": 1.0}
@@ -39,10 +39,15 @@ UNFIT = {
     "neighbours of cells": (
         {"neighbours": FOUR},
         "neighbours",
-        "take 8 neighbours around quadrilaterals",
+        "take 8 on the square or the rectangular lattice",
+    ),
+    "lattice of cells": (
+        {"lattice": {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 70.0}},
+        "neighbours",
+        "the neighbours of a site are not the corners of the cells around it",
     ),
     "lattice of elastic": (
-        {"lattice": {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 70.0}},
+        {"lattice": {"type": "oblique", "a": 1.0, "b": 1.0, "angle": 70.0}, "frame": MEAN},
         "rule",
         "works on the square and the rectangular lattice",
     ),
@@ -134,7 +139,7 @@ def test_copying_frames_are_warned_of_with_the_size_of_the_error(frame, warned):
 
 def test_cut_cells_have_the_area_of_the_outline(monkeypatch):
     """That of a disc, at second order, but for the slivers that are left out."""
-    monkeypatch.setattr(cutting, "SMALLEST", 0.0)
+    monkeypatch.setattr(cut_cells, "SMALLEST", 0.0)
     off = []
     for spacing in (0.2, 0.1, 0.05):
         lattice = SQUARE | {"a": spacing}
@@ -156,10 +161,10 @@ def test_cells_between_given_sites_are_whole():
     assert scene().cells.share.sum() == 5 * 4
 
 
-class Tiring(StrainGradient):
+class Tiring(pbdkit.Remembers, StrainGradient):
     type: Literal["tiring"] = "tiring"
 
-    def particle_state(self):
+    def remembered(self):
         return (pbdkit.Remembered("tiredness", "how tired it is", "1"),)
 
 

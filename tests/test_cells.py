@@ -8,12 +8,11 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, LATTICES, displace, experiment, scene_of, state_with
 
 import pbdkit
-from pbdkit.components.diagnostics import smallest_corner_area
 from pbdkit.interfaces import BasisSite, Cell, Vector
-from pbdkit.results.inversion import inside_out
+from pbdkit.interfaces.polygons import area_share
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
-from pbdkit.scene.mesh import lattice_cells
+from pbdkit.scene.cells import tiling_of
 from pbdkit.stepping.state import initial_state
 
 every_lattice = pytest.mark.parametrize("lattice", LATTICES)
@@ -57,7 +56,8 @@ def cell_of(lattice):
     ],
 )  # fmt: skip
 def test_the_cells_of_a_lattice_tile_the_plane(cell, corners):
-    polygons = [found.rest for found in lattice_cells(cell)]
+    slots = ((),) * len(cell.sites)
+    polygons = [found.rest for own in tiling_of(cell, slots).polygons for found in own]
     a, b = cell.vectors
     areas = [area_of(polygon) for polygon in polygons]
     assert min(areas) > 0
@@ -68,7 +68,7 @@ def test_the_cells_of_a_lattice_tile_the_plane(cell, corners):
 def measured(scene, u, *, intact_only=False):
     """The shares of all cells of a body whose displacements are u, (body particle, axis)."""
     moment = StateMoment(state_with(scene, u), Tables(scene))
-    return moment.over_cells(smallest_corner_area, intact_only=intact_only)
+    return moment.cells.over(area_share, intact_only=intact_only)
 
 
 @every_lattice
@@ -86,13 +86,18 @@ def test_all_cells_of_an_affine_deformation_have_the_share_of_its_determinant(la
         np.testing.assert_allclose(shares, determinant, rtol=0, atol=1e-13)
 
 
-def test_a_corner_folded_over_its_diagonal_is_inside_out_though_the_square_is_not():
-    """A square with a corner at (.4, .4): the whole has .4 of its area, that corner -.2."""
+def test_a_corner_folded_over_its_diagonal_makes_a_square_concave_and_not_inside_out():
+    """A square with a corner at (.4, .4) has .4 of its area, though the triangle there -.2."""
     scene = scene_of(2, 2)
     u = np.zeros((4, 2))
     u[3] = -0.6
     assert area_of([(0, 0), (1, 0), (0.4, 0.4), (0, 1)]) == pytest.approx(0.4)
-    np.testing.assert_allclose(measured(scene, u), [-0.2], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(measured(scene, u), [0.4], rtol=0, atol=1e-15)
+    warning = StateMoment(state_with(scene, u), Tables(scene)).cells.inside_out()
+    assert warning.startswith(
+        "the last state is folded: 1 of 1 cells have a corner that has turned over, the worst, at "
+        "particle 6, to -0.2 of its area at rest; "
+    )
 
 
 @every_lattice
@@ -103,7 +108,7 @@ def test_cells_with_a_broken_bond_count_where_they_are_asked_for(lattice):
     low = scene.raster.reference(scene.raster.body_rows).min(axis=0)
     high = scene.raster.reference(scene.raster.body_rows).max(axis=0)
     assert low[0] < 1.75 < high[0]
-    every, intact = (moment.over_cells(smallest_corner_area, intact_only=k) for k in (False, True))
+    every, intact = (moment.cells.over(area_share, intact_only=k) for k in (False, True))
     assert 0 < len(intact) < len(every)
     if lattice == "square":
         assert (len(intact), len(every)) == (16, 20)  # the crack runs through a column of four
@@ -116,9 +121,9 @@ def test_parts_of_a_broken_body_may_pass_each_other():
     u = np.zeros((30, 2))
     u[15:, 0] = -4.0
     broken = StateMoment(state_with(scene, u), Tables(scene))
-    assert inside_out(broken) is None
+    assert broken.cells.inside_out() is None
     whole = scene_of(6, 5)
-    warning = inside_out(StateMoment(state_with(whole, u), Tables(whole)))
+    warning = StateMoment(state_with(whole, u), Tables(whole)).cells.inside_out()
     assert warning == (
         "the last state is inside out: 4 of 20 cells have turned over, the worst, at particle "
         "23, to -3 of its area at rest; let the leaders go less far, or weaken the rule where it "
@@ -136,6 +141,7 @@ def test_the_warning_is_printed_by_run_and_silenced_by_quiet(call, tmp_path):
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 5), (6, 1), (1, 1)])
+@pytest.mark.filterwarnings("ignore:leaders. everybody leads")
 def test_a_body_without_a_cell_is_refused_by_the_diagnostic_and_never_inside_out(columns, rows):
     given = experiment(columns, rows, leaders=BOTH_ENDS_HELD[:1])
     asked = given | {"diagnostics": [{"type": "smallest-cell-area"}]}
@@ -158,9 +164,10 @@ class Areas(pbdkit.Diagnostic):
             x = [Vector(a.x + b.x, a.y + b.y) for a, b in zip(d, r, strict=True)]
             return sum(x[k - 1].x * x[k].y - x[k - 1].y * x[k].x for k in range(len(x))) / 2
 
-        return (now.over_cells(area).sum(),)
+        return (now.cells.over(area).sum(),)
 
 
+@pytest.mark.filterwarnings("ignore:leaders. there are none")
 def test_a_diagnostic_of_ones_own_gets_the_cells():
     given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
     ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)

@@ -43,7 +43,7 @@ FAULTS = [
     (rules.DriftsByRounding, "rests", "a body at rest moves by"),
     (rules.Divides, "is-finite", "where all neighbours meet in the particle"),
     (rules.Square, "returns-a-value-a-particle", "returns the shape (2, 4, 3)"),
-    (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 3, now 4 values"),
+    (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 2, now 3 values"),
     (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
     (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
     (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
@@ -74,8 +74,9 @@ FAULTS = [
     (others.Directed, "is-seen-alike-from-both-ends", "take lengths and shells, not directions"),
     (others.DeniesBreaking, "breaks-as-declared", "and `breaks` says yes"),
     (others.BreaksAtRest, "rests", "bonds of a body at rest break in step"),
-    (others.Measures, "returns-a-value-a-particle", "`breaks` returns float64: compare"),
-    (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return `pbdkit.Vector"),
+    (others.Measures, "changes-no-input", "`breaks` returned float64: compare, as in"),
+    (others.Tupled, "changes-no-input", "`fictitious` returned tuple: return a vector, as"),
+    (others.TakesOurName, "labels-its-variables", "the dataset has 'site' already"),
     (others.NoUnits, "labels-its-variables", "the variable 'extent' has no units"),
     (others.OneShort, "measures-what-it-declares", "'extent' has the shape (55,), not (56,)"),
     (others.Truncates, "measures-what-it-declares", "declared as i4 and measured as float64"),
@@ -93,7 +94,7 @@ FAULTS = [
     (remembering.DrawsAgain, "answers-the-same", "at random that nobody gave it"),
     (remembering.DrawsOnItsOwn, "continues-where-it-stopped", "a run made anew gives another"),
     (remembering.WritesBonds, "changes-no-input", "`draw` writes into `shell`"),
-    (remembering.WritesWear, "changes-no-input", "`update` writes into `own1`"),
+    (remembering.WritesWear, "changes-no-input", "`update` writes into what it is given: make"),
     (remembering.WritesTheWay, "changes-no-input", "`remember` writes into `own0`"),
     (remembering.OneTooMany, "renews-what-it-remembers", "returns 3 values, and 2 of the numbers"),
     (remembering.ForgetsTheWay, "renews-what-it-remembers", "`remember` returns 0 values, and 1"),
@@ -223,11 +224,11 @@ class Mine(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return SHARE * total[0] / total[2], total[1] / total[2]
+        return SHARE * total[0] / total[1]
 
 @pbdkit.hookimpl
 def pbdkit_components():
@@ -237,7 +238,7 @@ def pbdkit_components():
 
 @pytest.mark.parametrize(("share", "code"), [("0.5", 0), ("1e-9 + 0.5", 1)])
 def test_one_line_is_enough_for_pytest(tmp_path, share, code):
-    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "1e-9 + ")
+    source = SOURCE if code == 0 else SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +")
     (tmp_path / "my_rules.py").write_text(source.replace("SHARE", share))
     (tmp_path / "test_mine.py").write_text(ONE_LINE)
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
@@ -251,7 +252,9 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
 
 def test_plugins_check_tries_a_distribution(install, call):
     install("pbdkit-good", SOURCE.replace("SHARE", "0.5"))
-    install("pbdkit-bad", SOURCE.replace("SHARE *", "1e-9 +").replace("mine", "bad"))
+    install(
+        "pbdkit-bad", SOURCE.replace("SHARE *", "pbdkit.Vector(1e-9, 0.0) +").replace("mine", "bad")
+    )
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0
     assert "FollowerRule mine: 19 properties ran, 0 failed; 3 skipped: it remembers" in good.out

@@ -81,5 +81,5 @@ def test_readme_lists_the_two_commands_that_ci_runs():
     commands = re.findall(r"^python3 -m venv .*$", text, re.M)
     assert [c.split(" && ")[-1] for c in commands] == [
         ".venv/bin/pbdkit run paper/a",
-        ".venv/bin/pytest",
+        ".venv/bin/pytest -n auto --dist worksteal",
     ]

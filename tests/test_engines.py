@@ -164,11 +164,11 @@ class Halfway(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return SHARE * total[0] / total[2], SHARE * total[1] / total[2]
+        return SHARE * total[0] / total[1]
 
 
 SHARE = 0.5
@@ -186,7 +186,7 @@ class Uncompilable(Halfway):
 
     @staticmethod
     def apply(total, here, p):
-        return globals()["SHARE"] * total[0], 0.1 * total[1]
+        return globals()["SHARE"] * total[0]
 
 
 def test_a_rule_that_does_not_compile_runs_slower_and_says_so(monkeypatch):
@@ -252,8 +252,8 @@ class Reads(Halfway):
         def inner(x):
             return SHARE * x
 
-        x = halved(inner(FACTORS[0] * total[0])) / (total[2] + WHOLE)
-        return x, s * total[1] / total[2]
+        d, n = total
+        return pbdkit.Vector(halved(inner(FACTORS[0] * d.x)) / (n + WHOLE), s * d.y / n)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +273,7 @@ def test_what_cannot_be_told_apart_makes_a_new_kernel_every_time(monkeypatch):
 
 def test_functions_of_one_source_in_two_modules_have_kernels_of_their_own():
     """A kernel that is kept finds its functions by their modules, which may be gone."""
-    source = "def gather(d, r, w, p):\n    return d.x, d.y, 1.0\n"
+    source = "def gather(d, r, w, p):\n    return d, 1.0\n"
     one, other, again = {"__name__": "one"}, {"__name__": "other"}, {"__name__": "one"}
     for names in (one, other, again):
         exec(source, names)

@@ -60,6 +60,7 @@ def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size
     assert abs(ds.u.isel(time=-1, axis=1)).max() <= known["distance"]
 
 
+@pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
 @settings(
     max_examples=15,
     deadline=None,
@@ -149,11 +150,11 @@ class Pushed(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y
+        return (d,)
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / 4 + 0.01, total[1] / 4
+        return total[0] / 4 + pbdkit.Vector(0.01, 0.0)
 
 
 def test_a_part_that_is_pushed_on_for_ever_is_refused_by_name():

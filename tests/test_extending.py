@@ -28,6 +28,25 @@ PAGE_OF = {
     "FractureModel": "fracture.md",
     "Diagnostic": "diagnostic.md",
 }
+CAPABILITIES = {
+    "FollowerRule": (
+        pbdkit.Calibrated,
+        pbdkit.StoresEnergy,
+        pbdkit.Remembers,
+        pbdkit.Draws,
+        pbdkit.RenewsParticles,
+        pbdkit.AppliesTwice,
+    ),
+    "FractureModel": (
+        pbdkit.Remembers,
+        pbdkit.Draws,
+        pbdkit.RenewsBonds,
+        pbdkit.Softens,
+        pbdkit.StartsCracked,
+        pbdkit.BreaksAtStrain,
+    ),
+    "FramePolicy": (pbdkit.Anchors,),
+}
 EVERY = pytest.mark.parametrize("interface", INTERFACES.values(), ids=lambda i: i.__name__)
 
 
@@ -59,9 +78,19 @@ def test_a_page_tells_every_method_and_declaration(interface):
 
 
 @EVERY
+def test_a_page_tells_what_only_some_can_do(interface):
+    text = text_of(interface)
+    for capability in CAPABILITIES.get(interface.__name__, ()):
+        assert re.search(rf"`(pbdkit\.)?{capability.__name__}`", text)
+        assert getattr(capability, "__abstractmethods__", set()) <= in_code(text)
+
+
+@EVERY
 def test_a_page_gives_the_signatures(interface):
+    of = [interface, *CAPABILITIES.get(interface.__name__, ())]
     for name, arguments in re.findall(r"`(\w+)\(([\w, ]*)\)` \|", text_of(interface)):
-        parameters = inspect.signature(getattr(interface, name)).parameters
+        (method, *_) = (getattr(kind, name) for kind in of if hasattr(kind, name))
+        parameters = inspect.signature(method).parameters
         assert [p for p in parameters if p != "self"] == re.findall(r"\w+", arguments), name
 
 
@@ -129,7 +158,7 @@ def test_every_hook_is_told_with_its_signature():
 def test_every_page_is_reached_from_the_first():
     index = (PAGES / "README.md").read_text()
     assert {p.name for p in PAGES.glob("*.md")} - {"README.md"} == set(
-        re.findall(r"\]\((.*?)\)", index)
+        re.findall(r"\]\(([^)#]+)", index)
     )
 
 

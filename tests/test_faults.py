@@ -125,10 +125,10 @@ TEXTS = {
 
 @pytest.mark.parametrize(("text", "expected"), TEXTS.values(), ids=TEXTS)
 def test_a_file_is_refused_at_once(refused: Refused, text: str | bytes, expected: str) -> None:
-    begun = time.perf_counter()
+    begun = time.process_time()  # a busy machine does not decide
     message = refused(text)
     assert agrees(message, expected), message
-    assert time.perf_counter() - begun < 1.0
+    assert time.process_time() - begun < 1.0
 
 
 READ = {
@@ -246,6 +246,6 @@ def test_long_equal_motions_are_compared_at_once(tensile: dict[str, Any]) -> Non
     long = velocity(1e-9, 300_000)
     groups = [group(LEFT, long), group(CORNER, long)]
     experiment = pbdkit.Experiment(**tensile | {"leaders": groups, "steps": 300_000})
-    begun = time.perf_counter()
+    begun = time.process_time()
     assert len(build_scene(experiment).leading) == 2
-    assert time.perf_counter() - begun < 0.5
+    assert time.process_time() - begun < 0.5

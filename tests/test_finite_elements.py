@@ -5,7 +5,7 @@ import pytest
 from finite_elements.errors import load, relative_l2
 from finite_elements.problems import BAR, CANTILEVER, HOLE, PROBLEMS
 
-WHY = "finite-element references are recomputed with scikit-fem, of the extra dev"
+WHY = "finite-element references are recomputed with scikit-fem, of the group test"
 KEPT = [(name, cells) for name, p in PROBLEMS.items() for cells in p.kept]
 ELEMENTS = ("P1", "Q1", "P2", "Q2")
 

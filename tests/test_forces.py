@@ -28,7 +28,13 @@ import pbdkit
 from pbdkit.components.cell_stiffness import rectangle_matrix
 from pbdkit.interfaces import Stiffness
 from pbdkit.scene.scene import build_scene
-from pbdkit.scene.shares import cells_with_shares
+
+# Forces are those of given starts, and of any frame.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:leaders. there are none"),
+    pytest.mark.filterwarnings("ignore:diagnostics.. .* counts what frame points pull"),
+    pytest.mark.filterwarnings("ignore:frame. under 'none' edges"),
+]
 
 E, T = 7.0, 2.0
 REACTION = {"type": "reaction", "youngs_modulus": E, "thickness": T}
@@ -124,7 +130,8 @@ def test_the_energy_of_any_state_is_that_of_its_cells(lattice, body):
     lattice = scene.experiment.lattice
     K = rectangle_matrix(stiffness, lattice.a, getattr(lattice, "b", lattice.a))
     K = K.reshape(8, 8)
-    for patch, share in cells_with_shares(scene.raster, scene.cells):
+    for patch in scene.patches:
+        share = scene.cells.of(patch)
         for place in np.flatnonzero(share):
             corners = u[patch.rows(scene.raster, place)].ravel()
             expected += share.flat[place] * 0.5 * corners @ K @ corners
@@ -242,7 +249,7 @@ def test_reactions_without_leaders_are_refused():
     assert str(caught.value) == "diagnostics.0: 'reaction' is of leader groups, and there is none"
 
 
-class Loose(pbdkit.FollowerRule):
+class Loose(pbdkit.Calibrated, pbdkit.FollowerRule):
     """A calibrated rule without weights, for neighbours that come and go."""
 
     type: Literal["loose"] = "loose"
@@ -252,11 +259,15 @@ class Loose(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2], total[1] / total[2]
+        return total[0] / total[1]
+
+    @staticmethod
+    def force(total, here, p):
+        return total[0]
 
 
 def test_forces_of_neighbours_that_come_and_go_are_refused():
@@ -270,14 +281,17 @@ def test_forces_of_neighbours_that_come_and_go_are_refused():
     )
 
 
-def test_a_rule_without_forces_is_named():
-    parts = SQUARE | {"rule": {"type": "loose"}, "frame": {"type": "none"}}
-    with pytest.raises(pbdkit.PluginError) as caught:
-        pbdkit.run(pulled(parts), components=[Loose], progress=False)
-    assert str(caught.value) == (
-        "FollowerRule 'loose' failed when asked for forces at step 0: NotImplementedError: the "
-        "rule is not calibrated to a material: it knows no forces"
-    )
+class Forceless(pbdkit.Calibrated, pbdkit.FollowerRule):
+    """A calibrated rule that does not say what its forces are."""
+
+    type: Literal["forceless"] = "forceless"
+    stiffness, gather, apply = Loose.stiffness, Loose.gather, Loose.apply
+
+
+def test_a_calibrated_rule_without_forces_is_named():
+    parts = SQUARE | {"rule": {"type": "forceless"}, "frame": {"type": "none"}}
+    with pytest.raises(pbdkit.ExperimentError, match="components: Forceless lacks force"):
+        pbdkit.run(pulled(parts), components=[Forceless], progress=False)
 
 
 @pytest.mark.parametrize(("name", "off"), [("bar", 0.045), ("cantilever", 0.67)])

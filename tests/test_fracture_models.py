@@ -196,10 +196,10 @@ def test_an_onset_beyond_failure_is_refused():
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
     from pbdkit.results.netcdf import NetcdfSink
-    from pbdkit.running import run_into
+    from pbdkit.runs.course import Run, record
 
     given = bar(9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, **SHEET)
-    run_into(NetcdfSink(tmp_path / "o.nc"), build_scene(pbdkit.Experiment(**given)), progress=False)
+    record(Run(build_scene(pbdkit.Experiment(**given))), NetcdfSink(tmp_path / "o.nc"))
     with pbdkit.open(tmp_path / "o.nc") as ds:
         rows, steps = ds.crack_bond.values, ds.crack_step.values
         assert sorted(rows) == np.flatnonzero(ds.broken_step >= 0).tolist()

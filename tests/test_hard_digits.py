@@ -29,6 +29,7 @@ def naively_broken(spacing, origin):
 @every_lattice
 @pytest.mark.parametrize("neighbours", ["coordination-1", "coordination-2"])
 @pytest.mark.parametrize("h", [0.1, 0.7, 1.0, 1.23, 1 / 3, 1e-7, 123.4])
+@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
 def test_case_10_nothing_breaks_at_rest_at_a_threshold_of_the_rest_distance(lattice, neighbours, h):
     scaled = {k: h * v if k in ("a", "b") else v for k, v in LATTICES[lattice].items()}
     parts = {"lattice": scaled, "neighbours": neighbours, "leaders": BOTH_ENDS_HELD}
@@ -47,6 +48,7 @@ def test_case_10_a_hexagonal_threshold_written_as_the_spacing_breaks_nothing_at_
 
 
 @pytest.mark.parametrize("below", [1e-16, 2e-13, 5e-13, 8e-13, 2e-12, 1e-9])
+@pytest.mark.filterwarnings("ignore:leaders. there are none")
 def test_case_10_a_threshold_that_is_accepted_does_not_break_a_body_at_rest(below):
     fracture = {"type": "threshold", "thresholds": [1.0 - below]}
     try:
@@ -110,6 +112,7 @@ def test_case_18_single_precision_keeps_its_digits_in_displacements():
 
 @every_lattice
 @pytest.mark.parametrize("far", [1e8, 1e12])
+@pytest.mark.filterwarnings("ignore:neighbours. they lie along one line")
 def test_case_19_far_from_the_origin_the_same_moves_are_made(lattice, far):
     parts = {"lattice": LATTICES[lattice], "leaders": [HOLD_LEFT, pull_right(0.35, 0.1)]}
     near, away = near_and_away(far, **parts, steps=200)

@@ -13,9 +13,11 @@ from identity_cases import (
     RECTANGULAR,
     SQUARE,
     WEIGHTED,
+    experiment,
     identity,
     oblique,
 )
+from remembering_parts import Tiring
 
 import pbdkit
 from pbdkit.identity.picture import by_direction
@@ -127,6 +129,14 @@ def test_what_is_neither_is_told_why(rule, reason):
     assert (found.kind, found.symmetry, found.poisson_ratio) == ("neither", None, None)
     assert reason in found.reasons
     json.dumps(found.as_dict())
+
+
+def test_a_rule_that_remembers_is_identified_as_it_starts():
+    """Fresh particles follow the barycentre by their zeal: 0.9 of its diffusivity."""
+    found = pbdkit.identify(experiment(SQUARE, NEAREST, Tiring()), components=[Tiring])
+    fresh = identity(SQUARE, NEAREST, BARYCENTRE)
+    assert (found.kind, found.symmetry) == (fresh.kind, fresh.symmetry)
+    assert found.diffusivity == pytest.approx(0.9 * fresh.diffusivity, rel=1e-9)
 
 
 def test_growing_waves_are_stable_at_no_relaxation():

@@ -17,7 +17,7 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.stepping.state import initial_state
 from pbdkit.stepping.stepper import Stepper
 

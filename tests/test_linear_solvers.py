@@ -11,7 +11,7 @@ import pbdkit
 from pbdkit.equilibrium import linear
 from pbdkit.equilibrium.krylov import conjugate_gradients
 from pbdkit.equilibrium.linear import linear_solver
-from pbdkit.equilibrium.watching import StoppedError, Watch
+from pbdkit.equilibrium.watch import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
 NAMES = ["lu", "multigrid", "conjugate-gradients"]
@@ -182,7 +182,7 @@ def test_an_iteration_hears_of_it():
 
 
 def test_progress_is_told_in_phases_and_shares(monkeypatch):
-    from pbdkit.equilibrium.loading import settle
+    from pbdkit.equilibrium.increments import settle
     from pbdkit.scene.scene import build_scene
     from pbdkit.stepping.state import initial_state
 

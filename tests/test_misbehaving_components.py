@@ -17,7 +17,7 @@ Call = Callable[..., Any]
 
 ODD = "--set=rule={type: odd}"
 WHO = "FollowerRule 'odd' of pbdkit-odd 0.3 failed "
-GATHER, APPLY = "return d.x, d.y, 1.0", "return p.strength * dx / n, p.strength * dy / n"
+GATHER, APPLY = "return d, 1.0", "return p.strength * total[0] / total[1]"
 
 
 def method(body: str) -> tuple[str, str]:
@@ -28,16 +28,19 @@ def method(body: str) -> tuple[str, str]:
 WRONG = {
     "gather raises": (GATHER, "raise KeyError('g')", "KeyError: 'g' (pbdkit_odd.py, line 11)"),
     "gather exits": (GATHER, "raise SystemExit(4)", "SystemExit: 4 (pbdkit_odd.py, line 11)"),
-    "gather gives one": (GATHER, "return d.x", "ValueError: "),
-    "gather varies": (GATHER, "return (d.x, d.y, 1.0) if r.x > 0 else (d.x, d.y)", "ValueError: "),
-    "apply gives nothing": (APPLY, "return None", "`apply` returned None, not the move (x, y)"),
-    "apply gives one": (APPLY, "return dx", "`apply` returned ndarray, not the move (x, y)"),
-    "apply gives three": (APPLY, "return dx, dx, dx", "`apply` returned 3 values, not the move (x, y)"),
-    "apply gives a number": (APPLY, "return 0.0", "`apply` returned float, not the move (x, y)"),
-    "apply gives text": (APPLY, "return 'ab'", ""),
-    "unknown parameter": ("p.strength * dx", "p.strenth * dx", "AttributeError: 'Parameters' object has no attribute 'strenth'; did you mean 'strength'? (pbdkit_odd.py, line 16)"),
-    "constants are none": (*method("def weights(self, slot, setting): return None"), "`weights` returned None, not a tuple: write `(value,)`"),
-    "parameters are none": (*method("def parameters(self, setting): return None"), "TypeError: "),
+    "gather gives one number": (GATHER, "return d.x", ", not a tuple: write `(value,)`"),
+    "gather gives a bare vector": (GATHER, "return d", "`gather` returned Vector, not a tuple: write `(value,)`"),
+    "gather gives nothing": (GATHER, "return None", "`gather` returned None, not a tuple: write `(value,)`"),
+    "gather varies": (GATHER, "return (d, 1.0) if r.x > 0 else (d,)", "ValueError: "),
+    "apply gives nothing": (APPLY, "return None", "`apply` returned None: return a vector, as `pbdkit.Vector(x, y)`"),
+    "apply gives a tuple": (APPLY, "return total[0].x, total[0].y", "`apply` returned tuple: return a vector, as `pbdkit.Vector(x, y)`"),
+    "apply gives a vector of space": (APPLY, "return pbdkit.SpaceVector(*total[0], 0.0)", "`apply` returned SpaceVector: return a vector, as `pbdkit.Vector(x, y)`"),
+    "apply gives the sums": (APPLY, "return total", "`apply` returned tuple: return a vector, as `pbdkit.Vector(x, y)`"),
+    "apply gives a number": (APPLY, "return 0.0", "`apply` returned float: return a vector, as `pbdkit.Vector(x, y)`"),
+    "apply gives text": (APPLY, "return 'ab'", "`apply` returned str: return a vector, as `pbdkit.Vector(x, y)`"),
+    "unknown parameter": ("p.strength *", "p.strenth *", "AttributeError: 'Parameters' object has no attribute 'strenth'; did you mean 'strength'? (pbdkit_odd.py, line 15)"),
+    "constants are none": (*method("def weights(self, slot, setting): return None"), "TypeError: it returned NoneType, not numbers by name: {'k': 1.0}"),
+    "parameters are none": (*method("def parameters(self, setting): return None"), "TypeError: it returned NoneType, not numbers by name: {'k': 1.0}"),
 }  # fmt: skip
 
 
@@ -57,9 +60,9 @@ def test_run_and_check_name_the_rule_that_fails(
 
 
 NOT_REAL = {
-    "a shape of its own": (GATHER, "return d.x[..., 0], d.y[..., 0], 1.0", "ValueError: it returned the shape (4,) for particles of shape (4, 3): it is not elementwise"),
-    "apply asks": (APPLY, "return (dx / n / 2, dy / n / 2) if (dx > 0) | (dx <= 0) else (0.0, 0.0)", "ValueError: The truth value of an array with more than one element is ambiguous. Use a.any() or a.all(); choose with `pbdkit.where` in the place of `if`, `and` and `or` (pbdkit_odd.py, line 16)"),
-    "complex numbers": (APPLY, "return dx * 1j, dy", "ValueError: it returned values of complex128, not real numbers"),
+    "a shape of its own": (GATHER, "return pbdkit.Vector(d.x[..., 0], d.y[..., 0]), 1.0", "ValueError: it returned the shape (4,) for particles of shape (4, 3): it is not elementwise"),
+    "apply asks": (APPLY, "return total[0] / total[1] if (total[0].x > 0) | (total[0].x <= 0) else 0.0 * total[0]", "ValueError: The truth value of an array with more than one element is ambiguous. Use a.any() or a.all(); choose with `pbdkit.where` in the place of `if`, `and` and `or` (pbdkit_odd.py, line 15)"),
+    "complex numbers": (APPLY, "return 1j * total[0]", "ValueError: it returned values of complex128, not real numbers"),
 }  # fmt: skip
 
 
@@ -73,7 +76,7 @@ def test_what_is_no_move_is_caught_in_the_step(
 
 
 def test_a_move_that_is_not_finite(install: Install, call: Call) -> None:
-    source = rule("odd").replace(APPLY, "return dx * float('nan'), dy")
+    source = rule("odd").replace(APPLY, "return float('nan') * total[0]")
     install("pbdkit-odd", source, "0.3")
     result = call("check", "e.json", ODD)
     reason = "ValueError: its move at rest, or a derivative of it, is not finite"

@@ -102,7 +102,7 @@ def test_the_rule_is_short(call: Call) -> None:
     assert sum(len(ast.unparse(function.body).splitlines()) for function in functions) <= 5
 
 
-OWN = ("return r.x + d.x, r.y + d.y, 1.0", "return d.x, d.y, 1.0")
+OWN = ("return r + d, 1.0", "return d, 1.0")
 """The one line in which the mean displacement differs from the barycentre."""
 
 

@@ -114,8 +114,8 @@ class Still(pbdkit.FollowerRule):
         return (1.0,)
 
     @staticmethod
-    def apply(total: Any, here: Any, p: Any) -> tuple[Any, Any]:
-        return 0.0, 0.0
+    def apply(total: Any, here: Any, p: Any) -> Any:
+        return 0.0 * here.u
 
 
 class Rightwards(pbdkit.NeighbourMetric):

@@ -30,7 +30,7 @@ class Plain(pbdkit.FractureModel):
     type: str = "plain"
 
     def constants(self, slot):
-        return ()
+        return {}
 
     @staticmethod
     def breaks(d, r, c, p):
@@ -38,63 +38,63 @@ class Plain(pbdkit.FractureModel):
 
     @staticmethod
     def fictitious(u, r, p):
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
 
-class Keeping(Plain):
-    def bond_state(self):
+class Keeping(pbdkit.Remembers, Plain):
+    def remembered(self):
         return (Remembered("age", "age", "step"),)
 
 
-class Shortened(Keeping):
+class Shortened(pbdkit.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"age": np.zeros(3)}
 
 
-class Infinite(Keeping):
+class Infinite(pbdkit.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"age": np.full(len(bonds), np.inf)}
 
 
-class Misspelt(Keeping):
+class Misspelt(pbdkit.Draws, Keeping):
     def draw(self, bonds, generator):
         return {"agee": np.zeros(len(bonds))}
 
 
 class Twice(Keeping):
-    def bond_state(self):
+    def remembered(self):
         return (Remembered("age", "age", "step"), Remembered("age", "age", "step"))
 
 
 class Taken(Keeping):
-    def bond_state(self):
+    def remembered(self):
         return (Remembered("shell", "age", "step"),)
 
 
 class Worded(Keeping):
-    def bond_state(self):
+    def remembered(self):
         return (Remembered("the age", "age", "step"),)
 
 
 class Typed(Keeping):
-    def bond_state(self):
+    def remembered(self):
         return (Remembered("age", "age", "step", dtype="f4"),)
 
 
-class Generous(Keeping):
+class Generous(pbdkit.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
-        return c[0] + 1, c[0]
+        return c.age + 1, c.age
 
 
-class Bare(Keeping):
+class Bare(pbdkit.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
-        return c[0] + 1
+        return c.age + 1
 
 
-class Loose(Plain):
-    def bond_state(self):
+class Loose(pbdkit.Remembers, Plain):
+    def remembered(self):
         return Remembered("age", "age", "step")
 
 
@@ -135,26 +135,26 @@ class Constant(Plain):
         return 1.0
 
 
-class Fractional(Keeping):
-    def bond_state(self):
+class Fractional(pbdkit.RenewsBonds, Keeping):
+    def remembered(self):
         return (Remembered("age", "age", "step", dtype="i4"),)
 
     @staticmethod
     def update(d, r, c, p):
-        return (c[0] + 0.5,)
+        return (c.age + 0.5,)
 
 
-class Exploding(Keeping):
+class Exploding(pbdkit.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
-        return ((c[0] + 1.0) * 1e200,)
+        return ((c.age + 1.0) * 1e200,)
 
 
-class Writing(Keeping):
+class Writing(pbdkit.RenewsBonds, Keeping):
     @staticmethod
     def update(d, r, c, p):
-        c[0][...] = 1.0
-        return (c[0],)
+        c.age[...] = 1.0
+        return (c.age,)
 
 
 @pytest.mark.parametrize(
@@ -169,15 +169,15 @@ class Writing(Keeping):
         (Typed, "'age' has the dtype 'f4', not f8, i1, i2, i4, i8"),
         (Generous, "it returned 2 values, and it remembers 1 that change: declare `changes=False`"),
         (Bare, "step 1: `update` returned ndarray, not a tuple: write `\\(value,\\)`"),
-        (Loose, "asked what it remembers: `bond_state` returned Remembered, not a tuple"),
+        (Loose, "asked what it remembers: `remembered` returned Remembered, not a tuple"),
         (
             Tangled,
-            "'tangled' failed to place .*: `fictitious` returned tuple: return `pbdkit.Vector",
+            "'tangled' failed to place .*: `fictitious` returned tuple: return a vector, as",
         ),
         (Measured, "'plain' failed at step 1: `breaks` returned float64: compare, as in"),
         (Silent, "'plain' failed at step 1: `breaks` returned None: compare, as in"),
         (Misshapen, "'plain' failed at step 1: ValueError: operands could not be broadcast"),
-        (Constant, "asked for its constants: `constants` returned float, not a tuple"),
+        (Constant, "asked for its constants: TypeError: it returned float, not numbers by name"),
         (Fractional, "failed at step 1.*same_kind"),
         (Writing, "failed at step 1.*read-only"),
     ],
@@ -257,9 +257,9 @@ def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch):
 
         @staticmethod
         def update(d, r, c, p):
-            return c[2], c[3] + 1
+            return c.damage, c.visits + 1
 
-    monkeypatch.setattr("pbdkit.equilibrium.loading.MOST_SETTLINGS", 5)
+    monkeypatch.setattr("pbdkit.equilibrium.increments.MOST_SETTLINGS", 5)
     given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
     with pytest.raises(pbdkit.DivergedError, match="bonds still change after they settled 5 times"):
         pbdkit.run(given, progress=False)

@@ -15,7 +15,7 @@ import pbdkit
 from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.region import modes, slowest_swing
 from pbdkit.analysis.spectrum import spectrum
-from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state

@@ -15,7 +15,7 @@ from pbdkit.analysis.derivatives import derivative, derivatives
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium import linear
 from pbdkit.equilibrium.dissection import FEWEST, dissected
-from pbdkit.scene import cutting
+from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -153,9 +153,9 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
     }
     found = build_scene(pbdkit.Experiment(**given)).cells.share
     if body["type"] != "dogbone":  # whose distance says more than the way to its fillets
-        monkeypatch.setattr(cutting, "NEAREST", 3.0)
+        monkeypatch.setattr(cut_cells, "NEAREST", 3.0)
     else:
-        monkeypatch.setattr(cutting, "_width", lambda corners: 0.15)
+        monkeypatch.setattr(cut_cells, "_width", lambda corners: 0.15)
     assert np.array_equal(found, build_scene(pbdkit.Experiment(**given)).cells.share)
 
 

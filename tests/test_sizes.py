@@ -1,13 +1,17 @@
 """What `check` says of a scene's size comes out."""
 
+import json
+import subprocess
+import sys
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
 import pbdkit
 from pbdkit.analysis.forecast import forecast
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.running import run_into
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
 MIB = 2**20
@@ -28,7 +32,7 @@ def test_memory_and_output_are_what_check_says(change, tmp_path):
     path = tmp_path / "out.nc"
 
     tracemalloc.start()
-    run_into(NetcdfSink(path), build_scene(scene.experiment), progress=False)
+    record(Run(build_scene(scene.experiment)), NetcdfSink(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 
@@ -41,3 +45,51 @@ def test_counts_are_those_of_the_dataset():
     said, ds = forecast(build_scene(experiment)), pbdkit.run(experiment, progress=False)
     assert (said.particles, said.bonds) == (ds.sizes["particle"], ds.sizes["bond"])
     assert said.followers == (ds.kind[0] == 1).sum()
+
+
+PEAK = """
+import json, sys
+from pathlib import Path
+from pbdkit.api import load
+from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.running import run_into
+from pbdkit.scene.scene import build_scene
+from pbdkit.scene.sizes import sizes_of
+
+def run(side):
+    size = [f"body.columns={side}", f"body.rows={side}"]
+    scene = build_scene(load("paper/a", settings=[*sys.argv[3:], *size]))
+    run_into(NetcdfSink(Path(sys.argv[1]), replace=True), scene, progress=False)
+    status = Path("/proc/self/status").read_text()
+    return scene, 1024 * int(status.split("VmHWM:")[1].split()[0])
+
+_, little = run(12)
+scene, peak = run(int(sys.argv[2]))
+sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+print(json.dumps([peak - little, sizes.memory]))
+"""
+"""What a run takes more than one of a few particles in the same process, and what was foretold."""
+CALIBRATED = [
+    "rule={type: elastic, poisson_ratio: 0.3}",
+    "neighbours={type: chebyshev}",
+    "frame={type: natural}",
+]
+STRESS = "diagnostics=[{type: stress, youngs_modulus: 1.0}, {type: strain}]"
+ANEW = "neighbours={type: euclidean, radius: 1.2, reevaluate: true}"
+TAKING_MORE = {
+    "neighbours found anew": (200, [ANEW]),
+    "stress and strain": (300, [*CALIBRATED, STRESS]),
+    "an equilibrium": (100, [*CALIBRATED, "solver={type: equilibrium}", "leaders.1.until=3"]),
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")
+@pytest.mark.parametrize(("side", "settings"), TAKING_MORE.values(), ids=TAKING_MORE)
+def test_the_peak_of_the_process_is_what_check_says(side, settings, tmp_path):
+    """Within 35 %; of equilibria, which depend on the shape of the body, within a factor of two."""
+    settings = ["steps=3", "record.every=3", "diagnostics=[]", *settings]
+    call = [sys.executable, "-c", PEAK, str(tmp_path / "out.nc"), str(side), *settings]
+    used, said = json.loads(subprocess.run(call, capture_output=True, check=True).stdout)
+    rough = any("equilibrium" in setting for setting in settings)
+    assert said / used == pytest.approx(1.0, rel=1.0 if rough else 0.35)
+    assert said > used / 2

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.results.overlapping import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.results.recorder import Sink
-from pbdkit.running import run_into
+from pbdkit.results.second_thread import LARGE_BYTES, MOST_WAITING, OverlappingSink
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
 LARGE = np.zeros(LARGE_BYTES // 8)
@@ -104,8 +105,8 @@ def test_a_large_run_is_the_same_written_beside_or_not(tmp_path):
     )
     scene = build_scene(experiment)
     plain, beside = tmp_path / "plain.nc", tmp_path / "beside.nc"
-    run_into(NetcdfSink(plain), scene, progress=False)
-    run_into(OverlappingSink(NetcdfSink(beside)), scene, progress=False)
+    record(Run(scene), NetcdfSink(plain))
+    record(Run(scene), OverlappingSink(NetcdfSink(beside)))
     with pbdkit.open(plain) as one, pbdkit.open(beside) as other:
         for name in one.variables:
             np.testing.assert_array_equal(one[name], other[name])
@@ -122,7 +123,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
         return False
 
     with pytest.raises(pbdkit.StorageError, match="appeared while this run was going on"):
-        run_into(sink, scene, progress=False, stopping=appear)
+        record(Run(scene, watch=Watch(appear)), sink)
     assert path.read_text() == "somebody else's"
     (kept,) = (p for p in tmp_path.iterdir() if p != path)
     with pbdkit.open(kept) as ds:
@@ -136,7 +137,7 @@ def test_compression_changes_the_file_and_not_the_values(tmp_path):
         experiment = pbdkit.load("start", settings=settings)
         path = tmp_path / f"{compression}.nc"
         sink = NetcdfSink(path, compression=experiment.record.compression)
-        run_into(sink, build_scene(experiment), progress=False)
+        record(Run(build_scene(experiment)), sink)
         sizes[compression] = path.stat().st_size
     assert sizes["zlib"] < 0.3 * sizes["none"]
     with pbdkit.open(tmp_path / "none.nc") as one, pbdkit.open(tmp_path / "zlib.nc") as other:
@@ -147,7 +148,7 @@ def test_compression_changes_the_file_and_not_the_values(tmp_path):
 def test_chunks_serve_a_history_and_a_snapshot(tmp_path, columns, along_time):
     settings = [f"body.columns={columns}", f"body.rows={columns}", "steps=30"]
     path = tmp_path / "out.nc"
-    run_into(NetcdfSink(path), build_scene(pbdkit.load("start", settings=settings)), progress=False)
+    record(Run(build_scene(pbdkit.load("start", settings=settings))), NetcdfSink(path))
     with pbdkit.open(path) as ds:
         chunks = ds.position.encoding["chunksizes"]
         assert np.prod(chunks) * 8 <= 1.01 * 2**20

@@ -20,11 +20,12 @@ DOCS = Path(__file__).parent.parent
 PREFACE = """# The paper's claims, measured
 
 What R. dell'Erba (2018, [doi](https://doi.org/10.1007/s00161-018-0663-5); page and figure numbers
-of the pre-print) says of its model, against what pbdkit computes. Every sentence of the paper that
-can be tested is quoted in a few words, with what was measured and one of three verdicts: **comes
+of the pre-print) says of its model, against what pbdkit computes. Every sentence that we found to
+be testable is quoted in a few words, with what was measured and one of three verdicts: **comes
 out**, of the case as shipped; **comes out only with** a named variant, option or range; **does not
 come out**. A verdict is computed from the numbers beside it. Where a claim failed, thresholds, lag,
-shells, metric, frame and particles around the case were searched.
+shells, metric, frame and particles around the case were searched. Times of programs are those of
+the pages that are named; all else is measured here.
 
 The paper's time t is step t − 1: its figures at time 401 are of step 400. Particles have the
 paper's numbers. Speeds, durations, thresholds and K that the paper does not give are our choice and

@@ -5,6 +5,8 @@ from drawing import LINES, abreast, curves
 from runs import Floats, Sheet, run_text
 
 SIZE, STEPS = 61, 60
+PULLS, SPEED = (3.0, 5.2, 7.0), 1.2
+"""Thresholds of the torn sheet, which decide how far it is pulled, and its pull a step."""
 POINT = """version: 1
 name: point-{name}
 lattice: {lattice}
@@ -45,7 +47,7 @@ fracture: {{type: threshold, thresholds: [{threshold}], placement: {placement}}}
 leaders:
   - {{select: {{edge: left}}, motion: {{type: hold}}}}
   - select: {{edge: right}}
-    motion: {{type: velocity, velocity: [1.2, 0.0], steps: 10}}
+    motion: {{type: velocity, velocity: [{speed}, 0.0], steps: 10}}
     until: {until}
 steps: {steps}
 record: {{every: 10}}
@@ -103,7 +105,9 @@ def predicted(name: str) -> Floats:
 
 def torn_text(threshold: float, placement: float, until: int = 400, steps: int = SETTLED) -> str:
     """A sheet torn apart; its right column leads to step `until`."""
-    return TORN.format(threshold=threshold, placement=placement, until=until, steps=steps)
+    return TORN.format(
+        speed=SPEED, threshold=threshold, placement=placement, until=until, steps=steps
+    )
 
 
 def strain(sheet: Sheet) -> float:
@@ -169,7 +173,7 @@ along y (at most {signs["cross"]:.1g}), and a push along y spreads as one along 
 def _plasticity() -> str:
     placements = np.array([0.8, 0.9, 1.0, 1.1, 1.2])
     lines, table = {}, []
-    for threshold in (3.0, 4.5, 6.0):
+    for threshold in PULLS:
         strains = np.array([strain(run_text(torn_text(threshold, p))) for p in placements])
         lines[f"threshold {threshold:g}"] = (placements, strains)
         cells = " | ".join(f"{s:.5f}" for s in strains)
@@ -177,9 +181,9 @@ def _plasticity() -> str:
     assert len(lines) <= len(LINES)
     axes = ("placement λ", "strain that stays")
     graph = curves(lines, axes, "permanent-strain.png")
-    pieces = {f"λ = {p}": run_text(torn_text(6.0, p)) for p in (0.8, 1.0, 1.2)}
+    pieces = {f"λ = {p}": run_text(torn_text(5.2, p)) for p in (0.8, 1.0, 1.2)}
     picture = abreast(pieces, SETTLED, "pe1_intact", "lambda.png", (-2, 12, -2, 11))
-    loose = {p: run_text(torn_text(6.0, p, until=20, steps=300)) for p in (0.8, 1.0, 1.2)}
+    loose = {p: run_text(torn_text(5.2, p, until=20, steps=300)) for p in (0.8, 1.0, 1.2)}
     drift = {p: float(s.u[-1, -1, 5, 0] - s.u[-11, -1, 5, 0]) / 100 for p, s in loose.items()}
     head = " | ".join(f"λ = {p:g}" for p in placements)
     return f"""## Pieces after a fracture: plastic-like and elastic-like
@@ -202,12 +206,12 @@ the piece was pulled before it tore. It is the effect of a load on the broken ed
 and no plastic strain in the usual sense, which would depend on the deformation before.
 
 ```yaml
-{torn_text(6.0, 1.2, steps=400)}```
+{torn_text(5.2, 1.2, steps=400)}```
 
 Released at step 20 instead of held, the torn column, which has one broken side, settles at no place
 at all unless λ = 1: at the end of {300} steps it moves by {drift[0.8]:.4f}, {drift[1.0]:.4f} and
 {drift[1.2]:.4f} a step for λ = 0.8, 1 and 1.2, for ever, by (1 − λ)/4.
 
 ```yaml
-{torn_text(6.0, 1.2, until=20, steps=300)}```
+{torn_text(5.2, 1.2, until=20, steps=300)}```
 """

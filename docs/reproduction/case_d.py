@@ -1,21 +1,10 @@
 """Case d: fracture of the square lattice, with one and two shells."""
 
-import numpy as np
 from claims import Claim, Section
 from drawing import configurations, histories
-from runs import Floats, Sheet, edges_first, parted, rebound, run, steps_text, sweep
-
-COLUMN, ROW = 7, 5
-"""Particle 103: two columns left of the leaders, just above the middle."""
-THRESHOLDS = np.arange(2.25, 7.01, 0.25)
-SPARED = "fracture.frame_bonds=false"
-LASTING = 12
-"""A rebound that begins after this step is not of the pull, which ends at step 10."""
-
-
-def x_of(sheet: Sheet) -> Floats:
-    """x displacement of the marked particle."""
-    return sheet.u[:, COLUMN, ROW, 0]
+from one_threshold import TRIED, fitting, span, times, which
+from runs import Sheet, edges_first, parted, rebound, run, steps_text
+from torn_square import COLUMN, FAMILIES, LASTING, ROW, SPARED, THRESHOLDS, both, kinds, swept, x_of
 
 
 def section() -> Section:
@@ -23,63 +12,55 @@ def section() -> Section:
     names = ("paper/d1", "paper/d2", "paper/d2-frame-bonds", "paper/d2-chebyshev")
     pictures = [
         (
-            configurations(run("paper/d1"), [1, 5, 7, 8, 9, 100], "d1-pe1.png"),
-            "Figure 14: paper/d1, threshold 6: the rows part together at time 8",
+            configurations(run("paper/d1"), [1, 5, 6, 7, 100], "d1-pe1.png"),
+            "Figure 14: paper/d1: the rows part together at time 7",
         ),
         (
-            configurations(run("paper/d2"), [1, 7, 8, 9, 10, 100], "d2-pe1.png"),
-            "Figure 15: paper/d2, thresholds 6: the outermost rows part at time 9, the rest at 10",
-        ),
-        (
-            configurations(run("paper/d1-early"), [1, 5, 6, 7, 100], "d1-early-pe1.png"),
-            "Figure 14 at the paper's times: paper/d1-early, threshold 4.75",
-        ),
-        (
-            configurations(run("paper/d2-early"), [1, 5, 6, 7, 8, 100], "d2-early-pe1.png"),
-            "Figure 15 at the paper's times: paper/d2-early, thresholds 4.75",
+            configurations(run("paper/d2"), [1, 5, 6, 7, 8, 100], "d2-pe1.png"),
+            "Figure 15: paper/d2: the outermost rows part at time 7, the rest at 8",
         ),
         (
             histories({n: (run(n), COLUMN, ROW) for n in names}, "d-103.png", 150, log=True),
             "Figure 16: x, y and PE1 of particle 103 (134 with Chebyshev neighbours)",
         ),
     ]
+    assert (times("d1"), times("d2")) == ((7, 7), (7, 8))
     words = (
-        "1.2 a step for ten steps, then held, thresholds 6.0, all our choice: `paper/d1` with one "
-        "shell, `paper/d2` with two. “Parts” is the step in which the leader of a row loses its "
-        "last bond to the column beside it."
+        "1.2 a step for ten steps, then held, thresholds 5.2 as in f and g, all our choice: "
+        "`paper/d1` with one shell, `paper/d2` with two. “Parts” is the step in which the leader "
+        "of a row loses its last bond to the column beside it; “edges first”, that both outermost "
+        "rows part before every other row."
     )
-    return Section("Case d: simple fracture", words, [*_line(), *_rebound(), *_energy()], pictures)
+    claims = [*_line(), *_rebound(), *_energy()]
+    return Section("Case d: simple fracture", words, claims, pictures, both())
 
 
 def _line() -> list[Claim]:
     one, two, lag = run("paper/d1"), run("paper/d2"), run("paper/d1-lag")
-    swept = {
-        "one shell": sweep("paper/d1", THRESHOLDS),
-        "one shell and lag 1": sweep("paper/d1", THRESHOLDS, "frame.lag=1"),
-        "two shells": sweep("paper/d2", THRESHOLDS),
-        "24 neighbours": sweep("paper/d2-chebyshev", THRESHOLDS),
-    }
+    sheets_of = {label: swept(label) for label in FAMILIES if "spared" not in label}
     first = {
         label: [t for t, sheet in sheets.items() if edges_first(parted(sheet))]
-        for label, sheets in swept.items()
+        for label, sheets in sheets_of.items()
     }
-    share = {n: f"{len(first[n])} of {len(swept[n])} thresholds" for n in swept}
+    share = {n: f"{len(first[n])} of {len(sheets_of[n])} thresholds" for n in sheets_of}
     found = "; ".join(
-        f"{label}: {len(first[label])} of {len(swept[label])}"
+        f"{label}: {len(first[label])} of {len(sheets_of[label])}"
         + (f" ({', '.join(f'{t:g}' for t in first[label])})" if first[label] else "")
-        for label in swept
+        for label in sheets_of
     )
     rows = {label: steps_text(parted(s)) for label, s in (("1", one), ("2", two), ("lag", lag))}
-    far, slow = _ten()
+    (fast, at), (slow, _) = _longest(1.2), _longest(0.35)
+    late = _first_break_at_ten()
     return [
         Claim(
             "choosing a distance fracture of about 10 units",
-            f"at 1.2 a step for ten steps the longest bond is {far:.2f}, at 0.35 {slow:.2f}: a "
-            "threshold of 10 breaks nothing. The leaders would have to go on to step "
-            f"{_first_break_at_ten()}",
-            far > 10 or slow > 10,
+            "the longest bond where bonds are judged (leaders moved, followers not yet) is "
+            f"{fast:.2f} at 1.2 a step for ten steps, in step {at}, and {slow:.2f} at 0.35: a "
+            f"threshold of 10 breaks nothing, and the sheet parts up to {fast:.2f}. The leaders "
+            f"would have to go on to step {late}",
+            max(fast, slow) > 10,
             "1.2 a step for twenty steps instead of ten",
-            _first_break_at_ten() <= 20,
+            late <= 20,
         ),
         Claim(
             "the vertical fracture line is different in first or second gradient",
@@ -90,8 +71,8 @@ def _line() -> list[Claim]:
             "points close to the frame are detached before the others [first gradient]",
             f"`paper/d1`: {rows['1']}, all at once; `paper/d1-lag`: {rows['lag']}. Thresholds "
             f"from {THRESHOLDS[0]:g} to {THRESHOLDS[-1]:g} at which all rows part, and among them "
-            f"those at which the edges do first: {found}",
-            len(first["one shell"]) == len(swept["one shell"]),
+            f"those with edges first: {found}",
+            len(first["one shell"]) == len(sheets_of["one shell"]),
             f"`paper/d1-lag`, at {share['one shell and lag 1']}",
             edges_first(parted(lag)),
         ),
@@ -99,23 +80,27 @@ def _line() -> list[Claim]:
             "points close to the frame are detached before the others [second gradient]",
             f"`paper/d2`: {rows['2']}; at {share['two shells']} that were tried in all, and with "
             f"24 neighbours at {share['24 neighbours']}",
-            len(first["two shells"]) == len(swept["two shells"]),
+            len(first["two shells"]) == len(sheets_of["two shells"]),
             f"`paper/d2`, at {share['two shells']}",
             edges_first(parted(two)),
         ),
         Claim(
             "this effect is more marked in second gradient case",
-            f"edge before the middle by {_lead(one)} steps with one shell, {_lead(two)} with two; "
-            f"at {share['one shell']} and {share['two shells']}",
+            f"edges before the rest by {_lead(one)} steps in `paper/d1`, {_lead(two)} in "
+            f"`paper/d2` (at the same threshold); at {share['one shell']} and "
+            f"{share['two shells']}; under lag 1 with one shell at "
+            f"{share['one shell and lag 1']}",
+            len(first["one shell"]) < len(first["two shells"]) == len(sheets_of["two shells"]),
+            f"`paper/d2`, at {share['two shells']}",
             _lead(two) > _lead(one),
         ),
         Claim(
             "time (1, 5, 6, 7 and 100) … (1, 5, 6, 7, 8 and 100) [when it tears]",
-            f"at threshold 6 the sheets are whole to time 7 and 8; at 4.75 the rows part at times "
-            f"{_times(run('paper/d1-early'))} and {_times(run('paper/d2-early'))}",
-            max(_steps(one)) <= 6,
-            "`paper/d1-early` and `paper/d2-early`",
-            max(_steps(run("paper/d1-early"))) <= 6 and max(_steps(run("paper/d2-early"))) <= 7,
+            f"rows part at time {span('d1')} in `paper/d1` and {span('d2')} in `paper/d2`. Of the "
+            f"thresholds {TRIED[0]:g} to {TRIED[-1]:g} in steps of 0.1 the last rows part after "
+            f"time 5 and by 7 and 8 at {which(fitting('d1', 'd2'))}; at 6 at "
+            f"{_times('d1', 6.0)} and {_times('d2', 6.0)}",
+            5.2 in fitting("d1", "d2"),
         ),
     ]
 
@@ -124,20 +109,20 @@ def _steps(sheet: Sheet) -> list[int]:
     return [step for step in parted(sheet) if step is not None]
 
 
-def _times(sheet: Sheet) -> str:
-    return " ".join(str(step + 1) for step in _steps(sheet))
+def _times(case: str, threshold: float) -> str:
+    return " to ".join(str(time) for time in sorted(set(times(case, threshold) or ())))
 
 
 def _lead(sheet: Sheet) -> int:
-    """Steps by which the edge rows part before the middle ones."""
+    """Steps by which the edge rows part before the last ones."""
     rows = _steps(sheet)
     return max(rows) - max(rows[0], rows[-1])
 
 
-def _ten() -> tuple[float, float]:
-    """The longest bond between the leaders and the column beside them, at 1.2 and 0.35."""
-    fast, slow = run("paper/a-text").u, run("paper/a").u
-    return tuple(1 + float((u[:11, 9, 5, 0] - u[:11, 8, 5, 0]).max()) for u in (fast, slow))  # type: ignore[return-value]
+def _longest(speed: float) -> tuple[float, int]:
+    """The longest bond of d1, where none breaks, and its step."""
+    pull = f"leaders.1.motion.velocity=[{speed}, 0.0]"
+    return run("paper/d1", "fracture.thresholds=[1000.0]", pull, "steps=20").longest_bond()
 
 
 def _first_break_at_ten() -> int:
@@ -152,12 +137,9 @@ def _rebound() -> list[Claim]:
     back, dip = rebound(x_of(spared)), rebound(x_of(wide))
     assert back is not None
     assert dip is not None
-    families = {
-        "two shells": sweep("paper/d2", THRESHOLDS),
-        "two shells, frame bonds spared": sweep("paper/d2", THRESHOLDS, SPARED),
-        "24 neighbours": sweep("paper/d2-chebyshev", THRESHOLDS),
-    }
-    found = "; ".join(f"{label}: {_kinds(sheets)}" for label, sheets in families.items())
+    families = {n: swept(n) for n in FAMILIES if "24" in n or n.startswith("two")}
+    spared_one = rebound(x_of(run("paper/d1", SPARED)))
+    found = "; ".join(f"{label}: {kinds(sheets)}" for label, sheets in families.items())
     kept = spared.residual()
     return [
         Claim(
@@ -173,10 +155,11 @@ def _rebound() -> list[Claim]:
         ),
         Claim(
             "differently from first gradient mode",
-            f"one shell: none at {len(sweep('paper/d1', THRESHOLDS))} thresholds"
-            if not any(rebound(x_of(s)) for s in sweep("paper/d1", THRESHOLDS).values())
-            else "one shell rebounds too at some thresholds",
-            rebound(x_of(one)) is None,
+            f"one shell rebounds at {kinds(swept('one shell'))}, but `paper/d2` at no more. With "
+            f"frame bonds spared one shell {'does' if spared_one else 'does not'}, two shells do",
+            rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
+            "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",
+            spared_one is None,
         ),
         Claim(
             "some fast point on its right try to deviate it to the right",
@@ -195,13 +178,6 @@ def _rebound() -> list[Claim]:
             max(one.residual(), two.residual()) < 0.1,
         ),
     ]
-
-
-def _kinds(sheets: dict[float, Sheet]) -> str:
-    """How many rebound at all, and how many of them after the pull."""
-    lows = [low[0] for low in (rebound(x_of(s)) for s in sheets.values()) if low]
-    after = sum(low > LASTING for low in lows)
-    return f"{len(lows)} of {len(sheets)} ({after} of them after the pull)"
 
 
 def _energy() -> list[Claim]:

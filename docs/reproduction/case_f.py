@@ -3,6 +3,7 @@
 import numpy as np
 from claims import Claim, Section
 from drawing import configurations, histories
+from one_threshold import same_parameters, which
 from runs import Floats, Sheet, in_the_gap, parted, rebound, run, steps_text
 
 COLUMN, ROW = 7, 4
@@ -27,11 +28,6 @@ def dent(sheet: Sheet) -> float:
     """How far the outer rows of the torn surface stand out beyond its middle, at the end."""
     surface = sheet.u[-1, -2, :, 0]
     return float(min(surface[:2].mean(), surface[-2:].mean()) - surface[4:6].mean())
-
-
-def which(thresholds: list[float]) -> str:
-    """A list of thresholds in words."""
-    return ", ".join(f"{t:g}" for t in thresholds) or "none"
 
 
 def section() -> Section:
@@ -59,7 +55,9 @@ def section() -> Section:
         "Hexagonal lattice, two layers of frame, thresholds 5.2, otherwise as d: `paper/f1`, "
         "`paper/f2`."
     )
-    return Section("Case f: the lattice", words, [*_one_shell(), *_two_shells()], pictures)
+    return Section(
+        "Case f: the lattice", words, [same_parameters(), *_one_shell(), *_two_shells()], pictures
+    )
 
 
 def _one_shell() -> list[Claim]:

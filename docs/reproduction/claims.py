@@ -30,12 +30,13 @@ class Claim:
 
 @dataclass(frozen=True)
 class Section:
-    """A case on the page: words before, pictures (file, caption) and claims."""
+    """A case on the page: words before, pictures (file, caption), claims and words after."""
 
     title: str
     words: str
     claims: list[Claim]
     pictures: list[tuple[str, str]] = field(default_factory=list)
+    after: str = ""
 
 
 def render(section: Section) -> str:
@@ -45,7 +46,7 @@ def render(section: Section) -> str:
         parts.append(f"![{caption}](pictures/reproduction/{file})\n\n*{caption}*\n")
     parts.append("| the paper says | measured | verdict |\n| --- | --- | --- |")
     parts += [f"| “{c.quote}” | {c.measured} | **{c.verdict}** |" for c in section.claims]
-    return "\n".join(parts) + "\n"
+    return "\n".join(parts) + "\n" + (f"\n{section.after}\n" if section.after else "")
 
 
 def counted(sections: list[Section]) -> str:

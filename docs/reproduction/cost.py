@@ -1,8 +1,13 @@
-"""How many steps an equilibrium takes."""
+"""How many steps an equilibrium takes, and who can share their work."""
+
+import json
+from pathlib import Path
 
 import numpy as np
 from claims import Claim
-from runs import run_parts
+from runs import run, run_parts
+
+MEASURED = Path(__file__).parents[1] / "performance.json"
 
 
 def cost() -> list[Claim]:
@@ -21,8 +26,30 @@ def cost() -> list[Claim]:
             growth < 1.5,
             "sheets of some ten particles a side",
             steps[0] < 400,
-        )
+        ),
+        _shared(),
     ]
+
+
+def _shared() -> Claim:
+    """Threads of a processor; no graphics processor was measured."""
+    one, two = (run("paper/a", "solver.engine=compiled", f"solver.threads={n}") for n in (1, 2))
+    differ = float(np.abs(one.position - two.position).max())
+    rows = json.loads(MEASURED.read_text("utf-8"))["threads"]
+    gains = {r["size"]: r["one_ns"] / r["two_ns"] for r in rows if r["rule"] == "barycentre"}
+    return Claim(
+        "the job can be parallelized between the GPU cores",
+        "on a GPU nothing was measured: pbdkit has no engine for one. What was: every follower is "
+        "computed from the intermediate configuration alone, so that the work can be split at "
+        f"will, and two threads of a processor give the same positions (they differ by {differ:g} "
+        "in case a). Two threads are "
+        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one "
+        "([performance](performance.md#threads)), slower in small sheets",
+        False,
+        "threads of a processor, in sheets of "
+        f"{' and '.join(f'{n}²' for n, g in gains.items() if g > 1.5)}; a GPU is not measured",
+        differ == 0.0 and max(gains.values()) > 1.5,
+    )
 
 
 def _settling(size: int) -> int:

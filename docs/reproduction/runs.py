@@ -11,7 +11,7 @@ import pbdkit
 from pbdkit.experiment.source import read_text
 
 Floats = NDArray[np.float64]
-FRAME = 2
+LEADER, FRAME = 0, 2
 COLUMNS = ROWS = 10
 """Every case is a grid of this size; its marked particles are named by column and row from 0."""
 
@@ -56,6 +56,15 @@ class Sheet:
         """The largest |u| of the piece left of the torn column, at the last step."""
         return float(np.linalg.norm(self.u[-1, :-1], axis=-1).max())
 
+    def longest_bond(self) -> tuple[float, int]:
+        """The length of the longest bond where bonds are judged, and its step: in the intermediate
+        configuration, with the leaders where the step takes them and all else where it was."""
+        place, leads = self.position, self.ds["kind"].values[1:, :, None] == LEADER
+        judged = np.where(leads, place[1:], place[:-1])
+        across = judged[:, self.ds["bond"].values]
+        length = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=-1).max(axis=1)
+        return float(length.max()), int(length.argmax()) + 1
+
 
 @cache
 def run(name: str, *settings: str) -> Sheet:
@@ -71,8 +80,9 @@ def run_parts(**parts: Any) -> Sheet:
     return Sheet(pbdkit.run(pbdkit.Experiment(**parts), progress=False))
 
 
+@cache
 def run_text(text: str) -> Sheet:
-    """An experiment in YAML, as it stands on a page."""
+    """An experiment in YAML, as it stands on a page; each is run once."""
     experiment = pbdkit.Experiment.build(read_text(text, "page"))
     return Sheet(pbdkit.run(experiment, progress=False))
 
@@ -94,10 +104,9 @@ def parted(sheet: Sheet) -> list[int | None]:
 
 
 def edges_first(rows: list[int | None]) -> bool:
-    """Whether both outermost rows part before the middle two."""
+    """Whether both outermost rows part before every other row."""
     late = [10**6 if step is None else step for step in rows]
-    middle = min(late[len(late) // 2 - 1 : len(late) // 2 + 1])
-    return max(late[0], late[-1]) < middle
+    return max(late[0], late[-1]) < min(late[1:-1])
 
 
 def rebound(x: Floats, least: float = 0.01) -> tuple[int, float, float] | None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from pbdkit.analysis.expense import excess
 from pbdkit.analysis.lagging import Lag, lag_of
 from pbdkit.analysis.matrices import Entries, connected
 from pbdkit.analysis.operator import StepOperator, step_operator
@@ -21,14 +23,11 @@ from pbdkit.analysis.region import (
     swings_below,
 )
 from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
-from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.interfaces import Anchors
 from pbdkit.scene.scene import Scene
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
-MOST_FOLLOWERS = 50_000
-"""Above this the spectrum would take many seconds, and is left out."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +53,9 @@ class Analysis:
     @cached_property
     def spectrum(self) -> Spectrum | None:
         """Of the step as the solver makes it, with relaxation, memory and lag."""
-        own, solver = self._rule_spectrum, self.scene.experiment.solver
+        own, solver = self._rule_spectrum, self.scene.experiment.stepping
         if own is None:
-            reach = self._within_reach
-            return spectrum(self.operator.augmented().matrix()) if reach else None
+            return self._spectrum_of(lambda: self.operator.augmented().matrix(), self._lags)
         if solver.relaxation == 1.0 and solver.memory == 0.0:
             return own
         # Radius and ends of what it is taken to are met at the ends of a real spectrum.
@@ -67,20 +65,41 @@ class Analysis:
     @property
     def _within_reach(self) -> bool:
         """Whether there is an operator, and it is small enough to be looked at."""
-        fixed = self.scene.experiment.neighbours.nearness() is None
-        return fixed and self.scene.raster.count <= MOST_FOLLOWERS
+        return not (self.scene.experiment.neighbours.nearness() or excess(self.scene))
+
+    @property
+    def left_out(self) -> list[str]:
+        """What is not known because it would take too long."""
+        why = ""
+        if too_many := excess(self.scene):
+            why = f"parts that no leader reaches too: the body is too large, {too_many}"
+        elif self._within_reach and self.spectrum is None:
+            why = "eigenvalues lie too close together, as in long bodies; a shorter one shows more"
+        return [f"analysis: the spectrum and the lag are left out, {why}"] if why else []
+
+    @property
+    def _lags(self) -> bool:
+        return bool(self.scene.frame and self.scene.frame.map.lag)
 
     @cached_property
     def _rule_spectrum(self) -> Spectrum | None:
         """Of the rule's own step, with neither relaxation nor memory; None where the frame lags."""
-        lags = self.scene.frame is not None and self.scene.frame.map.lag
-        return None if lags or not self._within_reach else spectrum(self._rule_matrix())
+        return self._spectrum_of(self._rule_matrix, not self._lags)
+
+    def _spectrum_of(self, matrix: Callable[[], Any], asked: bool) -> Spectrum | None:
+        """None where it is not asked for, cannot be had, or not soon."""
+        if not asked or not self._within_reach:
+            return None
+        try:
+            return spectrum(matrix())
+        except RuntimeError:  # too dear, or not found by ARPACK
+            return None
 
     def _rule_matrix(self) -> Any:
         """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
         no memory left."""
         now, before = self.operator.entries_now, self.operator.entries_before
-        share, every = 1.0 / self.scene.experiment.solver.relaxation, np.arange(now.shape[0])
+        share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(now.shape[0])
         rest = Entries(every, every, np.full(len(every), 1.0 - share), now.shape)
         return rest.plus(now.plus(before), share).matrix()
 
@@ -98,7 +117,7 @@ class Analysis:
     def largest_stable_relaxation(self) -> float | None:
         """The relaxation below which all modes shrink, with the memory as it is:
         2 (1 + b) / (1 - λ_min) for real eigenvalues."""
-        own, memory = self._rule_spectrum, self.scene.experiment.solver.memory
+        own, memory = self._rule_spectrum, self.scene.experiment.stepping.memory
         return largest_stable_relaxation(own.eigenvalues, memory) if own else None
 
     @property
@@ -134,7 +153,10 @@ class Analysis:
         known = own.eigenvalues
         if 0.0 < memory < 1.0 and own.largest > (edge := swings_below(relaxation, memory)):
             # The slowest modes creep back. Of large groups, those that just swing are not known.
-            known = np.append(known, just_below(self._rule_matrix(), edge))
+            try:
+                known = np.append(known, just_below(self._rule_matrix(), edge))
+            except RuntimeError:  # too dear, or not found by ARPACK
+                return None
         return slowest_swing(modes(known, relaxation, memory))
 
     @property
@@ -153,7 +175,7 @@ class Analysis:
 
         None where no leader moves steadily, steps do not settle or are not made, or it would cost
         too much."""
-        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        straight = not self.scene.experiment.solver.makes_steps
         if straight or not self._within_reach or not self.stable:
             return None
         return lag_of(self.scene)
@@ -175,7 +197,7 @@ class Analysis:
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
         led[label[np.unique(operator.entries_led.rows)]] = True
-        numbers = operator.followers[np.arange(len(label)) // 2] + 1
+        numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)
 
@@ -194,14 +216,14 @@ class Analysis:
                 f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
                 "nothing holds it"
             )
-        straight = isinstance(self.scene.experiment.solver, Equilibrium)
+        straight = not self.scene.experiment.solver.makes_steps
         if straight and self.largest_stable_relaxation:
             pass  # it makes no steps, and steps with that relaxation would lead there too
         elif self.stable is False:
             bound = self.largest_stable_relaxation
             remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
             found.append(
-                f"solver.relaxation: {self.scene.experiment.solver.relaxation:g} diverges, the "
+                f"solver.relaxation: {self.scene.experiment.stepping.relaxation:g} diverges, the "
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"
             )
         elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
@@ -209,7 +231,7 @@ class Analysis:
                 "solver.relaxation: a mode that changes its sign in every step never decays; take "
                 "a relaxation below 1"
             )
-        return found + self._late()
+        return found + self._late() + self.left_out
 
     def _late(self) -> list[str]:
         """Whether the body is left behind its equilibrium by more than a bond."""

@@ -1,4 +1,4 @@
-"""Who moves with whom: the blocks of 2 × 2 between particles that a step operator is made of."""
+"""Who moves with whom: the blocks, (axis, axis), that a step operator is made of."""
 
 from __future__ import annotations
 
@@ -16,34 +16,37 @@ Indices = NDArray[np.signedinteger[Any]]
 
 @dataclass
 class Couplings:
-    """Blocks of 2 × 2 at (row, column), in parts, counted in particles; those of one place add.
+    """Blocks (axis, axis) at (row, column), in parts, counted in particles; those of one place add.
 
-    `shape` is in particles. Blocks that are the same everywhere may be views of one.
+    `shape` is in particles, `axes` how many space has. Blocks that are the same everywhere may be
+    views of one.
     """
 
     shape: tuple[int, int]
+    axes: int
     parts: list[tuple[Indices, Indices, Floats]] = field(default_factory=list)
 
     def add(self, rows: Indices, columns: Indices, blocks: Floats) -> None:
-        """Adds blocks, (entry, 2, 2)."""
+        """Adds blocks, (entry, axis, axis)."""
         if len(rows):
             self.parts.append((rows, columns, blocks))
 
     def add_scaled_identity(self, rows: Indices, factor: float) -> None:
         """Adds factor · 1 on the diagonal of some rows."""
-        block = factor * np.eye(2)
-        self.add(rows, rows, np.broadcast_to(block, (len(rows), 2, 2)))
+        block = factor * np.eye(self.axes)
+        self.add(rows, rows, np.broadcast_to(block, (len(rows), *block.shape)))
 
     def entries(self) -> Entries:
-        """Of the matrix with the unknowns 2n (x) and 2n + 1 (y) of particle n."""
+        """Of the matrix with the unknowns 2n (x) and 2n + 1 (y) of particle n in the plane, 3n to
+        3n + 2 in space."""
         found: list[tuple[Indices, Indices, Floats]] = []
+        axes = self.axes
         for rows, columns, blocks in self.parts:
-            for a in (0, 1):
-                for b in (0, 1):
-                    value = blocks[:, a, b]
-                    kept = value != 0.0
-                    found.append((2 * rows[kept] + a, 2 * columns[kept] + b, value[kept]))
-        return _joined(found, (2 * self.shape[0], 2 * self.shape[1]))
+            for a, b in np.ndindex(axes, axes):
+                value = blocks[:, a, b]
+                kept = value != 0.0
+                found.append((axes * rows[kept] + a, axes * columns[kept] + b, value[kept]))
+        return _joined(found, (axes * self.shape[0], axes * self.shape[1]))
 
     def between(self, a: int, b: int) -> Entries:
         """Of the matrix from axis b to axis a alone, an unknown a particle."""
@@ -59,16 +62,17 @@ class Couplings:
         return any(_of_one(blocks)[:, a, b].any() for _, _, blocks in self.parts)
 
     def is_isotropic(self) -> bool:
-        """Whether both axes move alike."""
+        """Whether all axes move alike."""
         blocks = [_of_one(blocks) for _, _, blocks in self.parts]
-        return all(np.array_equal(b[:, 0, 0], b[:, 1, 1]) for b in blocks)
+        first, *others = range(self.axes)
+        return all(np.array_equal(b[:, first, first], b[:, a, a]) for b in blocks for a in others)
 
     def times(self, vectors: Floats) -> Floats:
-        """The product with vectors, (particle, 2)."""
-        product = np.zeros((self.shape[0], 2))
+        """The product with vectors, (particle, axis)."""
+        product = np.zeros((self.shape[0], self.axes))
         for rows, columns, blocks in self.parts:
             terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
-            for axis in (0, 1):
+            for axis in range(self.axes):
                 product[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
         return product
 
@@ -83,6 +87,11 @@ def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
 def is_one(blocks: Floats) -> bool:
     """Whether the blocks are views of a single one."""
     return len(blocks) > 1 and blocks.strides[0] == 0
+
+
+def frame_matrices(weights: Floats, axes: int) -> Floats:
+    """(entry, axis, axis): a frame's weights as matrices."""
+    return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
 
 
 def _of_one(blocks: Floats) -> Floats:

@@ -11,7 +11,6 @@ from pbdkit.analysis.analysis import NO_REMEDY, Analysis
 from pbdkit.analysis.region import NEUTRAL
 from pbdkit.analysis.symbol import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import FOLLOWER
@@ -57,7 +56,7 @@ def forecast(scene: Scene) -> Forecast:
     analysis = Analysis(scene)
     exact = analysis.warnings()
     waves = [] if analysis.spectrum else _growing_waves(scene)
-    solver = scene.experiment.solver
+    solver = scene.experiment.stepping
     swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
     return Forecast(
         particles=scene.raster.count,
@@ -87,7 +86,7 @@ def quick_warnings(scene: Scene) -> tuple[str, ...]:
 def prediction(scene: Scene) -> dict[str, Any]:
     """What the dataset keeps of the bound from plane waves; empty where there is none. `stable` is
     None where no wave grows and waves do not bound the body."""
-    bound, memory = wave_bound(scene), scene.experiment.solver.memory
+    bound, memory = wave_bound(scene), scene.experiment.stepping.memory
     if bound is None:
         return {}
     return {
@@ -116,11 +115,11 @@ def _doubts(scene: Scene) -> list[str]:
 
 
 def _growing_waves(scene: Scene) -> list[str]:
-    bound, solver = wave_bound(scene), scene.experiment.solver
+    bound, solver = wave_bound(scene), scene.experiment.stepping
     if bound is None or bound.radius <= 1.0 + NEUTRAL:
         return []
     stable = bound.largest_stable_relaxation(solver.memory)
-    if stable and isinstance(solver, Equilibrium):
+    if stable and not scene.experiment.solver.makes_steps:
         return []
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
     return [

@@ -17,7 +17,7 @@ lattice, l long between its ends and h apart, that is 4 v l² / (9 √3 h²) at 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.matrices import connected
-from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.analysis.operator import step_operator
 from pbdkit.experiment.motions import Oscillation
 from pbdkit.scene.leading import Leading
 from pbdkit.scene.scene import Scene
@@ -58,97 +58,20 @@ class Lag:
         return self.steady if self.reached is None else self.reached
 
 
-@dataclass(frozen=True)
-class _Interval:
-    """Steps in which all leaders keep their velocities, (particle, axis) for each leading group."""
-
-    first: int
-    last: int
-    velocities: tuple[tuple[Leading, Floats], ...]
-
-    @property
-    def speed(self) -> float:
-        """Of the fastest leader."""
-        return max((float(np.hypot(*v.T).max()) for _, v in self.velocities), default=0.0)
-
-
 def lag_of(scene: Scene) -> Lag | None:
     """The lag in the fastest interval of two steps or more: a jump of one step has no speed, nor
     has a leader that swings. None where no leader moves so, or the body has no equilibrium.
 
     Raises ExperimentError where neighbours are found anew.
     """
-    intervals = [i for i in _intervals(scene) if i.last > i.first]
-    fastest = max(intervals, key=lambda i: i.speed, default=None)
-    if fastest is None or fastest.speed == 0.0:
+    first, last, speed = _fastest(scene)
+    if speed == 0.0:
         return None
-    operator = step_operator(scene, step=fastest.first)
+    operator = step_operator(scene, step=first)
     v = np.zeros((len(operator.leaders), 2))
-    for leading, velocity in fastest.velocities:
-        v[np.searchsorted(operator.leaders, leading.rows)] = velocity
-    trailing = _trailing(operator, v, scene.frame.map.lag if scene.frame else 0)
-    if trailing is None:
-        return None
-    steps = fastest.last - fastest.first + 1
-    return Lag(fastest.first, fastest.last, fastest.speed, trailing.steady(), trailing.after(steps))
-
-
-def _intervals(scene: Scene) -> Iterator[_Interval]:
-    """Between any two moments at which a leader group begins, ends or changes its velocity."""
-    steps = scene.experiment.steps
-    moments = {1, steps + 1}
     for leading in scene.leading:
-        group = leading.group
-        moments |= {group.from_, group.last(steps) + 1}
-        moments |= {group.from_ + n for n in group.motion.knots()}
-    for first, after in pairwise(sorted(m for m in moments if 1 <= m <= steps + 1)):
-        some = [leading for leading in scene.leading if leading.group.leads(first)]
-        velocities = tuple((leading, _velocity(leading, first)) for leading in some)
-        yield _Interval(first, after - 1, velocities)
-
-
-def _velocity(leading: Leading, step: int) -> Floats:
-    """Of a group's particles in a step, (particle, axis); a rotation turns it on the way."""
-    n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
-    if isinstance(motion, Oscillation):
-        return np.zeros_like(at, dtype=float)
-    before = motion.offset(n - 1, at) if n > 1 else 0.0
-    velocity: Floats = np.zeros_like(at, dtype=float) + (motion.offset(n, at) - before)
-    return velocity
-
-
-@dataclass(frozen=True)
-class _Trailing:
-    """The recurrence of e for the unknowns `who` that moving leaders reach: P, Q, what solves
-    A x = b, and what pushes in the first step, and in all others."""
-
-    who: NDArray[np.intp]
-    now: Any
-    before: Any
-    solve: Solve
-    first_push: Floats
-    push: Floats
-
-    def steady(self) -> float:
-        """The largest distance once it is steady."""
-        return self._largest(self.solve(self.push))
-
-    def after(self, steps: int) -> float | None:
-        """The largest distance after so many steps; None where that is too dear."""
-        dense = isinstance(self.now, np.ndarray)
-        if steps * (self.now.size if dense else self.now.nnz) > DEAREST:
-            return None
-        before, error = np.zeros_like(self.push), self.first_push
-        for _ in range(steps - 1):
-            before, error = error, self.now @ error + self.before @ before + self.push
-        return self._largest(error)
-
-    def _largest(self, error: Floats) -> float:
-        return float(np.sqrt(np.bincount(self.who // 2, error * error).max()))
-
-
-def _trailing(operator: StepOperator, v: Floats, lag: int) -> _Trailing | None:
-    """None where no follower feels the leaders, or A has no inverse."""
+        if leading.group.leads(first):
+            v[np.searchsorted(operator.leaders, leading.rows)] = _velocity(leading, first)
     pull = operator.couplings_led.times(v).ravel()
     shown = operator.couplings_shown.times(v).ravel()
     both = operator.entries_now.plus(operator.entries_before).matrix()
@@ -160,11 +83,54 @@ def _trailing(operator: StepOperator, v: Floats, lag: int) -> _Trailing | None:
     now, before = (
         entries.matrix()[who][:, who] for entries in (operator.entries_now, operator.entries_before)
     )
-    pull, shown = pull[who], shown[who]
-    delta = solve(pull)
-    first_push = delta - (pull - shown)
-    push = first_push + before @ delta + lag * shown
-    return _Trailing(who, now, before, solve, first_push, push)
+    delta = solve(pull[who])
+    first_push = delta - (pull - shown)[who]
+    lags = scene.frame.map.lag if scene.frame else 0
+    push = first_push + before @ delta + lags * shown[who]
+
+    def largest(error: Floats) -> float:
+        return float(np.sqrt(np.bincount(who // 2, error * error).max()))
+
+    steady, reached, steps = largest(solve(push)), None, last - first + 1
+    if steps * (now.size if isinstance(now, np.ndarray) else now.nnz) <= DEAREST:
+        earlier, error = np.zeros_like(push), first_push
+        for _ in range(steps - 1):
+            earlier, error = error, now @ error + before @ earlier + push
+        reached = largest(error)
+    return Lag(first, last, speed, steady, reached)
+
+
+def _fastest(scene: Scene) -> tuple[int, int, float]:
+    """(first, last, speed): the steps, two at least, in which all leaders keep their velocities and
+    one moves fastest."""
+    steps, moments = scene.experiment.steps, [_moments(each, scene) for each in scene.leading]
+    every = np.unique([1, steps + 1, *(m for own in moments for m in own)])
+    speeds = np.zeros(len(every) - 1)
+    for leading, own in zip(scene.leading, moments, strict=True):
+        for first, after in pairwise(own):
+            speed = np.hypot(*_velocity(leading, first).T).max()
+            some = speeds[np.searchsorted(every, first) : np.searchsorted(every, after)]
+            np.maximum(some, speed, out=some)
+    speeds[np.diff(every) < 2] = 0.0
+    n = int(np.argmax(speeds))
+    return int(every[n]), int(every[n + 1]) - 1, float(speeds[n])
+
+
+def _moments(leading: Leading, scene: Scene) -> list[int]:
+    """When the group begins, ends or changes its velocity."""
+    group = leading.group
+    last = group.last(scene.experiment.steps)
+    some = {group.from_, last + 1, *(group.from_ + n for n in group.motion.knots())}
+    return sorted(m for m in some if group.from_ <= m <= last + 1)
+
+
+def _velocity(leading: Leading, step: int) -> Floats:
+    """Of a group's particles in a step, (particle, axis); a rotation turns it on the way."""
+    n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
+    if isinstance(motion, Oscillation):
+        return np.zeros_like(at)
+    before = motion.offset(n - 1, at) if n > 1 else 0.0
+    return np.zeros_like(at) + (motion.offset(n, at) - before)
 
 
 def _solver(step: Any) -> Solve | None:

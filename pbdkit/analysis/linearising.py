@@ -19,10 +19,12 @@ from pbdkit.interfaces import Components, Slot, Softens
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.raster import EMPTY, Places, slot_step
+from pbdkit.scene.places import Places, slot_step
+from pbdkit.scene.raster import EMPTY
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Contributions, Evaluator, summed
 from pbdkit.stepping.state import State
+from pbdkit.stepping.surroundings import Surroundings
 
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
@@ -97,9 +99,9 @@ def _differ(scene: Scene, state: State) -> bool:
 def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple[Indices, Indices]:
     """(kind, place): which kind each place is of, and one place of each; those of a kind have the
     same neighbours, the same shares of cells around them and the same broken bonds."""
-    evaluator, code = Evaluator(scene), np.zeros(len(place), np.int64)
-    around = evaluator.around(Places(scene.raster.shape, place), sublattice)
-    neighbours = evaluator.neighbours(around, state)
+    code = np.zeros(len(place), np.int64)
+    around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
+    neighbours = around.neighbours(state)
     if scene.cells:
         left = np.array([np.broadcast_to(to.w.left, place.shape) for to in neighbours])
         cut = (left != 1.0).any(axis=0)
@@ -121,13 +123,13 @@ class _Followers:
 
     def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
         self._evaluator = Evaluator(scene)
-        around = self._evaluator.around(Places(scene.raster.shape, place), sublattice)
+        around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
         u = state.u.astype(float, copy=False)
         self._slots, self._axes = around.slots, scene.axes
-        self._here = self._evaluator.here(around, u, state)
-        d = self._evaluator.differences(around, u)
+        self._here = around.here(u, state)
+        d = around.differences(u)
         self._d = dict(zip(self._slots, d, strict=True))
-        to = self._evaluator.neighbours(around, state)
+        to = around.neighbours(state)
         self._neighbours = dict(zip(self._slots, to, strict=True))
         with np.errstate(all="ignore"):
             self._still = {slot: self._contribution(slot, self._here.u) for slot in self._slots}

@@ -1,7 +1,7 @@
 """The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
 u(t+1) = now · u(t) + before · u(t-1) + led · u_L + source for the displacements of the followers,
-two unknowns a particle (x, y). `before` is empty but for frames with lag and for memory.
+an unknown a particle and axis. `before` is empty but for frames with lag and for memory.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import Couplings, some_of
+from pbdkit.analysis.composition import moves_and_couplings
+from pbdkit.analysis.couplings import Couplings, frame_matrices, some_of
 from pbdkit.analysis.linearising import Response, has_neighbours, respond
 from pbdkit.analysis.matrices import Entries
-from pbdkit.analysis.nesting import moves_and_couplings
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leading import kinds_at
@@ -35,9 +35,9 @@ Integers = NDArray[np.signedinteger[Any]]
 class StepOperator:
     """One step, linearised at a state, for fixed roles and leaders that stand still.
 
-    `followers` and `leaders` are rows of the particle table; unknown 2n is x of the n-th follower,
-    2n + 1 its y, and the same for leaders. The couplings hold the same by particle; of those with
-    leaders, `couplings_shown` is the share that frame points show.
+    `followers` and `leaders` are rows of the particle table; in the plane unknown 2n is x of the
+    n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by
+    particle; of those with leaders, `couplings_shown` is the share that frame points show.
     """
 
     followers: Indices
@@ -126,12 +126,13 @@ class _Assembly:
             self._unknown[place] = np.arange(len(some))
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
-        self._now, self._before = Couplings((free, free)), Couplings((free, free))
-        self._led, self._shown = Couplings((free, led)), Couplings((free, led))
-        self._source = np.zeros((free, 2))
+        axes = scene.axes
+        self._now, self._before = Couplings((free, free), axes), Couplings((free, free), axes)
+        self._led, self._shown = Couplings((free, led), axes), Couplings((free, led), axes)
+        self._source = np.zeros((free, axes))
 
     def operator(self) -> StepOperator:
-        memory = self._scene.experiment.solver.memory
+        memory = self._scene.experiment.stepping.memory
         self._now.add_scaled_identity(np.arange(len(self._followers), dtype=np.int32), 1.0)
         place = self._scene.raster.place_of(self._followers)
         cells = self._kind.size // self._scene.raster.shape[0]
@@ -158,7 +159,7 @@ class _Assembly:
 
     def _add(self, place: Indices, response: Response) -> None:
         """The rows of the followers at some places of one sublattice."""
-        relaxation = self._scene.experiment.solver.relaxation
+        relaxation = self._scene.experiment.stepping.relaxation
         u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
         rows = self._unknown[place]
         own = response.of_each(relaxation * response.own)
@@ -178,7 +179,7 @@ class _Assembly:
 
     def _add_nested(self, place: Indices) -> None:
         """The rows of followers whose rule works on the moves of another."""
-        relaxation, rows = self._scene.experiment.solver.relaxation, self._unknown[place]
+        relaxation, rows = self._scene.experiment.stepping.relaxation, self._unknown[place]
         moves, couplings = moves_and_couplings(self._scene, self._state, place)
         everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
         u = self._state.u.reshape(self._scene.axes, -1)[:, everybody].T.astype(float, copy=False)
@@ -204,17 +205,14 @@ class _Assembly:
         for e in range(int((last - first).max(initial=0))):
             has = first + e < last
             entry = (first + e)[has]
-            product = np.einsum("eab,ebc->eac", weight[has], _matrices(frame.map.weight[entry]))
+            follows = frame_matrices(frame.map.weight[entry], self._scene.axes)
+            product = np.einsum("eab,ebc->eac", weight[has], follows)
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
             sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
             for couplings, those in sums:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
-
-
-def _matrices(weights: Floats) -> Floats:
-    return weights[:, None, None] * np.eye(2) if weights.ndim == 1 else weights
 
 
 def _times(matrices: Floats, vectors: Floats) -> Floats:

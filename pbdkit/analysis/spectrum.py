@@ -7,7 +7,7 @@ those of the groups. That finds x and y uncoupled, and keeps rules that couple t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,9 @@ from pbdkit.analysis.region import Complex
 
 BEYOND = 1e-7
 """How far outside the spectrum the shift of the inverse iteration lies."""
+
+DEAREST, VECTORS = 1e9, 20
+"""So many multiplications are made at most for a spectrum, VECTORS a number beside each product."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +36,18 @@ class Spectrum:
     eigenvalues: Complex
 
 
+class TooDearError(RuntimeError):
+    """The eigenvalues lie too close together to be told apart with a bounded number of products."""
+
+
 def spectrum(matrix: Any) -> Spectrum:
-    """The extreme eigenvalues of a matrix, dense or sparse; all of them of small groups."""
-    values, symmetric = [np.empty(0, complex)], True
+    """The extreme eigenvalues of a matrix, dense or sparse; all of them of small groups. Raises
+    TooDearError where that would take long."""
+    values, symmetric, meter = [np.empty(0, complex)], True, _Meter()
     for group in _groups(matrix):
         even = abs(group - group.T).max() <= 1e-12 * max(1.0, abs(group).max())
         symmetric &= bool(even)
-        values.append(_extremes(group, bool(even)))
+        values.append(_extremes(group, bool(even), meter))
     return spectrum_of(np.concatenate(values), symmetric)
 
 
@@ -53,11 +61,11 @@ def spectrum_of(found: Complex, symmetric: bool) -> Spectrum:
 
 def just_below(matrix: Any, edge: float) -> Complex:
     """Of each large group of a sparse matrix, the eigenvalue nearest to `edge` among those with a
-    smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has."""
-    from scipy.sparse.linalg import eigs
-
+    smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has. Raises
+    TooDearError where that would take long."""
+    meter = _Meter()
     found = [
-        eigs(group.tocsc(), k=1, sigma=edge, which="SR", return_eigenvectors=False)
+        meter.nearest(group, edge, symmetric=False, k=1, which="SR")
         for group in (_groups(matrix) if matrix.shape[0] > DENSE else ())
         if group.shape[0] > DENSE
     ]
@@ -88,22 +96,52 @@ def _content(block: Any) -> tuple[Any, ...]:
     return block.shape, block.data.tobytes(), block.indices.tobytes()
 
 
-def _extremes(block: Any, symmetric: bool) -> Complex:
+class _Meter:
+    """Counts the multiplications of an iteration, and ends it when they are too many."""
+
+    def __init__(self) -> None:
+        self._left = DEAREST
+
+    def counted(self, size: int, cost: int, product: Callable[[Any], Any]) -> Any:
+        """The product as a scipy.sparse.linalg.LinearOperator."""
+        from scipy.sparse.linalg import LinearOperator
+
+        def counted(x: Any) -> Any:
+            self._left -= cost + VECTORS * size
+            if self._left < 0:
+                raise TooDearError
+            return product(x)
+
+        return LinearOperator((size, size), matvec=counted, dtype=float)
+
+    def nearest(self, block: Any, end: float, *, symmetric: bool, **wanted: Any) -> Any:
+        """The eigenvalues of a sparse block near `end`, by a shifted inverse iteration."""
+        from scipy.sparse import eye_array
+        from scipy.sparse.linalg import eigs, eigsh, splu
+
+        size = block.shape[0]
+        factors = splu((block - end * eye_array(size)).tocsc())
+        inverse = self.counted(size, factors.L.nnz + factors.U.nnz, factors.solve)
+        find = eigsh if symmetric else eigs
+        return find(block, sigma=end, OPinv=inverse, return_eigenvectors=False, **wanted)
+
+
+def _extremes(block: Any, symmetric: bool, meter: _Meter) -> Complex:
     if block.shape[0] <= DENSE:
         dense = block if isinstance(block, np.ndarray) else block.toarray()
         found = np.linalg.eigvalsh(dense) if symmetric else np.linalg.eigvals(dense)
         return found.astype(complex)
-    from scipy.sparse.linalg import eigs, eigsh
-
     if not symmetric:
-        some = [eigs(block, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
+        from scipy.sparse.linalg import eigs
+
+        product = meter.counted(block.shape[0], block.nnz, block.dot)
+        some = [eigs(product, k=6, which=w, return_eigenvectors=False) for w in ("LM", "LR", "SR")]
         return np.concatenate(some)
     # Shifted inverses just outside the spectrum: Gershgorin's discs bound it.
     diagonal = block.diagonal()
     spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
     ends = ((diagonal + spread).max() + BEYOND, (diagonal - spread).min() - BEYOND)
     nearest = [
-        eigsh(block.tocsc(), k=2, sigma=end, which="LM", tol=1e-10, return_eigenvectors=False)
-        for end in ends
+        meter.nearest(block, end, symmetric=True, k=2, which="LM", tol=1e-10) for end in ends
     ]
     return np.concatenate(nearest).astype(complex)

@@ -7,16 +7,15 @@ from the rule's own `gather` and `apply`; exact for linear rules.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.derivatives import derivative
-from pbdkit.interfaces import Here, Slot, Vector
-from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces import Here, Slot
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
@@ -34,51 +33,12 @@ class Stencil:
     neighbours: dict[Slot, Floats]
 
 
-def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
-    """The stencil of the scene's rule; `at` says where for rules that ask."""
-    if scene.inner:
-        return _composed(linearised(replace(scene, inner=None), at), linearised(scene.inner, at))
+def stencil_of(scene: Scene, at: Here = NOWHERE) -> Stencil:
+    """The stencil of the scene's rule alone; `at` says where for rules that ask."""
     every = scene.neighbourhood.slots
     own = np.array([_derivative(scene, slots, None, at) for slots in every])
     neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
     return Stencil(own, neighbours)
-
-
-def _composed(outer: Stencil, inner: Stencil) -> Stencil:
-    """The stencil of a rule that works on the moves of another."""
-    own = np.zeros_like(outer.own)
-    neighbours: dict[Slot, Floats] = {}
-    known: dict[tuple[int, int, Index], Slot] = {}
-    for first, W in _with_itself(outer):
-        for second, V in _with_itself(inner):
-            if first.target != second.source:
-                continue
-            slot = _after(first, second)
-            key = slot.source, slot.target, slot.cell
-            if slot.source == slot.target and slot.cell == (0, 0):
-                own[slot.source] += W @ V
-            else:
-                slot = known.setdefault(key, slot)
-                neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
-    return Stencil(own, neighbours)
-
-
-def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
-    for s, own in enumerate(stencil.own):
-        yield Slot(s, s, (0, 0), (0, 0), Vector(0.0, 0.0), 0), own
-    yield from stencil.neighbours.items()
-
-
-def _after(first: Slot, second: Slot) -> Slot:
-    """Where two slots lead, one after the other."""
-    return Slot(
-        first.source,
-        second.target,
-        (first.cell[0] + second.cell[0], first.cell[1] + second.cell[1]),
-        (first.site[0] + second.site[0], first.site[1] + second.site[1]),
-        first.rest + second.rest,
-        first.shell + second.shell,
-    )
 
 
 def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:

@@ -1,8 +1,8 @@
 """How a rule answers plane waves on the infinite lattice: a bound that costs milliseconds.
 
 A displacement exp(iθ·c) over repeat cells c is multiplied in a step by the symbol, a matrix of
-2 × 2 blocks over sublattices. Modes of a finite body lie within what the waves reach, as long as
-its frame copies or mirrors.
+blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as
+long as its frame copies or mirrors.
 """
 
 from __future__ import annotations
@@ -11,14 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pbdkit.analysis.composition import linearised
 from pbdkit.analysis.region import Complex, modes
-from pbdkit.analysis.stencil import linearised
 from pbdkit.scene.scene import Scene
 
 WAVES = 48
 """Wave numbers along each axis; an even number, so that the shortest waves are among them."""
 
-
+MOST_ANSWERS = 100_000
+"""Of a rule that is asked what each neighbour does to each: about half a second."""
 LITTLE_MEMORY = 0.9
 """Up to which plane waves were seen to bound random bodies (tests/test_predictions.py)."""
 
@@ -46,9 +47,12 @@ def wave_bound(scene: Scene) -> Bound | None:
     """The bound for the scene's rule at rest.
 
     None for rules that depend on the place or take no single numbers, where neighbours are found
-    anew, and where the frame lags: its delay can make modes grow that no plane wave knows.
+    anew or are more than some 300, and where the frame lags: its delay can make modes grow that no
+    plane wave knows.
     """
-    solver, lags = scene.experiment.solver, scene.frame is not None and scene.frame.map.lag
+    if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MOST_ANSWERS:
+        return None
+    solver, lags = scene.experiment.stepping, scene.frame is not None and scene.frame.map.lag
     if lags or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
     try:
@@ -70,7 +74,7 @@ def bounds_the_body(scene: Scene) -> bool:
     modes of their own, and with much memory so have frames on leaning lattices."""
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach
-    return whole and abs(scene.experiment.solver.memory) <= LITTLE_MEMORY
+    return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY
 
 
 def _eigenvalues(matrices: Complex) -> Complex:
@@ -85,18 +89,21 @@ def _eigenvalues(matrices: Complex) -> Complex:
 
 
 def _symbols(scene: Scene) -> Complex:
-    """(wave, 2S, 2S): the rule's step on plane waves, of which opposite ones answer alike."""
+    """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
+    alike."""
     stencil = linearised(scene)
     angle = 2 * np.pi * np.arange(WAVES) / WAVES
     half = angle[: WAVES // 2 + 1]
-    theta = np.stack(np.meshgrid(half, angle, indexing="ij"), axis=-1).reshape(-1, 2)
-    symbols = np.zeros((len(theta), 2 * len(stencil.own), 2 * len(stencil.own)), complex)
-    symbols += np.eye(2 * len(stencil.own))
+    axes, waves = scene.axes, [half, *[angle] * (scene.axes - 1)]
+    theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
+    size = axes * len(stencil.own)
+    symbols: Complex = np.zeros((len(theta), size, size), complex)
+    symbols += np.eye(size)
+    of = [slice(axes * s, axes * (s + 1)) for s in range(len(stencil.own))]
     for s, own in enumerate(stencil.own):
-        symbols[:, 2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += own
+        symbols[:, of[s], of[s]] += own
     for slot, matrix in stencil.neighbours.items():
-        here = slice(2 * slot.source, 2 * slot.source + 2)
-        there = slice(2 * slot.target, 2 * slot.target + 2)
+        here, there = of[slot.source], of[slot.target]
         phase = np.exp(1j * theta @ np.array(slot.cell, float))
         symbols[:, here, there] += phase[:, None, None] * matrix
     return symbols

@@ -16,7 +16,7 @@ import numpy as np
 from pbdkit.benching.exact import decay_of, exact_answer, followers_of
 from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.finding import UnconvergedError
-from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.increments import settle
 from pbdkit.experiment.model import Experiment
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import choose, make_engine

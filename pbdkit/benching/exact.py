@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.certificate import scale_of
 from pbdkit.equilibrium.finding import UnconvergedError
-from pbdkit.equilibrium.loading import settle
+from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.moves import Moves, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.leading import kinds_at
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME
 from pbdkit.scene.scene import Scene

@@ -77,7 +77,7 @@ def _do_equilibrium(job: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _import_engine(experiment: Experiment) -> None:
-    if experiment.solver.engine == "compiled":
+    if experiment.stepping.engine == "compiled":
         import_module("pbdkit.stepping.compiled.compiled_stepper")
 
 

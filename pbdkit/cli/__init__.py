@@ -83,10 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
         given = [argument for argument in given if argument != "--debug"]
     try:
         code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
-    except click.exceptions.Abort:
-        code = _failed("interrupted", 130)
-    except KeyboardInterrupt:
-        code = _failed("interrupted", 130)
+    except (click.exceptions.Abort, KeyboardInterrupt) as error:
+        where = getattr(error.__cause__, "args", error.args)
+        code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
     except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
@@ -119,5 +118,8 @@ def _report(error: BaseException) -> int:
 
 
 def _failed(message: str, code: int) -> int:
+    from pbdkit.errors import printable
+
+    message = printable(message)
     click.echo(f"pbdkit: {message}" if "\n" not in message else f"pbdkit:\n{message}", err=True)
     return code

@@ -60,11 +60,10 @@ def bench(
     the solver is `equilibrium`, its methods and the steps, over tolerances."""
     from pbdkit.api import load
     from pbdkit.cli.pictures import refuse_unwritable
-    from pbdkit.experiment.solvers import Equilibrium
 
     refuse_unwritable(picture, json_file)
     loaded = load(experiment, settings=(*settings, *([f"steps={steps}"] if steps else ())))
-    compare = _find if isinstance(loaded.solver, Equilibrium) else _step
+    compare = _step if loaded.solver.makes_steps else _find
     figures, draw = compare(loaded, experiment, settings, sizes or (None,))
     _write(json_file, picture, figures, draw)
 

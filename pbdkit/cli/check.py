@@ -17,10 +17,13 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Validate an experiment and say what will happen, without running it."""
     from pbdkit.analysis.forecast import forecast
     from pbdkit.api import load
+    from pbdkit.results.rehearsal import rehearse
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
-    found = forecast(build_scene(loaded))
+    scene = build_scene(loaded)
+    rehearse(scene)
+    found = forecast(scene)
     if as_json:
         click.echo(json.dumps(found.as_dict()))
         return

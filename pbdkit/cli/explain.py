@@ -27,22 +27,18 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
     is, or was, from breaking, and what happened around it."""
     from pbdkit.api import experiment_of
-    from pbdkit.errors import ExperimentError
-    from pbdkit.results.accessor import open as open_result
+    from pbdkit.results.accessor import reading
     from pbdkit.results.explaining import Explained
     from pbdkit.scene.scene import build_scene
 
-    with open_result(file) as dataset:
-        try:
-            explained = Explained(dataset, build_scene(experiment_of(dataset)))
-            found = _of_one(explained, *bond) if bond else _of_all(explained)
-        except ExperimentError as error:
-            raise ExperimentError(f"{file}: {error}") from None
-    if as_json:
-        click.echo(json.dumps(found, default=asdict))
-        return
-    for line in _bond_in_words(found) if bond else _run_in_words(found):
-        click.echo(line)
+    with reading(file) as dataset:
+        explained = Explained(dataset, build_scene(experiment_of(dataset)))
+        found = _of_one(explained, *bond) if bond else _of_all(explained)
+        if as_json:
+            said = json.dumps(found, default=asdict)
+        else:
+            said = "\n".join(_bond_in_words(found) if bond else _run_in_words(found))
+    click.echo(said)
 
 
 def _of_all(explained: Explained) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import click
 @click.option("--color", metavar="VARIABLE", help="Colour by a variable, e.g. pe1.")
 @click.option("--contours", is_flag=True, help="Fill contours of the variable.")
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers.")
+@click.option("--force", is_flag=True, help="Replace an existing picture.")
 def plot(
     file: Path,
     output: Path | None,
@@ -22,22 +23,23 @@ def plot(
     color: str | None,
     contours: bool,
     numbers: bool,
+    force: bool,
 ) -> None:
     """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
+    from pbdkit.cli.output import refuse_output
     from pbdkit.cli.pictures import FORMATS, save
     from pbdkit.errors import ExperimentError
-    from pbdkit.results.accessor import open as open_result
+    from pbdkit.results.accessor import reading
     from pbdkit.results.picture import draw, figure
 
     path = output or file.with_suffix(".png")
     if path.suffix not in FORMATS:
         raise ExperimentError(f"{path}: a picture ends in {', '.join(FORMATS)}")
-    if file.suffix in (".yaml", ".yml", ".json"):
-        raise ExperimentError(f"{file}: is an experiment; run it first, then plot its result")
+    refuse_output(path, force=force)
     look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
-    with open_result(file) as dataset:
+    with reading(file) as dataset:
         if len(times) > 1:
             drawn: Any = figure(dataset, times, **look)
         else:
             drawn = draw(dataset, next(iter(times), None), **look).figure
-    save(path, drawn)
+        save(path, drawn)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +13,14 @@ import click
 from pbdkit.cli.options import experiment_argument, json_option, set_option
 
 if TYPE_CHECKING:
-    from pbdkit.running import Report
+    from pbdkit.runs.course import Report
 
 
 @click.command()
 @experiment_argument
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The file to write.")
 @set_option
-@click.option("--force", is_flag=True, help="Replace an existing output.")
+@click.option("--force", is_flag=True, help="Replace an existing output by a whole result.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 @json_option
 def run(
@@ -31,34 +32,39 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
-    from pbdkit.analysis.forecast import quick_warnings
     from pbdkit.api import load
-    from pbdkit.cli.stopping import asked_to_stop
-    from pbdkit.running import run_into
+    from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
+    from pbdkit.cli.signals import asked_to_stop
+    from pbdkit.equilibrium.watch import Watch
+    from pbdkit.results.netcdf import NetcdfSink
+    from pbdkit.results.progress import progress_bar
+    from pbdkit.results.second_thread import OverlappingSink
+    from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 
-    loaded = load(experiment, settings=settings)
-    path = output or Path(loaded.name.replace("/", "-") + ".nc")
-    _refuse_existing(path, force)
+    with folder_kept():
+        loaded = load(experiment, settings=settings)
+        path = output or Path(loaded.name.replace("/", "-") + ".nc")
+    refuse_output(path, force=force, experiment=Path(experiment))
+    file = NetcdfSink(path, replace=force, compression=loaded.record.compression)
     scene = build_scene(loaded)
-    if not quiet:
-        for warning in quick_warnings(scene):
-            click.echo(f"warning: {warning}", err=True)
-
-    from pbdkit.results.netcdf import NetcdfSink
-    from pbdkit.results.overlapping import OverlappingSink
-
-    silent = quiet or as_json or not sys.stderr.isatty()
-    sink = OverlappingSink(NetcdfSink(path, replace=force, compression=loaded.record.compression))
-    with asked_to_stop() as stopping:
-        report = run_into(sink, scene, progress=not silent, stopping=stopping)
-    for warning in () if quiet else report.warnings:
-        click.echo(f"warning: {warning}", err=True)
+    _warn(disk_warnings(path, scene), quiet)
+    drawn = not (quiet or as_json) and sys.stderr.isatty()
+    with asked_to_stop() as stopping, progress_bar(drawn) as show:
+        one = Run(scene, watch=Watch(stopping, show))
+        _warn(one.warnings, quiet)
+        report = record(one, OverlappingSink(file))
+    _warn(report.warnings, quiet)
     if as_json:
-        click.echo(json.dumps(_figures(report, path)))
+        click.echo(json.dumps(_figures(report, file.written)))
     elif not quiet and report.outcome.status in ("complete", "settled"):
-        _say(report, path, settling=loaded.solver.settle is not None)
-    return _exit_code(report, path)
+        _say(report, path, settling=loaded.stepping.settle is not None)
+    return _exit_code(report, path, file.written)
+
+
+def _warn(texts: Iterable[str], quiet: bool) -> None:
+    for text in () if quiet else texts:
+        click.echo(f"warning: {text}", err=True)
 
 
 def _say(report: Report, path: Path, *, settling: bool) -> None:
@@ -72,19 +78,6 @@ def _say(report: Report, path: Path, *, settling: bool) -> None:
     if report.choice.engine != "equilibrium":
         threads = f" on {report.choice.threads} threads" if report.choice.threads > 1 else ""
         click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
-
-
-def _refuse_existing(path: Path, force: bool) -> None:
-    from pbdkit.errors import ExperimentError, StorageError
-
-    try:
-        is_folder, exists = path.is_dir(), path.exists()
-    except OSError as error:
-        raise StorageError(f"{str(path)[:80]}...: {error.strerror}") from None
-    if is_folder:
-        raise ExperimentError(f"{path}: is a folder; name a file with -o")
-    if exists and not force:
-        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
@@ -111,13 +104,14 @@ def _peak_memory_mib() -> float | None:
     return round(getrusage(RUSAGE_SELF).ru_maxrss / unit, 1)
 
 
-def _exit_code(report: Report, path: Path) -> int:
+def _exit_code(report: Report, path: Path, written: Path) -> int:
     codes = {"diverged": 4, "unconverged": 4, "interrupted": 130}
     code = codes.get(report.outcome.status, 0)
     if code:
+        left = "" if written == path else f"; {path} is left as it was"
         click.echo(
             f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
-            f"what was recorded until then is in {path}",
+            f"what was recorded until then is in {written}{left}",
             err=True,
         )
     return code

@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Setting, Slot, Stiffness
+from pbdkit.interfaces import Slot, Stiffness
+from pbdkit.interfaces.polygons import Tiling
 
 Floats = NDArray[np.float64]
 
@@ -40,20 +41,13 @@ def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
     return K
 
 
-def in_rectangles(slot: Slot, c: Stiffness, a: float, b: float) -> tuple[Floats, Floats]:
-    """-K_jk in the cell a × b to the left and in that to the right of a slot, half of it in each
+def in_rectangles(slot: Slot, c: Stiffness, cells: Tiling) -> tuple[Floats, Floats]:
+    """-K_jk in the rectangle to the left and in that to the right of a slot, half of it in each
     where both are one cell."""
-    K = rectangle_matrix(c, a, b)
-    x, y = int(np.sign(slot.rest.x)), int(np.sign(slot.rest.y))
-    ends = {corner: n for n, corner in enumerate(CORNERS)}
-    if x and y:
-        block: Floats = -K[ends[int(x < 0), int(y < 0)], :, ends[int(x > 0), int(y > 0)], :] / 2
-        return block, block
-    found = []
-    for towards in ((-y, x), (y, -x)):  # where the cell to the left and that to the right lie
-        start = int(x + towards[0] < 0), int(y + towards[1] < 0)
-        found.append(-K[ends[start], :, ends[start[0] + x, start[1] + y], :])
-    return found[0], found[1]
+    assert cells.rectangle
+    K, share = rectangle_matrix(c, *cells.rectangle), 2 if cells.is_diagonal(slot) else 1
+    left, right = (-K[side.start, :, side.end, :] / share for side in cells.beside[slot])
+    return left, right
 
 
 def in_triangles(slot: Slot, c: Stiffness) -> tuple[Floats, Floats]:
@@ -69,24 +63,3 @@ def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
     area = math.sqrt(0.75) * (x * x + y * y) / 2
     block: Floats = -_of_mean_strain(c, gradient, area)[0, :, 1, :]
     return block
-
-
-def rectangle_of(setting: Setting) -> tuple[float, float] | None:
-    """The sides of the cells, where every site has the 8 neighbours of a rectangular lattice."""
-    a, b = setting.cell.vectors
-    if len(setting.cell.sites) > 1 or a.y != 0.0 or b.x != 0.0:
-        return None
-    around = {slot.cell for slot in setting.slots[0]}
-    ring = {(m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)} - {(0, 0)}
-    return (abs(a.x), abs(b.y)) if around == ring and len(setting.slots[0]) == 8 else None
-
-
-def is_triangular(setting: Setting) -> bool:
-    """Whether every site has six neighbours at 60 degrees."""
-    for slots in setting.slots:
-        rests = [complex(*slot.rest) for slot in slots]
-        turned = [rest * complex(0.5, math.sqrt(0.75)) for rest in rests]
-        near = [min(abs(t - rest) for rest in rests) for t in turned]
-        if len(rests) != 6 or max(near) > 1e-9 * abs(rests[0]):
-            return False
-    return True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -11,7 +10,9 @@ from pydantic import Field
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Diagnostic, Moment, Variable, Vector, length
+from pbdkit.interfaces.diagnostic import Need
 from pbdkit.interfaces.fracture import breaking_order
+from pbdkit.interfaces.polygons import area_share
 
 LENGTH = "lattice unit"
 
@@ -19,12 +20,12 @@ LENGTH = "lattice unit"
 class PE1(Diagnostic):
     """PE1_j = Σ_k (|x_j - x_k| - |X_j - X_k|)² over all reference neighbours, broken or not.
 
-    For every body particle, leaders included; frame points are neighbours but get 0.
+    For every body particle, leaders included; frame points are neighbours.
     """
 
     type: Literal["pe1"] = "pe1"
 
-    uses_bonds: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`pe1`."""
@@ -40,7 +41,7 @@ class PE1Intact(Diagnostic):
 
     type: Literal["pe1-intact"] = "pe1-intact"
 
-    uses_bonds: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`pe1_intact`."""
@@ -86,7 +87,7 @@ class Track(Diagnostic):
 
     type: Literal["track"] = "track"
     numbers: Annotated[
-        tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)
+        tuple[Annotated[int, Field(ge=1, lt=2**62)], ...], Field(strict=False, min_length=1)
     ] = Field(description="The particles to follow, by number.", examples=[[3, 1]])
 
     every_step: ClassVar[bool] = True
@@ -95,14 +96,9 @@ class Track(Diagnostic):
         """`track`."""
         return (Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH),)
 
-    def check(self, particles: int) -> None:
+    def check(self, particles: int, leader_groups: int) -> None:
         """Refuses numbers that no particle has."""
-        for n, number in enumerate(self.numbers):
-            if number > particles:
-                raise ExperimentError(
-                    f"there is no particle {number}; they are numbered 1 to {particles}",
-                    ("numbers", n),
-                )
+        refuse_numbers_beyond(particles, self.numbers)
 
     def coordinates(self) -> dict[str, NDArray[Any]]:
         """`tracked`, the numbers of the particles."""
@@ -130,16 +126,13 @@ class Broken(Diagnostic):
 
 class SmallestCellArea(Diagnostic):
     """The smallest signed area of a cell, as a share of its area at rest: 1 at rest, 0 where a cell
-    is flat, negative where one is inside out.
-
-    Of a cell with more than three corners it is the area at a corner, spanned by the two sides that
-    meet there: all are positive exactly where the cell is convex and the right way round. Cells
-    with broken bonds count too. For cells whose corners are all of the body.
+    is flat, negative where one is inside out. Cells with broken bonds count too. For cells whose
+    corners are all of the body.
     """
 
     type: Literal["smallest-cell-area"] = "smallest-cell-area"
 
-    uses_cells: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`smallest_cell_area`."""
@@ -148,23 +141,7 @@ class SmallestCellArea(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The smallest of all cells."""
-        return (now.over_cells(smallest_corner_area).min(),)
-
-
-def smallest_corner_area(d: tuple[Vector, ...], r: tuple[Vector, ...]) -> Any:
-    """min over the corners k of (x_k - x_k-1) × (x_k+1 - x_k), over the same at rest."""
-    rest = [Vector(r[k].x - r[k - 1].x, r[k].y - r[k - 1].y) for k in range(len(r))]
-    now = [
-        Vector(side.x + (d[k].x - d[k - 1].x), side.y + (d[k].y - d[k - 1].y))
-        for k, side in enumerate(rest)
-    ]
-    corners = range(len(r)) if len(r) > 3 else range(1)  # the corners of a triangle agree
-    shares = [_cross(now[k - 1], now[k]) / _cross(rest[k - 1], rest[k]) for k in corners]
-    return reduce(np.minimum, shares)
-
-
-def _cross(a: Vector, b: Vector) -> Any:
-    return a.x * b.y - a.y * b.x
+        return (now.cells.over(area_share).min(),)
 
 
 class CrackPath(Diagnostic):
@@ -173,7 +150,7 @@ class CrackPath(Diagnostic):
 
     type: Literal["crack-path"] = "crack-path"
 
-    uses_bonds: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
     at_end: ClassVar[bool] = True
     own_dimension: ClassVar[str] = "crack"
 
@@ -191,11 +168,23 @@ class CrackPath(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """A row a broken bond."""
-        steps, strains = now.broken_step(), now.broken_strain()
-        order = breaking_order(steps, strains)
-        return order, steps[order], strains[order], now.bonds().midpoint[order]
+        bonds = now.bonds()
+        order = breaking_order(bonds.broken_step, bonds.broken_strain)
+        return order, *(
+            values[order] for values in (bonds.broken_step, bonds.broken_strain, bonds.midpoint)
+        )
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:
     extension = length(Vector(r.x + d.x, r.y + d.y)) - length(r)
     return extension * extension
+
+
+def refuse_numbers_beyond(particles: int, numbers: tuple[int, ...]) -> None:
+    """Raises ExperimentError for a number that no particle has."""
+    for n, number in enumerate(numbers):
+        if number > particles:
+            raise ExperimentError(
+                f"there is no particle {number}; they are numbered 1 to {particles}",
+                ("numbers", n),
+            )

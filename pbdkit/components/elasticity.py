@@ -8,12 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import (
-    in_rectangles,
-    in_triangles,
-    is_triangular,
-    rectangle_of,
-)
+from pbdkit.components.cell_stiffness import in_rectangles, in_triangles
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     Calibrated,
@@ -57,13 +52,13 @@ class CellElastic(Calibrated, FollowerRule):
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The modulus; ExperimentError where the lattice has no such cells."""
-        if not (rectangle_of(setting) or is_triangular(setting)):
+        if not (setting.cells.rectangle or setting.cells.regular == 3):
             raise ExperimentError(
                 f"'{self.type}' works on the square and the rectangular lattice with 8 neighbours "
                 "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
                 "lattice with 6 ({type: coordination, shells: 1})"
             )
-        if is_triangular(setting) and not _is_isotropic(self.ratios()):
+        if setting.cells.regular == 3 and not _is_isotropic(self.ratios()):
             raise ExperimentError(
                 f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
             )
@@ -72,8 +67,8 @@ class CellElastic(Calibrated, FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
         to the right the transpose; a cell on both sides counts half on each."""
-        if sides := rectangle_of(setting):
-            left, right = in_rectangles(slot, self.ratios(), *sides)
+        if setting.cells.rectangle:
+            left, right = in_rectangles(slot, self.ratios(), setting.cells)
         else:
             left, right = in_triangles(slot, self.ratios())
         mean = (left + right.T) / 2

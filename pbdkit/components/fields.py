@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pbdkit.interfaces import Diagnostic, Moment, Variable
+from pbdkit.interfaces.diagnostic import Need
 
 Floats = NDArray[np.floating[Any]]
 Measure = Annotated[
@@ -27,7 +28,7 @@ COMPONENTS = ("xx", "yy", "xy")
 
 
 class Strain(Diagnostic):
-    """The strain of every body particle; 0 at frame points and where no cell is.
+    """The strain of every body particle; 0 where no cell is.
 
     From the displacement gradient H = ∂u/∂X of the cells around the particle. `measure: small` is
     ε = (H + Hᵀ)/2, which takes rotations for strain; `green-lagrange`, for finite deformation, is
@@ -38,7 +39,7 @@ class Strain(Diagnostic):
     type: Literal["strain"] = "strain"
     measure_: Measure = "small"
 
-    uses_cells: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`strain_xx`, or `green_lagrange_xx`, and so on."""
@@ -48,19 +49,19 @@ class Strain(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """(xx, yy, xy)."""
-        return strain(now.displacement_gradient(), self.measure_)
+        return strain(now.cells.gradient(), self.measure_)
 
 
 class Rotation(Diagnostic):
     """The angle by which the surroundings of every body particle have turned, counterclockwise,
-    from -π to π; 0 at frame points and where no cell is.
+    from -π to π; 0 where no cell is.
 
     That of R in the polar decomposition F = R U: atan2(F_yx - F_xy, F_xx + F_yy).
     """
 
     type: Literal["rotation"] = "rotation"
 
-    uses_cells: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`rotation`."""
@@ -68,13 +69,13 @@ class Rotation(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The angle."""
-        H = now.displacement_gradient()
+        H = now.cells.gradient()
         return (np.arctan2(H[:, 1, 0] - H[:, 0, 1], 2.0 + H[:, 0, 0] + H[:, 1, 1]),)
 
 
 class Stress(Diagnostic):
     """The stress of every body particle in the material that the rule is calibrated to, in plane
-    stress or plane strain as the rule; 0 at frame points and where no cell is.
+    stress or plane strain as the rule; 0 where no cell is.
 
     Young's modulus times the rule's stiffness times the strain. With `measure: small` it is the
     Cauchy stress of linear elasticity; with `green-lagrange`, for finite rotation (rule `springs`),
@@ -85,8 +86,7 @@ class Stress(Diagnostic):
     youngs_modulus: Modulus
     measure_: Measure = "small"
 
-    uses_cells: ClassVar[bool] = True
-    uses_material: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"cells", "material"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`stress_xx`, or `piola_kirchhoff_xx`, and so on."""
@@ -96,8 +96,8 @@ class Stress(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """(xx, yy, xy)."""
-        c, E = now.stiffness(), self.youngs_modulus
-        xx, yy, xy = strain(now.displacement_gradient(), self.measure_)
+        c, E = now.forces.stiffness, self.youngs_modulus
+        xx, yy, xy = strain(now.cells.gradient(), self.measure_)
         return (
             E * (c.xx * xx + c.xy * yy),
             E * (c.xy * xx + c.yy * yy),

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from pbdkit.components.diagnostics import refuse_numbers_beyond
 from pbdkit.components.fields import Modulus, Positive
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Diagnostic, Moment, Pair, Variable
+from pbdkit.interfaces.diagnostic import Need
 
 Floats = NDArray[np.floating[Any]]
 FORCE = "unit of youngs_modulus * unit of thickness * lattice unit"
@@ -35,7 +37,7 @@ class StrainEnergy(Diagnostic):
     youngs_modulus: Modulus
     thickness: Thickness = 1.0
 
-    uses_forces: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`strain_energy`."""
@@ -44,7 +46,7 @@ class StrainEnergy(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """E t times the rule's."""
-        return (self.youngs_modulus * self.thickness * now.energy(),)
+        return (self.youngs_modulus * self.thickness * now.forces.energy(),)
 
 
 class Reaction(Diagnostic):
@@ -59,16 +61,16 @@ class Reaction(Diagnostic):
     youngs_modulus: Modulus
     thickness: Thickness = 1.0
 
-    uses_forces: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`reaction`."""
         name = "force that the leader group exerts"
         return (Variable("reaction", ("leader_group", "axis"), name, FORCE),)
 
-    def check_leaders(self, groups: int) -> None:
+    def check(self, particles: int, leader_groups: int) -> None:
         """Refuses experiments without leaders."""
-        if groups == 0:
+        if leader_groups == 0:
             raise ExperimentError(f"'{self.type}' is of leader groups, and there is none")
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -103,7 +105,7 @@ class StressStrain(Diagnostic):
         None, description="Ends of the gauge length by number.", examples=[(1, 30)]
     )
 
-    uses_forces: ClassVar[bool] = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     @model_validator(mode="after")
     def _one_gauge(self) -> StressStrain:
@@ -118,23 +120,15 @@ class StressStrain(Diagnostic):
             Variable("nominal_strain", (), "nominal strain", "1"),
         )
 
-    def check(self, particles: int) -> None:
-        """Refuses numbers that no particle has."""
-        for n, number in enumerate(self.numbers or ()):
-            if number > particles:
-                raise ExperimentError(
-                    f"there is no particle {number}; they are numbered 1 to {particles}",
-                    ("numbers", n),
-                )
-
-    def check_leaders(self, groups: int) -> None:
-        """Refuses groups that are not there."""
+    def check(self, particles: int, leader_groups: int) -> None:
+        """Refuses numbers and groups that are not there."""
+        refuse_numbers_beyond(particles, self.numbers or ())
         by_leaders = not (self.points or self.numbers)
         for name in ("group", "against") if by_leaders else ("group",):
-            if getattr(self, name) >= groups:
+            if getattr(self, name) >= leader_groups:
                 raise ExperimentError(
                     f"there is no leader group {getattr(self, name)}; they are numbered from 0, "
-                    f"and there are {groups}",
+                    f"and there are {leader_groups}",
                     (name,),
                 )
 
@@ -165,7 +159,7 @@ class StressStrain(Diagnostic):
 
 def reactions(now: Moment) -> Floats:
     """What each leader group exerts over Young's modulus and thickness, (leader group, axis)."""
-    forces, groups = now.forces(), now.leader_groups()
+    forces, groups = now.forces.on_particles(), now.leader_groups()
     leaders = [group.rows if group.leads else group.rows[:0] for group in groups]
     times = np.bincount(np.concatenate(leaders), minlength=len(forces))
     return np.stack([0.0 - (forces[rows] / times[rows, None]).sum(axis=0) for rows in leaders])

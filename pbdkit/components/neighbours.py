@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset, Vector
 
+MOST_NEIGHBOURS = 4224
+"""As many as 32 shells of chebyshev neighbours."""
 Shells = Annotated[int, Field(ge=1, le=32)]
 Weight = Annotated[float, Field(gt=0.0)]
 
@@ -36,13 +40,16 @@ class Coordination(LatticeNeighbours):
     type: Literal["coordination"] = "coordination"
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """The `shells` smallest distances between any two sites; multiples of a cell vector give
-        that many at least. A sublattice may have no neighbour in some of them."""
-        radius = self.shells * min(math.hypot(*v) for v in cell.vectors) * (1 + 1e-6)
-        around = [cell.offsets(s, radius) for s in range(len(cell.sites))]
-        everywhere = sorted((o for own in around for o in own), key=lambda o: o.length)
-        ranks = _ranked(everywhere, [o.length for o in everywhere])[: self.shells]
-        lengths = [(shell[0].length, shell[-1].length) for shell in ranks]
+        """The `shells` smallest distances between any two sites. A sublattice may have no neighbour
+        in some of them."""
+        ranks: list[list[Offset]] = []
+        radius = math.sqrt(8 * self.shells / math.pi * area_of(cell) / len(cell.sites))
+        while len(ranks) <= self.shells:  # with one more, the shells before it are complete
+            around = [cell.offsets(s, radius) for s in range(len(cell.sites))]
+            everywhere = sorted((o for own in around for o in own), key=lambda o: o.length)
+            ranks = _ranked(everywhere, [o.length for o in everywhere])
+            radius *= 1.5
+        lengths = [(shell[0].length, shell[-1].length) for shell in ranks[: self.shells]]
         return [[o for o in around[sublattice] if a <= o.length <= b] for a, b in lengths]
 
 
@@ -54,26 +61,37 @@ class Chebyshev(LatticeNeighbours):
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Every offset up to index distance `shells`, grouped by it."""
         shells: list[list[Offset]] = [[] for _ in range(self.shells)]
-        for offset in cell.offsets(sublattice, self._radius(cell)):
+        m_max, n_max = self._cells(cell)
+        near = sorted(
+            (
+                cell.offset(sublattice, target, (m, n))
+                for target in range(len(cell.sites))
+                for m in range(-m_max, m_max + 1)
+                for n in range(-n_max, n_max + 1)
+            ),
+            key=lambda o: (o.length, o.site),
+        )
+        for offset in near:
             distance = max(abs(offset.primitive[0]), abs(offset.primitive[1]))
-            if distance <= self.shells:
+            if offset.site != (0, 0) and distance <= self.shells:
                 shells[distance - 1].append(offset)
         return shells
 
-    def _radius(self, cell: Cell) -> float:
-        """No offset of index distance `shells` is longer: the sum of both primitive steps."""
-        (a, b), ((pa, qa), (pb, qb)) = cell.vectors, cell.primitive
-        det = pa * qb - qa * pb
-        along_p = math.hypot(qb * a.x - qa * b.x, qb * a.y - qa * b.y) / abs(det)
-        along_q = math.hypot(pa * b.x - pb * a.x, pa * b.y - pb * a.y) / abs(det)
-        return self.shells * (along_p + along_q) * (1 + 1e-9)
+    def _cells(self, cell: Cell) -> tuple[int, int]:
+        """How many repeat cells on a site of index distance `shells` can lie: (m, n) for which
+        m (pa, qa) + n (pb, qb) is no larger than that, and what basis sites differ by."""
+        (pa, qa), (pb, qb) = cell.primitive
+        basis = max(abs(p) for site in cell.sites for p in site.primitive)
+        most, det = self.shells + 2 * basis, abs(pa * qb - qa * pb)
+        return most * (abs(pb) + abs(qb)) // det, most * (abs(pa) + abs(qa)) // det
 
 
 class Euclidean(NeighbourMetric):
     """All within √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9); a shell is a distinct distance.
 
     Unequal weights make the neighbourhood, and with it the body, anisotropic. With `reevaluate`
-    the neighbours are found anew at every step, in the intermediate configuration.
+    the neighbours are found anew at every step, in the intermediate configuration. More than
+    MOST_NEIGHBOURS are refused.
     """
 
     type: Literal["euclidean"] = "euclidean"
@@ -89,26 +107,41 @@ class Euclidean(NeighbourMetric):
     )
 
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
-        """Ranked by weighted distance."""
-        near = self.radius * (1 + 1e-9)
-        found = sorted(
-            ((self._distance(o), o) for o in cell.offsets(sublattice, near / self._shrinkage())),
-            key=lambda pair: pair[0],
+        """Ranked by weighted distance: by distance, where the plane is stretched by √w."""
+        near, (wx, wy) = self.radius * (1 + 1e-9), map(math.sqrt, self.weights)
+        a, b = (Vector(wx * v.x, wy * v.y) for v in cell.vectors)
+        stretched = replace(
+            cell,
+            vectors=(a, b),
+            sites=tuple(replace(s, at=Vector(wx * s.at.x, wy * s.at.y)) for s in cell.sites),
         )
-        inside = [(distance, o) for distance, o in found if distance <= near]
-        return _ranked([o for _, o in inside], [distance for distance, _ in inside])
+        if not (count := cells_within(stretched, near) * len(cell.sites)) <= MOST_NEIGHBOURS:
+            raise ExperimentError(
+                f"a radius of {self.radius:g} holds some {count:.3g} neighbours on this lattice, "
+                f"and {MOST_NEIGHBOURS} is the most; take a smaller one",
+                ("radius",),
+            )
+        found = stretched.offsets(sublattice, near)
+        rest = [cell.offset(sublattice, o.target, o.cell) for o in found]
+        return _ranked(rest, [o.length for o in found])
 
     def nearness(self) -> Nearness | None:
         """The same distance in the current configuration, if `reevaluate`."""
         return Nearness(self.radius, self.weights) if self.reevaluate else None
 
-    def _distance(self, offset: Offset) -> float:
-        (wx, wy), (x, y) = self.weights, offset.rest
-        return math.sqrt(wx * x * x + wy * y * y)
 
-    def _shrinkage(self) -> float:
-        """The smallest ratio of weighted to plain distance."""
-        return math.sqrt(min(self.weights)) * (1 - 1e-9)
+def area_of(cell: Cell) -> float:
+    """Of the repeat cell."""
+    a, b = cell.vectors
+    area: float = abs(a.x * b.y - a.y * b.x)
+    return area
+
+
+def cells_within(cell: Cell, radius: float) -> float:
+    """About how many repeat cells lie within a radius, or in lines across it where these are
+    more."""
+    longest = max(math.hypot(*v) for v in cell.vectors)
+    return max(math.pi * radius, 2 * longest) * radius / max(area_of(cell), 5e-324)
 
 
 def _ranked(offsets: Sequence[Offset], distances: Sequence[float]) -> list[list[Offset]]:

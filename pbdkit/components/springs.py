@@ -41,16 +41,12 @@ class Springs(StoresEnergy, FollowerRule):
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Half the spring's stiffness, for each of the cells beside it, and its rest length."""
-        rests = [math.hypot(*s.rest) for s in setting.slots[slot.source]]
-        edge = min(rests)
-        diagonals = sum(math.isclose(rest, edge * math.sqrt(2.0)) for rest in rests)
-        edges = sum(math.isclose(rest, edge) for rest in rests)
-        if (edges, diagonals) == (6, 0) and len(rests) == 6:
-            return {"half": OF_TRIANGLE / 2, "rest": math.hypot(*slot.rest)}
-        if (edges, diagonals) == (4, 4) and len(rests) == 8:
-            is_edge = math.isclose(math.hypot(*slot.rest), edge)
-            half = (EDGE_OF_SQUARE if is_edge else DIAGONAL_OF_SQUARE) / 2
-            return {"half": half, "rest": math.hypot(*slot.rest)}
+        cells, rest = setting.cells, math.hypot(*slot.rest)
+        if cells.regular == 3:
+            return {"half": OF_TRIANGLE / 2, "rest": rest}
+        if cells.regular == 4:
+            k = DIAGONAL_OF_SQUARE if cells.is_diagonal(slot) else EDGE_OF_SQUARE
+            return {"half": k / 2, "rest": rest}
         raise ExperimentError(
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from pbdkit.components.cell_stiffness import rectangle_of
 from pbdkit.components.elasticity import Elastic, IsotropicElastic, mean_move
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import AppliesTwice, Here, Setting, Vector
@@ -36,7 +35,7 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The modulus and c."""
         parameters = super().parameters(setting)
-        sides = rectangle_of(setting)
+        sides = setting.cells.rectangle
         if sides and not math.isclose(*sides):
             raise ExperimentError(
                 f"'{self.type}' works on cells of equal sides, and these are {sides[0]:g} by "

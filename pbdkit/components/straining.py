@@ -105,7 +105,7 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
         return self
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`per_rest` = 1/|r|, and `onset_strain` and `failure_strain` unless each bond has its own."""
+        """`per_rest` = 1/|r|; `onset_strain` and `failure_strain` unless each bond has its own."""
         rest = {"per_rest": 1.0 / length(slot.rest)}
         own = {} if self.scatter else {"onset_strain": self.onset, "failure_strain": self.failure}
         return rest | own

@@ -13,7 +13,7 @@ from pbdkit.equilibrium.certificate import Certificate
 from pbdkit.equilibrium.krylov import product
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -157,7 +157,7 @@ class _Search:
         return System(operator, self._finder.method, self._X, self._finder.watch)
 
     def _shift(self, correction: Vectors, share: float) -> None:
-        self._state.u.reshape(2, -1)[:, self._place] += share * correction.T
+        self._state.u.reshape(len(self._state.u), -1)[:, self._place] += share * correction.T
         self._left = self._moves()
 
     def _moves(self) -> Vectors:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.solving import LinearSolver
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 
 Floats = NDArray[np.float64]
 Preconditioner = Callable[[Floats], Floats]

@@ -14,7 +14,7 @@ from pbdkit.equilibrium.dissection import dissected
 from pbdkit.equilibrium.grids import aggregated, classical
 from pbdkit.equilibrium.krylov import Krylov
 from pbdkit.equilibrium.solving import LinearSolver
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 
 Floats = NDArray[np.float64]

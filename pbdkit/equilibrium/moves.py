@@ -22,14 +22,14 @@ class Moves:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._followers = SlotFollowers(
-            scene, Stepping(relaxation=scene.experiment.solver.relaxation)
+            scene, Stepping(relaxation=scene.experiment.stepping.relaxation)
         )
         self._after: Floats | None = None
 
     def at(self, state: State, place: Indices) -> NDArray[np.float64]:
         """(follower, axis) at the flat places; brings the state's frame into line."""
         u = state.u
-        flat = u.reshape(2, -1)
+        flat = u.reshape(len(u), -1)
         if self._scene.frame:
             self._scene.frame.follow(flat, flat)
         if self._after is None:
@@ -37,7 +37,7 @@ class Moves:
         self._after[...] = u
         with np.errstate(all="ignore"):
             self._followers.move(u, self._after, state)
-        moved = (self._after.reshape(2, -1)[:, place] - flat[:, place]).T
+        moved = (self._after.reshape(len(self._after), -1)[:, place] - flat[:, place]).T
         return moved.astype(float)
 
 
@@ -46,7 +46,7 @@ def owed_by(operator: StepOperator, state: State, place: Indices) -> NDArray[np.
     back: before · (u(t-1) - u(t)), None elsewhere."""
     if not operator.couplings_before.parts:
         return None
-    u, previous = (p.reshape(2, -1)[:, place] for p in (state.u, state.previous))
+    u, previous = (p.reshape(len(p), -1)[:, place] for p in (state.u, state.previous))
     return operator.couplings_before.times((previous - u).T.astype(float))
 
 

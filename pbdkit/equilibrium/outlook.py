@@ -13,7 +13,7 @@ from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.moves import Moves, owed_by, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
@@ -112,7 +112,7 @@ class Foresight:
         ahead, distance = here.u.copy(), math.inf
         correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
-            ahead.reshape(2, -1)[:, known.place] += correction.T
+            ahead.reshape(len(ahead), -1)[:, known.place] += correction.T
             left = self._moves.at(replace(here, u=ahead), known.place)
             bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
@@ -147,7 +147,7 @@ class Foresight:
         shape = (len(known.place), 2)
         put = np.random.default_rng(0).uniform(-size, size, shape)
         there = here.u.copy()
-        there.reshape(2, -1)[:, known.place] += put.T
+        there.reshape(len(there), -1)[:, known.place] += put.T
         change = self._moves.at(replace(here, u=there), known.place) - self._moves.at(
             here, known.place
         )

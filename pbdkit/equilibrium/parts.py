@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.krylov import Krylov
 from pbdkit.equilibrium.linear import Dense, is_symmetric, linear_solver
 from pbdkit.equilibrium.solving import LinearSolver
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 
 Floats = NDArray[np.float64]
 SAFETY = 3.0

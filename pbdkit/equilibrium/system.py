@@ -18,7 +18,7 @@ from pbdkit.analysis.matrices import DENSE, connected
 from pbdkit.analysis.operator import StepOperator
 from pbdkit.equilibrium.floating import Floating
 from pbdkit.equilibrium.parts import DriftingError, Held, Part
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ class System:
         self._operator, self._method, self._X = operator, method, X
         self._watch = watch
         now, before = operator.couplings_now, operator.couplings_before
-        both = Couplings(now.shape, now.parts + before.parts)
+        both = Couplings(now.shape, now.axes, now.parts + before.parts)
         self._both = both
         self.amplification = 1.0
         """How much larger moves are, in rounding too, than the displacements that make them."""

@@ -7,8 +7,9 @@ sites on the outline belong whatever the rounding (model.md, section 3).
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +25,37 @@ Count = Annotated[int, Field(ge=1, le=2**31)]
 class Box:
     """The rectangle around a body: in coordinates, or in site indices for a grid."""
 
-    low: tuple[float, float]
-    high: tuple[float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     in_sites: bool = False
 
 
 @dataclass(frozen=True)
 class Sites:
-    """Sites by index (i, j) and by position (x, y), arrays of one shape."""
+    """Sites by `index` (i, j) and by the place where they lie, `at`; arrays of one shape."""
 
-    i: NDArray[np.int64]
-    j: NDArray[np.int64]
-    x: Floats
-    y: Floats
+    index: Sequence[NDArray[np.signedinteger[Any]]]
+    at: Any
+
+    @property
+    def i(self) -> NDArray[np.signedinteger[Any]]:
+        """The index along the first axis."""
+        return self.index[0]
+
+    @property
+    def j(self) -> NDArray[np.signedinteger[Any]]:
+        """The index along the second axis."""
+        return self.index[1]
+
+    @property
+    def x(self) -> Floats:
+        """The coordinate along the first axis."""
+        return np.asarray(self.at.x)
+
+    @property
+    def y(self) -> Floats:
+        """The coordinate along the second axis."""
+        return np.asarray(self.at.y)
 
 
 class Body(Component):

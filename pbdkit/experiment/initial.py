@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny
 
 from pbdkit.experiment.parts import closed_part
-from pbdkit.interfaces import Component, Pair
+from pbdkit.interfaces import Component
 
 Floats = NDArray[np.floating[Any]]
-Gradient = Annotated[tuple[Pair, Pair], Field(strict=False)]
+Share = Annotated[float, Field(ge=-1e100, le=1e100)]
+Shares = Annotated[tuple[Share, Share], Field(strict=False)]
+Gradient = Annotated[tuple[Shares, Shares], Field(strict=False)]
 
 
 class Initial(Component):
@@ -49,7 +51,7 @@ class Noise(Initial):
     from the experiment's seed in the order of the numbers; leaders of step 1 start on theirs."""
 
     type: Literal["noise"] = "noise"
-    amplitude: Annotated[float, Field(ge=0.0)]
+    amplitude: Annotated[float, Field(ge=0.0, le=1e100)]
 
     def displacement(
         self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
@@ -64,7 +66,7 @@ class Affine(Initial):
 
     type: Literal["affine"] = "affine"
     gradient: Gradient
-    shift: Pair = (0.0, 0.0)
+    shift: Shares = (0.0, 0.0)
 
     def displacement(
         self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator

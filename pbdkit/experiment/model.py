@@ -24,7 +24,7 @@ from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.parts import brief, fault, open_part
 from pbdkit.experiment.record import Record
-from pbdkit.experiment.solvers import AnySolver, Equilibrium
+from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
     INTERFACES,
@@ -111,27 +111,27 @@ class Experiment(Strict):
                 "set neighbours.reevaluate: false or fracture: {type: none}",
                 key="fracture",
             )
-        if self.neighbours.nearness() and isinstance(self.solver, Equilibrium):
+        if self.neighbours.nearness() and not self.solver.makes_steps:
             raise fault(
                 "where neighbours are re-evaluated nothing tells where the steps lead; "
                 "set neighbours.reevaluate: false or solver: {type: stepping}",
                 key="solver",
             )
-        if self.neighbours.nearness() and self.solver.settle:
+        if self.neighbours.nearness() and self.stepping.settle:
             raise fault(
                 "where neighbours are re-evaluated no distance from equilibrium is known; "
                 "set neighbours.reevaluate: false, or leave solver.settle out",
                 key="solver",
             )
         remembers = isinstance(self.rule, RenewsParticles)
-        if self.solver.settle and (remembers or isinstance(self.fracture, Softens)):
+        if self.stepping.settle and (remembers or isinstance(self.fracture, Softens)):
             part = self.rule if remembers else self.fracture
             raise fault(
                 f"'{part.type}' remembers, so that no distance from equilibrium is known; leave "
                 "solver.settle out",
                 key="solver",
             )
-        if remembers and isinstance(self.solver, Equilibrium):
+        if remembers and not self.solver.makes_steps:
             raise fault(
                 f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
                 "all of them; take solver: {type: stepping}",
@@ -142,9 +142,20 @@ class Experiment(Strict):
     @property
     def recording(self) -> Record:
         """What is recorded: of an equilibrium, the start and the end."""
-        if isinstance(self.solver, Equilibrium):
-            return self.record.model_copy(update={"at": (0, self.steps)})
-        return self.record
+        if self.solver.makes_steps:
+            return self.record
+        return self.record.model_copy(update={"at": (0, self.steps)})
+
+    @property
+    def stepping(self) -> Stepping:
+        """How a step of it is made, whatever the solver."""
+        return self.solver.stepping
+
+    def next_wanted(self, step: int) -> int:
+        """The next step after `step` of which something is recorded."""
+        if any(d.every_step for d in self.diagnostics):
+            return step + 1
+        return self.recording.next_after(step, self.steps)
 
     _source: Source = PrivateAttr(default_factory=Source)
     _registry: Registry = PrivateAttr()
@@ -187,7 +198,7 @@ class Experiment(Strict):
     @property
     def shows_bonds(self) -> bool:
         """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
-        return self.fracture.can_break or any(d.uses_bonds for d in self.diagnostics)
+        return self.fracture.can_break or any("bonds" in d.needs for d in self.diagnostics)
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""

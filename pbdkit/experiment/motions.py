@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from bisect import bisect_left
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
-from pbdkit.experiment.parts import closed_part
+from pbdkit.experiment.parts import brief, closed_part
 from pbdkit.interfaces import Component, Pair
 
 Floats = NDArray[np.floating[Any]]
@@ -44,7 +45,7 @@ class Hold(Motion):
 
     def offset(self, n: int, start: Floats) -> Floats:
         """None."""
-        return np.zeros(2)
+        return np.zeros(start.shape[1])
 
     def rests_after(self) -> int:
         """At once."""
@@ -110,14 +111,20 @@ class Path(Motion):
                 f"for {len(self.steps)}"
             )
         if any(a >= b for a, b in zip(self.steps, self.steps[1:], strict=False)):
-            raise ValueError(f"steps must increase, got {list(self.steps)}")
+            raise ValueError(f"steps must increase, got {brief(self.steps)}")
         return self
 
     def offset(self, n: int, start: Floats) -> Floats:
         """Linear interpolation."""
-        steps = (0, *self.steps)
-        x, y = zip((0.0, 0.0), *self.displacements, strict=True)
-        return np.array([np.interp(n, steps, x), np.interp(n, steps, y)])
+        after = bisect_left(self.steps, n)
+        if after == len(self.steps):
+            return np.array(self.displacements[-1])
+        before = (
+            (self.steps[after - 1], self.displacements[after - 1]) if after else (0, (0.0, 0.0))
+        )
+        between = (before[0], self.steps[after])
+        ways = zip(before[1], self.displacements[after], strict=True)
+        return np.array([np.interp(n, between, way) for way in ways])
 
     def rests_after(self) -> int:
         """The last of its steps."""

@@ -16,6 +16,7 @@ from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.registry.blame import blame
 from pbdkit.registry.registry import Registry
 
+LONGEST_TYPE = 200
 Finder = Callable[[str], type[Component]]
 
 
@@ -65,6 +66,8 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
         raise fault("`type` is missing")
     if not isinstance(name, str):
         raise fault(f"expected a word, got {brief(name)}", key="type")
+    if len(name) > LONGEST_TYPE:
+        raise fault(f"unknown type {brief(name)}", key="type")
     try:
         part = find(name)
     except ExperimentError as error:
@@ -99,5 +102,7 @@ def brief(value: Any) -> str:
         return f"a {'map' if isinstance(value, dict) else 'list'} of {len(value)}"
     if isinstance(value, int) and abs(value) > 10**20:
         return "a huge integer"
+    if isinstance(value, str):
+        value = value[:50]
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."

@@ -9,6 +9,9 @@ from typing import Any
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.source import Source, Where, read_value
 
+LONGEST = 80
+"""So many characters of a setting are repeated in messages."""
+
 
 def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> Source:
     """A copy of the source with one value set.
@@ -16,7 +19,7 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
     `setting` is ``path=value`` with a dotted path, list positions from 0 and a YAML value. A part
     that the file leaves out starts from its entry in `defaults`.
     """
-    label = f"--set {setting}"
+    label = f"--set {setting if len(setting) <= LONGEST else setting[:LONGEST] + '...'}"
     path, equals, value = setting.partition("=")
     if not equals or not path:
         raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")

@@ -3,6 +3,7 @@ family."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, SerializeAsAny
@@ -22,6 +23,19 @@ class Settle(Strict):
 class Solver(Component):
     """What takes a scene from its start to its end."""
 
+    makes_steps: ClassVar[bool]
+    """Whether every step is made, one after the other."""
+
+    @property
+    @abstractmethod
+    def stepping(self) -> Stepping:
+        """How a step is made, where one is: the rule's own unless the experiment says more."""
+
+    @property
+    @abstractmethod
+    def sought(self) -> Equilibrium:
+        """How an equilibrium is looked for, where one is."""
+
 
 class Stepping(Solver):
     """One step after the other.
@@ -32,13 +46,24 @@ class Stepping(Solver):
     `settle` the run ends where it has settled, after `steps` at the latest.
     """
 
+    makes_steps: ClassVar[bool] = True
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
-    relaxation: Annotated[float, Field(gt=0.0)] = 1.0
-    memory: float = 0.0
+    relaxation: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
+    memory: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     settle: Settle | None = None
+
+    @property
+    def stepping(self) -> Stepping:
+        """As the experiment says."""
+        return self
+
+    @property
+    def sought(self) -> Equilibrium:
+        """As by default."""
+        return Equilibrium()
 
 
 class Equilibrium(Solver):
@@ -51,18 +76,21 @@ class Equilibrium(Solver):
     Krylov's iteration around it), conjugate-gradients alone, or what serves their size.
     """
 
+    makes_steps: ClassVar[bool] = False
     type: Literal["equilibrium"] = "equilibrium"
     method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-8
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
 
-    # The rule's own step; until roles change for the last time it is made as stepping would.
-    engine: ClassVar[Literal["auto", "numpy", "compiled"]] = "auto"
-    precision: ClassVar[Literal["float64", "float32"]] = "float64"
-    threads: ClassVar[Literal["auto"] | int] = "auto"
-    relaxation: ClassVar[float] = 1.0
-    memory: ClassVar[float] = 0.0
-    settle: ClassVar[None] = None
+    @property
+    def stepping(self) -> Stepping:
+        """The rule's own: so steps are made until roles change for the last time."""
+        return Stepping()
+
+    @property
+    def sought(self) -> Equilibrium:
+        """As the experiment says."""
+        return self
 
 
 AnySolver = Annotated[

@@ -7,10 +7,10 @@ keys and tags are what makes YAML dangerous, and an experiment needs none of the
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -19,10 +19,12 @@ from ruamel.yaml.events import (
     CollectionEndEvent,
     CollectionStartEvent,
     DocumentStartEvent,
+    MappingStartEvent,
     NodeEvent,
     ScalarEvent,
+    SequenceStartEvent,
 )
-from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
+from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.reader import ReaderError
 
 from pbdkit.errors import ExperimentError, dotted
@@ -53,6 +55,12 @@ class Source:
 def read_file(path: Path) -> Source:
     """The experiment in a file; ExperimentError names what cannot be read, and where."""
     try:
+        with path.open("rb") as file:
+            if file.read(4) in (b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05"):
+                raise ExperimentError(
+                    f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
+                    "pbdkit.rerun(pbdkit.open(...)) runs the same again"
+                )
         if path.stat().st_size > MAX_BYTES:
             raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
         raw = path.read_bytes()
@@ -86,9 +94,7 @@ def read_value(text: str, name: str) -> Any:
 def _read(text: str, source: Source) -> Any:
     yaml = YAML(typ="safe", pure=True)
     try:
-        _guard(yaml, text, source.name)
-        node = yaml.compose(io.StringIO(text))
-        return None if node is None else _build(node, (), source, yaml)
+        return _Reading(yaml, text, source).document()
     except ReaderError as error:
         before = text[: error.position]
         place = f"{before.count(chr(10)) + 1}:{error.position - before.rfind(chr(10))}"
@@ -98,70 +104,89 @@ def _read(text: str, source: Source) -> Any:
         raise _syntax_error(error, source.name) from None
 
 
-def _guard(yaml: YAML, text: str, name: str) -> None:
-    depth = documents = nodes = 0
-    for event in yaml.parse(io.StringIO(text)):
-        line = f"{name}:{event.start_mark.line + 1}:{event.start_mark.column + 1}"
+class _Reading:
+    """Makes data of the parser's events, one look at each, and notes the places."""
+
+    def __init__(self, yaml: YAML, text: str, source: Source) -> None:
+        self._yaml, self._source, self._nodes = yaml, source, 0
+        self._events = (self._allowed(event) for event in yaml.parse(io.StringIO(text)))
+
+    def document(self) -> Any:
+        """The data of the one document; None where there is none."""
+        data, documents = None, 0
+        for event in self._events:
+            if isinstance(event, DocumentStartEvent):
+                if event.version or event.tags:
+                    self._refuse(event, "directives (%YAML, %TAG) are not taken")
+                documents += 1
+                if documents > 1:
+                    self._refuse(event, "a second document; one file holds one experiment")
+                data = self._value(next(self._events), ())
+        return data
+
+    def _allowed(self, event: Any) -> Any:
+        if not isinstance(event, NodeEvent):
+            return event
+        self._nodes += 1
         if isinstance(event, AliasEvent):
-            raise ExperimentError(f"{line}: aliases (*{event.anchor}) are not taken; write it out")
-        nodes += isinstance(event, NodeEvent)
-        if nodes > MAX_NODES:
-            raise ExperimentError(
-                f"{line}: more than {MAX_NODES} values, which no experiment needs"
-            )
-        if isinstance(event, DocumentStartEvent):
-            if event.version or event.tags:
-                raise ExperimentError(f"{line}: directives (%YAML, %TAG) are not taken")
-            documents += 1
-            if documents > 1:
-                raise ExperimentError(f"{line}: a second document; one file holds one experiment")
+            self._refuse(event, f"aliases (*{event.anchor}) are not taken; write it out")
+        if self._nodes > MAX_NODES:
+            self._refuse(event, f"more than {MAX_NODES} values, which no experiment needs")
         tag = getattr(event, "tag", None)
-        if isinstance(event, NodeEvent) and str(tag or "!") != "!":
-            raise ExperimentError(f"{line}: tags ({tag}) are not taken")
-        if isinstance(event, ScalarEvent) and event.value == "<<" and event.implicit[0]:
-            raise ExperimentError(f"{line}: merge keys (<<) are not taken; write the keys out")
-        if isinstance(event, CollectionStartEvent):
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise ExperimentError(f"{line}: nested more than {MAX_DEPTH} levels deep")
-        elif isinstance(event, CollectionEndEvent):
-            depth -= 1
+        if str(tag or "!") != "!":
+            self._refuse(event, f"tags ({tag}) are not taken")
+        if isinstance(event, ScalarEvent):
+            if event.value == "<<" and event.implicit[0]:
+                self._refuse(event, "merge keys (<<) are not taken; write the keys out")
+            if any("\ud800" <= c <= "\udfff" for c in event.value):
+                self._refuse(event, "half a character (\\ud800 to \\udfff) is not taken")
+        return event
 
-
-def _build(node: Any, where: Where, source: Source, yaml: YAML) -> Any:
-    source.places.setdefault(where, _place(node, source))
-    if isinstance(node, SequenceNode):
-        return [_build(item, (*where, n), source, yaml) for n, item in enumerate(node.value)]
-    if isinstance(node, MappingNode):
-        return _build_map(node, where, source, yaml)
-    if str(node.tag).rsplit(":", 1)[-1] not in ("null", "bool", "int", "float"):
-        return node.value
-    try:
-        return yaml.constructor.construct_object(node)
-    except ValueError:
-        what = f"{dotted(where)}: '{node.value[:20]}...' is too long for a number"
-        raise ExperimentError(f"{_place(node, source)}: {what}") from None
-
-
-def _build_map(node: MappingNode, where: Where, source: Source, yaml: YAML) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        place = _place(key_node, source)
-        if not isinstance(key_node, ScalarNode):
-            raise ExperimentError(f"{place}: a key must be a word")
-        key = str(key_node.value)
-        if key in found:
-            first = source.places[(*where, key)]
-            raise ExperimentError(
-                f"{place}: {dotted((*where, key))}: given twice, first at {first}"
+    def _value(self, event: Any, where: Where) -> Any:
+        self._source.places.setdefault(where, self._place(event))
+        if len(where) >= MAX_DEPTH and isinstance(event, CollectionStartEvent):
+            self._refuse(event, f"nested more than {MAX_DEPTH} levels deep")
+        if isinstance(event, SequenceStartEvent):
+            return [self._value(item, (*where, n)) for n, item in enumerate(self._inner())]
+        if isinstance(event, MappingStartEvent):
+            return self._map(where)
+        tag = self._yaml.resolver.resolve(ScalarNode, event.value, event.implicit)
+        if str(tag).rsplit(":", 1)[-1] not in ("null", "bool", "int", "float"):
+            return event.value
+        try:
+            return self._yaml.constructor.construct_object(ScalarNode(tag, event.value))
+        except ValueError:
+            return self._refuse(
+                event, f"{dotted(where)}: '{event.value[:20]}...' is too long for a number"
             )
-        source.places[(*where, key)] = place
-        found[key] = _build(value_node, (*where, key), source, yaml)
-    return found
 
+    def _map(self, where: Where) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for event in self._inner():
+            if not isinstance(event, ScalarEvent):
+                self._refuse(event, "a key must be a word")
+            key, places = str(event.value), self._source.places
+            if key in found:
+                first = places[(*where, key)]
+                self._refuse(event, f"{dotted((*where, key))}: given twice, first at {first}")
+            places[(*where, key)] = self._place(event)
+            found[key] = self._value(next(self._events), (*where, key))
+        return found
 
-def _place(node: Any, source: Source) -> str:
-    return f"{source.name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
+    def _inner(self) -> Iterator[Any]:
+        """The events in a collection, up to its end; whoever takes one takes what is in it too."""
+        return iter(lambda: self._unless_end(next(self._events)), None)
+
+    @staticmethod
+    def _unless_end(event: Any) -> Any:
+        return None if isinstance(event, CollectionEndEvent) else event
+
+    def _place(self, event: Any) -> str:
+        mark = event.start_mark
+        return f"{self._source.name}:{mark.line + 1}:{mark.column + 1}"
+
+    def _refuse(self, event: Any, what: str) -> NoReturn:
+        raise ExperimentError(f"{self._place(event)}: {what}")
 
 
 def _syntax_error(error: YAMLError, name: str) -> ExperimentError:

@@ -46,9 +46,9 @@ def identified(scene: Scene) -> Identity:
         rests_at_edges=answers.rests_at_edges,
         stencil=cell,
         long=None,
-        spectrum=spectrum(cell, experiment.solver.memory),
-        relaxation=experiment.solver.relaxation,
-        memory=experiment.solver.memory,
+        spectrum=spectrum(cell, experiment.stepping.memory),
+        relaxation=experiment.stepping.relaxation,
+        memory=experiment.stepping.memory,
     )
     found = _with_long_waves(found)
     return replace(found, notes=notes_on(found, scene))

@@ -29,7 +29,7 @@ def as_verdict(answer: Any) -> Any:
     """The answer of `breaks`; AnswerError where it is neither yes nor no."""
     if (dtype := np.asarray(answer).dtype).kind != "b":
         what = "None" if answer is None else dtype
-        raise AnswerError(f"`breaks` returned {what}: compare, as in `... > c[0]`")
+        raise AnswerError(f"`breaks` returned {what}: compare, as in `... > c.limit`")
     return answer
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from pbdkit.errors import printable
 from pbdkit.interfaces.naming import did_you_mean
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
@@ -46,7 +47,8 @@ class Strict(BaseModel):
             whose = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
             taken = f"known: {', '.join(known)}" if known else f"'{whose}' takes nothing"
             message = f"unknown key{did_you_mean(str(unknown[0]), known)} ({taken})"
-            raise PydanticCustomError("key", "{text}", {"text": message, "key": unknown[0]})
+            key = printable(str(unknown[0]))
+            raise PydanticCustomError("key", "{text}", {"text": message, "key": key})
         return data
 
 

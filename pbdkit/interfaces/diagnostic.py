@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.rule import Stiffness
 from pbdkit.interfaces.values import Bonds
-from pbdkit.interfaces.vector import Vector
 
 Floats = NDArray[np.floating[Any]]
+Need = Literal["bonds", "cells", "material", "forces"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,14 @@ class Variable:
     dtype: str = "f8"
     attributes: dict[str, Any] = field(default_factory=dict)
 
+    def is_recordable(self, values: Any, body: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which values can go into the dataset: finite ones, and NaN at frame points."""
+        fine: NDArray[np.bool_] = np.isfinite(values)
+        if "particle" in self.dims:
+            shape = [-1 if dim == "particle" else 1 for dim in self.dims]
+            fine |= np.isnan(values) & ~body.reshape(shape)
+        return fine
+
 
 class LeaderRows(NamedTuple):
     """The rows of a leader group's particles, and whether it leads during this step."""
@@ -41,14 +49,94 @@ class LeaderRows(NamedTuple):
     leads: bool
 
 
+@dataclass(frozen=True)
+class BondHistory(Bonds):
+    """The table of bonds and when they broke, (bond,): `broken_step`, -1 where one has not, 0 at a
+    given crack; `broken_strain` in the intermediate configuration, NaN where it has not broken or
+    was broken from the start."""
+
+    broken_step: NDArray[np.int32]
+    broken_strain: NDArray[np.float64]
+
+
+class CellValues(ABC):
+    """What cells show. A cell is a polygon of neighbouring sites with no other site in its
+    circumcircle: on the square and rectangular lattice the rectangles, on the others triangles;
+    together they tile the plane, whatever the neighbours are."""
+
+    @abstractmethod
+    def over(
+        self,
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> Floats:
+        """function(d, r) of every cell whose corners are all of the body, (cell,).
+
+        d and r hold a vector a corner, counter-clockwise: d[k] = u_k - u_0, r[k] = X_k - X_0; r is
+        constant. Elementwise, and called once a shape and part of the body. Cells with a broken
+        bond between corners count unless `intact_only`.
+        """
+
+    @abstractmethod
+    def gradient(self) -> Floats:
+        """H = ∂u/∂X at every particle, (particle, component of u, axis); F = 1 + H.
+
+        The mean over the cells that meet there, by the share of each that belongs to the body,
+        carried on from the middle of those cells to the particle. Cells with a broken bond between
+        corners do not count. NaN at frame points, 0 at body particles without a cell.
+        """
+
+
+class ForceValues(ABC):
+    """What the material that the rule is calibrated to makes of a state, over Young's modulus and
+    thickness, in lattice units."""
+
+    @property
+    @abstractmethod
+    def stiffness(self) -> Stiffness:
+        """The material."""
+
+    @abstractmethod
+    def on_particles(self) -> Floats:
+        """The forces of the neighbours on every particle, leaders too, (particle, axis); NaN at
+        frame points. Of broken bonds they are what the rule sees."""
+
+    @abstractmethod
+    def energy(self) -> float:
+        """The strain energy: ½ uᵀK u, which is -½ Σ u·force, or that of the rule's own bonds where
+        it is not linear."""
+
+
 class Moment(ABC):
-    """The run at the end of a step, as a diagnostic sees it. Tables have a row a particle."""
+    """The run at the end of a step, as a diagnostic sees it. Tables have a row a particle; nobody
+    can write to them."""
 
     step: int
+
+    @property
+    @abstractmethod
+    def body(self) -> NDArray[np.bool_]:
+        """(particle,): which are leaders or followers; the others are frame points."""
+
+    @property
+    @abstractmethod
+    def cells(self) -> CellValues:
+        """What the cells of the body show."""
+
+    @property
+    @abstractmethod
+    def forces(self) -> ForceValues:
+        """Forces and energy of the material, for diagnostics that need it."""
 
     @abstractmethod
     def rows(self, numbers: tuple[int, ...]) -> NDArray[np.intp]:
         """The rows of the particles with these numbers."""
+
+    @abstractmethod
+    def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
+        """The row of the body particle that is nearest to each point at rest, the lowest number on
+        ties."""
 
     @abstractmethod
     def displacement(self, rows: NDArray[np.intp] | None = None) -> Floats:
@@ -64,79 +152,25 @@ class Moment(ABC):
 
     @abstractmethod
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """Σ_k function(d, r) over the reference neighbours k of each body particle, (particle,).
 
         d = u_k - u_j, r = X_k - X_j; elementwise, like a rule's `gather`. Broken bonds count, with
-        the real neighbour, unless `intact_only`. Frame points get 0.
+        the real neighbour, unless `intact_only`. Frame points get NaN.
         """
-
-    @abstractmethod
-    def over_cells(
-        self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
-        *,
-        intact_only: bool = False,
-    ) -> Floats:
-        """function(d, r) of every cell whose corners are all of the body, (cell,).
-
-        A cell is a polygon of neighbouring sites with no other site in its circumcircle: on the
-        square and rectangular lattice the rectangles, on the others triangles; together they tile
-        the plane, whatever the neighbours are. d and r hold a Vector a corner, counter-clockwise:
-        d[k] = u_k - u_0, r[k] = X_k - X_0; r is constant. Elementwise, and called once a shape and
-        part of the body. Cells with a broken bond between corners count unless `intact_only`.
-        """
-
-    @abstractmethod
-    def displacement_gradient(self) -> Floats:
-        """H = ∂u/∂X at every body particle, (particle, component of u, axis); F = 1 + H.
-
-        The mean over the cells that meet there, by the share of each that belongs to the body,
-        carried on from the middle of those cells to the particle. Cells with a broken bond between
-        corners do not count. Zero at frame points and where there is no cell.
-        """
-
-    @abstractmethod
-    def stiffness(self) -> Stiffness:
-        """The material that the rule is calibrated to."""
-
-    @abstractmethod
-    def forces(self) -> Floats:
-        """The forces of the neighbours on every body particle, leaders too, over Young's modulus
-        and thickness, (particle, axis), lattice units; zero at frame points. Of broken bonds they
-        are what the rule sees."""
-
-    @abstractmethod
-    def energy(self) -> float:
-        """The strain energy over Young's modulus and thickness, lattice units squared: ½ uᵀK u,
-        which is -½ Σ u·force, or that of the rule's own bonds where it is not linear."""
 
     @abstractmethod
     def leader_groups(self) -> tuple[LeaderRows, ...]:
         """The leader groups in the order of the experiment."""
 
     @abstractmethod
-    def nearest(self, points: tuple[Pair, ...]) -> NDArray[np.intp]:
-        """The row of the body particle that is nearest to each point at rest, the lowest number on
-        ties."""
-
-    @abstractmethod
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
     @abstractmethod
-    def bonds(self) -> Bonds:
+    def bonds(self) -> BondHistory:
         """The table of bonds, in the order of the dataset."""
-
-    @abstractmethod
-    def broken_step(self) -> NDArray[np.int32]:
-        """(bond,): the step at which each bond broke, -1 where it has not, 0 at a given crack."""
-
-    @abstractmethod
-    def broken_strain(self) -> NDArray[np.float64]:
-        """(bond,): the strain with which each bond broke, in the intermediate configuration; NaN
-        where it has not, or was broken from the start."""
 
     @abstractmethod
     def remembered(self, name: str) -> NDArray[Any]:
@@ -152,15 +186,11 @@ class Diagnostic(Component):
     `at_end`; nothing of it exists where nobody asks.
     """
 
-    uses_bonds: ClassVar[bool] = False
-    """Whether readers of the dataset need the table of bonds to make sense of it."""
-    uses_cells: ClassVar[bool] = False
-    """Whether it makes no sense without cells (`Moment.over_cells`); a body that has none, a single
-    row for instance, is then refused."""
-    uses_material: ClassVar[bool] = False
-    """Whether it asks for `Moment.stiffness`; rules that are not calibrated are then refused."""
-    uses_forces: ClassVar[bool] = False
-    """Whether it asks for `Moment.forces` or `Moment.energy`; the same are refused."""
+    needs: ClassVar[frozenset[Need]] = frozenset()
+    """What it makes no sense without. "bonds": the table of bonds in the dataset; "cells"
+    (`Moment.cells`): a body that has none, a single row for instance, is refused; "material"
+    (`Moment.forces.stiffness`), "forces" (all of `Moment.forces`): rules that are not calibrated
+    are refused."""
     every_step: ClassVar[bool] = False
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
     at_end: ClassVar[bool] = False
@@ -176,15 +206,12 @@ class Diagnostic(Component):
         """Dimensions of its own with their values; by default none."""
         return {}
 
-    def check(self, particles: int) -> None:
-        """Raise ExperimentError where it does not go with a scene of so many particles."""
-        return
-
-    def check_leaders(self, groups: int) -> None:
-        """Raise ExperimentError where it does not go with so many leader groups. A variable can
-        have a dimension `leader_group`, an entry a group."""
+    def check(self, particles: int, leader_groups: int) -> None:
+        """Raise ExperimentError where it does not go with a scene of so many particles and leader
+        groups. A variable can have a dimension `leader_group`, an entry a group."""
         return
 
     @abstractmethod
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """The values of its variables, one array each, shaped as their `dims` say."""
+        """The values of its variables, one array each, shaped as their `dims` say; finite, but for
+        NaN at frame points in what is measured of the body."""

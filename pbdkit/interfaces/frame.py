@@ -45,7 +45,7 @@ class FrameSites(ABC):
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:
         """(point, body): each frame point with every body particle that is nearest to it in the
-        reference configuration, distance ≤ d_min(1 + 1e-9) + 1e-12; sorted by both."""
+        reference configuration, distance ≤ d_min(1 + 1e-9); sorted by both."""
 
     @abstractmethod
     def body_at(self, site: NDArray[np.int32]) -> Indices:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.vector import Vector
+from pbdkit.interfaces.vector import Components, Vector, vector
 
-Index = tuple[int, int]
+Index = tuple[int, ...]
+"""One number an axis."""
 
-ORIGIN = Vector(0.0, 0.0)
+
+PLANE_ORIGIN = Vector(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,7 @@ class BasisSite:
     period, `primitive` the same in the primitive basis, in which Chebyshev distance is counted.
     """
 
-    at: Vector = ORIGIN
+    at: Components = PLANE_ORIGIN
     index: Index = (0, 0)
     primitive: Index = (0, 0)
 
@@ -41,7 +46,7 @@ class Offset:
     cell: Index
     site: Index
     primitive: Index
-    rest: Vector
+    rest: Components
 
     @property
     def length(self) -> float:
@@ -51,65 +56,87 @@ class Offset:
 
 @dataclass(frozen=True)
 class Cell:
-    """The repeat cell of a lattice.
+    """The repeat cell of a lattice, with as many vectors as space has axes.
 
     Sites carry integer indices (i, j). The cell repeats every `period[0]` of i along
-    `vectors[0]` and every `period[1]` of j along `vectors[1]`; the site with index (i, j) has the
-    basis site whose `index` is (i mod period[0], j mod period[1]), and where there is none the
-    lattice has a hole. `primitive` gives each cell vector in the primitive basis.
+    `vectors[0]`, every `period[1]` of j along `vectors[1]` and so on; the site with index (i, j)
+    has the basis site whose `index` is (i mod period[0], j mod period[1]), and where there is none
+    the lattice has a hole. `primitive` gives each cell vector in the primitive basis. What is left
+    out is that of one site a cell, at its corner.
     """
 
-    vectors: tuple[Vector, Vector]
-    sites: tuple[BasisSite, ...] = (BasisSite(),)
-    period: Index = (1, 1)
-    primitive: tuple[Index, Index] = ((1, 0), (0, 1))
+    vectors: tuple[Components, ...]
+    sites: tuple[BasisSite, ...] = ()
+    period: Index = ()
+    primitive: tuple[Index, ...] = ()
+
+    def __post_init__(self) -> None:
+        axes = range(len(self.vectors))
+        nowhere = tuple(0 for _ in axes)
+        corner = BasisSite(vector(map(float, nowhere)), nowhere, nowhere)
+        steps = tuple(tuple(int(axis == other) for other in axes) for axis in axes)
+        object.__setattr__(self, "sites", self.sites or (corner,))
+        object.__setattr__(self, "period", self.period or tuple(1 for _ in axes))
+        object.__setattr__(self, "primitive", self.primitive or steps)
+
+    @property
+    def axes(self) -> int:
+        """How many axes space has."""
+        return len(self.vectors)
+
+    def shift(self, cell: Iterable[Any]) -> Any:
+        """m·a + n·b, the vector from a repeat cell to that `cell` further on; numbers or arrays."""
+        steps = [n * v for n, v in zip(cell, self.vectors, strict=True)]
+        return sum(steps[1:], steps[0])
 
     def offset(self, source: int, target: int, cell: Index) -> Offset:
         """The offset from sublattice `source` to `target`, `cell` repeat cells on.
 
         The reverse offset has exactly the negated `rest`: every operation here is odd.
         """
-        a, b = self.vectors
         here, there = self.sites[source], self.sites[target]
-        m, n = cell
+        axes = range(self.axes)
+        between = [there.primitive[p] - here.primitive[p] for p in axes]
         return Offset(
             target,
             cell,
-            (
-                there.index[0] - here.index[0] + m * self.period[0],
-                there.index[1] - here.index[1] + n * self.period[1],
-            ),
-            (
-                there.primitive[0] - here.primitive[0]
-                + m * self.primitive[0][0] + n * self.primitive[1][0],
-                there.primitive[1] - here.primitive[1]
-                + m * self.primitive[0][1] + n * self.primitive[1][1],
-            ),
-            Vector(
-                there.at.x - here.at.x + (m * a.x + n * b.x),
-                there.at.y - here.at.y + (m * a.y + n * b.y),
-            ),
-        )  # fmt: skip
+            tuple(there.index[n] - here.index[n] + cell[n] * self.period[n] for n in axes),
+            tuple(between[p] + sum(cell[n] * self.primitive[n][p] for n in axes) for p in axes),
+            (there.at - here.at) + self.shift(cell),
+        )
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
         """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""
-        a, b = self.vectors
-        area = abs(a.x * b.y - a.y * b.x)
         spread = radius + max(math.hypot(*s.at) for s in self.sites) * 2
-        # |m| of a cell that reaches within `spread`, and for each m the n: of nearly collinear
-        # vectors all pairs would be too many.
-        m_max, half = math.ceil(spread * math.hypot(*b) / area), spread / math.hypot(*b)
-        tilt = (a.x * b.x + a.y * b.y) / (b.x * b.x + b.y * b.y)
         here = self.sites[source].at
-        steps = [(t, s.at.x - here.x, s.at.y - here.y) for t, s in enumerate(self.sites)]
+        steps = [site.at - here for site in self.sites]
         found = []
-        for m in range(-m_max, m_max + 1):
-            for n in range(math.floor(-m * tilt - half), math.ceil(-m * tilt + half) + 1):
-                x, y = m * a.x + n * b.x, m * a.y + n * b.y
-                near = [t for t, dx, dy in steps if math.hypot(dx + x, dy + y) <= radius]
-                found += [self.offset(source, target, (m, n)) for target in near]
-        others = [offset for offset in found if offset.site != (0, 0)]
+        for cell in self._cells_within(spread):
+            shift = self.shift(cell)
+            near = [t for t, step in enumerate(steps) if math.hypot(*(step + shift)) <= radius]
+            found += [self.offset(source, target, cell) for target in near]
+        others = [offset for offset in found if any(offset.site)]
         return sorted(others, key=lambda o: (o.length, o.site))
+
+    def _cells_within(self, radius: float) -> Iterator[Index]:
+        """All repeat cells within a radius, and few others: axis by axis, of each the range that
+        the axes before leave (Fincke and Pohst); of nearly collinear vectors all combinations would
+        be too many."""
+        # Columns in reverse, so that the first axis is the outermost.
+        R = np.linalg.qr(np.array(self.vectors[::-1]).T, mode="r")
+
+        def inside(fixed: Index) -> Iterator[Index]:
+            left = len(R) - len(fixed)
+            if not left:
+                yield fixed
+                return
+            row = R[left - 1]
+            centre = -sum(row[len(R) - 1 - n] * m for n, m in enumerate(fixed)) / row[left - 1]
+            half = radius / abs(row[left - 1])
+            for n in range(math.floor(centre - half), math.ceil(centre + half) + 1):
+                yield from inside((*fixed, n))
+
+        yield from inside(())
 
 
 class Lattice(Component):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell, Index, Offset
-from pbdkit.interfaces.vector import Vector
+from pbdkit.interfaces.vector import Components
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Slot:
     target: int
     cell: Index
     site: Index
-    rest: Vector
+    rest: Components
     shell: int
 
 
@@ -32,7 +32,7 @@ class Nearness:
     """Who is near in the current configuration: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9)."""
 
     radius: float
-    weights: tuple[float, float]
+    weights: tuple[float, ...]
 
 
 class NeighbourMetric(Component):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.polygons import Tiling
 from pbdkit.interfaces.values import Remembers
 from pbdkit.interfaces.vector import Components
 
@@ -42,12 +43,14 @@ class Stiffness(NamedTuple):
 @dataclass(frozen=True)
 class Setting:
     """What a rule may derive its constants from: the lattice, the slots of each sublattice, and
-    the box (`lower`, `upper`) of the body's reference configuration, frame not included."""
+    the box (`lower`, `upper`) of the body's reference configuration, frame not included. `cells`
+    are the lattice's cells, and which of them lie beside a slot."""
 
     cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
     lower: Components
     upper: Components
+    cells: Tiling = field(default_factory=Tiling)
 
 
 class FollowerRule(Component):

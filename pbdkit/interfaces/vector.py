@@ -23,9 +23,19 @@ class Components(tuple[Any, ...]):
     __slots__ = ()
     __array_ufunc__ = None  # so that array * vector asks the vector
 
+    @property
+    def x(self) -> Any:
+        """The component along the first axis."""
+        return self[0]
+
+    @property
+    def y(self) -> Any:
+        """The component along the second axis."""
+        return self[1]
+
     def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
         """The vector of function(component, ...), component by component."""
-        return type(self)(*map(function, self, *others))
+        return type(self)(*(function(*parts) for parts in zip(self, *others, strict=True)))
 
     def __add__(self, other: Any) -> Self:
         return self.each(operator.add, other)
@@ -46,13 +56,13 @@ class Components(tuple[Any, ...]):
         return type(self)(*(component / divisor for component in self))
 
 
-class Vector(Components, namedtuple("Vector", ("x", "y"))):
+class Vector(namedtuple("Vector", ("x", "y")), Components):
     """A vector in the plane."""
 
     __slots__ = ()
 
 
-class SpaceVector(Components, namedtuple("SpaceVector", ("x", "y", "z"))):
+class SpaceVector(namedtuple("SpaceVector", ("x", "y", "z")), Components):
     """A vector in space."""
 
     __slots__ = ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import chdir, contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, version
 from typing import Any
@@ -81,7 +81,7 @@ def load_plugin(point: Point, check: Callable[[Any], None] = check_component) ->
         with _kept_apart():
             offers = _apart([_offer(c, check, point) for c in _offered(point.entry)])
     except KeyboardInterrupt:
-        raise
+        raise KeyboardInterrupt(f"while {point.distribution} was loaded") from None
     except IncompatibleError as error:
         return _plugin(point, "incompatible", str(error))
     except BaseException as error:  # SystemExit at import is a plugin's fault too
@@ -169,7 +169,7 @@ def _apart(offers: list[Offer]) -> tuple[Offer, ...]:
 
 @contextmanager
 def _kept_apart() -> Iterator[None]:
-    """What a plugin prints at import is no output of the program, and its filters of warnings
-    are its own."""
-    with redirect_stdout(sys.stderr), warnings.catch_warnings():
+    """What a plugin prints at import is no output of the program, its filters of warnings are its
+    own, and so is the folder that it works in."""
+    with redirect_stdout(sys.stderr), warnings.catch_warnings(), chdir("."):
         yield

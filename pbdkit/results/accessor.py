@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import xarray
 
-from pbdkit.errors import StorageError
+from pbdkit.errors import ExperimentError, PbdkitError, StorageError
+from pbdkit.registry.wording import one_line
 from pbdkit.results import picture
-from pbdkit.results.layout import SCHEMA_VERSION
+from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,23 +22,57 @@ if TYPE_CHECKING:
 def open(path: str | Path) -> xarray.Dataset:
     """The dataset in a result file; its values are read when they are used.
 
-    Raises StorageError where there is no such file, where it cannot be read as netCDF, where
-    pbdkit did not make it, or where a newer pbdkit made it than this one can read.
+    Raises ExperimentError for an experiment, and StorageError where there is no such file, where it
+    cannot be read as netCDF, where pbdkit did not make it, where variables are missing, or where a
+    newer pbdkit made it than this one can read.
     """
     file = Path(path)
     if not file.is_file():
         raise StorageError(f"{file}: there is no such file")
+    if file.suffix in (".yaml", ".yml", ".json"):
+        raise ExperimentError(
+            f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
+        )
     try:
         # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
         dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except Exception as error:  # whatever the libraries below make of a damaged file
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
-    fault = _fault(dataset.attrs.get("schema_version"))
+    fault = _fault(dataset.attrs.get("schema_version")) or _missing(dataset)
     if fault:
         dataset.close()
         raise StorageError(f"{file}: {fault}")
     return dataset
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[xarray.Dataset]:
+    """The dataset in a result file, to be read from in the block.
+
+    Raises what `open` does, and StorageError for whatever reading and using its values raises:
+    files are sound when written.
+    """
+    with open(path) as dataset:
+        try:
+            yield dataset
+        except (ExperimentError, StorageError) as error:
+            raise type(error)(f"{path}: {'; '.join(str(error).splitlines())}") from None
+        except (PbdkitError, MemoryError):
+            raise
+        except Exception as error:
+            told = f"{type(error).__name__}: {error}"
+            raise StorageError(f"{path}: is damaged, or was changed: {one_line(told)}") from error
+
+
+def _missing(dataset: xarray.Dataset) -> str | None:
+    """What a dataset of pbdkit has, and this one has not."""
+    for column in base_columns():
+        dims = dataset[column.name].dims if column.name in dataset.variables else None
+        if dims != column.dims:
+            what = "has no" if dims is None else f"has other dimensions, {dims}, of"
+            return f"{what} variable '{column.name}': it is damaged, or was changed"
+    return None
 
 
 def _fault(version: Any) -> str | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Bonds, BreaksAtStrain
 from pbdkit.interfaces.fracture import breaking_order
 from pbdkit.scene.raster import FRAME
@@ -130,6 +130,8 @@ class Explained:
         else:
             reference = self._dataset["reference"].isel(particle=particles).values
             u = self._dataset["position"].isel(at).values - reference
+        if not np.isfinite(u).all():
+            raise StorageError("is damaged, or was changed: it has positions that are not finite")
         a, b = (np.searchsorted(particles, self.bonds.ends[rows, end] - 1) for end in (0, 1))
         rest = self.bonds.rest[rows]
         now = rest + (u[..., b, :] - u[..., a, :])

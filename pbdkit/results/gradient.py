@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Vector
-from pbdkit.scene.mesh import Patch
+from pbdkit.interfaces.polygons import signed_area
+from pbdkit.scene.cells import Patch
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 FLAT = 0.1
 """Where the centres around the corners of a cell span less than this of its area they lie in line,
 as in a body of one row of cells, and tell of no slope."""
@@ -31,7 +32,7 @@ def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]
     shape = u.shape[1:]
     area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((4, *shape))
     for patch, share in cells:
-        rest = patch.cell.rest
+        rest = patch.polygon.rest
         whole, slopes = _around(patch.differences(u), rest)
         centre = [sum(r[axis] for r in rest) / len(rest) for axis in (0, 1)]
         for corner, r in zip(patch.corners, rest, strict=True):
@@ -52,14 +53,14 @@ def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]])
     area, slope = np.zeros(gradient.shape[1:]), np.zeros((4, 2, *gradient.shape[1:]))
     for patch, share in cells:
         first, at = offset[(slice(None), *patch.corners[0].slices())], []
-        for corner, r in zip(patch.corners, patch.cell.rest, strict=True):
+        for corner, r in zip(patch.corners, patch.polygon.rest, strict=True):
             x, y = offset[(slice(None), *corner.slices())] - first
             at.append(Vector(r.x + x, r.y + y))
         values = [gradient[(slice(None), *corner.slices())] for corner in patch.corners]
         between = [_around([Vector(*(v[n : n + 2] - values[0][n : n + 2])) for v in values], at)
                    for n in (0, 2)]  # fmt: skip
         whole = between[0][0]
-        usable = np.where(whole > FLAT * _area(patch.cell.rest), share, 0.0)
+        usable = np.where(whole > FLAT * signed_area(patch.polygon.rest), share, 0.0)
         for corner in patch.corners:
             there = corner.slices()
             area[there] += whole * usable
@@ -80,8 +81,4 @@ def _around(d: Any, r: Any) -> tuple[Any, list[Any]]:
         normal = (ahead.y - behind.y) / 2, (behind.x - ahead.x) / 2
         for n in range(4):
             slopes[n] = slopes[n] + value[n // 2] * normal[n % 2]
-    return _area(r), slopes
-
-
-def _area(r: Any) -> Any:
-    return sum(r[k - 1].x * r[k].y - r[k].x * r[k - 1].y for k in range(len(r))) / 2
+    return signed_area(r), slopes

@@ -12,9 +12,13 @@ from pbdkit.interfaces import Diagnostic, Remembered, Variable
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 CONVENTIONS = "CF-1.11"
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 STATUSES = ("complete", "settled", "diverged", "unconverged", "interrupted")
 LENGTH = "lattice unit"
+
+
+Values = dict[str, Any]
+"""What goes into a dataset, by the name of the variable."""
 
 
 class When(Enum):
@@ -93,6 +97,12 @@ def broken_columns() -> list[Column]:
         Column("broken_step", ("bond",), "i4", When.END, _described(step)),
         Column("broken_strain", ("bond",), "f8", When.END, _described(strain, "1")),
     ]
+
+
+def reserved_names() -> set[str]:
+    """The names that nobody else can give to a variable or a dimension."""
+    ours = [*base_columns(), *bond_columns(), *broken_columns(), step_column(), leader_column()]
+    return {name for column in ours for name in (column.name, *column.dims)}
 
 
 def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbdkit.results.layout import Column
-from pbdkit.results.recorder import Sink, Values
+from pbdkit.results.layout import Column, Values
+from pbdkit.results.recorder import Sink
 
 if TYPE_CHECKING:
     import xarray

@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ import netCDF4
 import numpy as np
 
 from pbdkit.errors import StorageError
-from pbdkit.results.layout import Column, When
-from pbdkit.results.recorder import Sink, Values
+from pbdkit.results.layout import Column, Values, When
+from pbdkit.results.recorder import Sink
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading
@@ -22,16 +23,28 @@ the history of a particle touches one chunk a batch, reading a snapshot little m
 OPEN_CHUNK = 1024
 """Entries a chunk along a dimension whose length is known at the end only."""
 FULL_BYTES = 2**20
+WHOLE = ("complete", "settled")
+"""The status of results that may replace others."""
+PARTIAL = "-partial"
+"""Added to the name of a result that may not, where its name is taken."""
 
 
 class NetcdfSink(Sink):
-    """Writes beside `path` under a temporary name; `finish` syncs it and renames it to `path`."""
+    """Writes beside `path` under a temporary name; `finish` syncs it and renames it to `path`.
+
+    With `replace` a whole result takes the place of what is there. What is left of a run that
+    diverged, did not converge or was interrupted takes nobody's place: beside `path`, as `written`
+    says.
+    """
 
     def __init__(self, path: Path, *, replace: bool = False, compression: str = "none") -> None:
         self._path = path
+        self.written = path
+        """Where the result is, once it is finished: beside `path` where that was taken."""
         self._compression = {"zlib": {"compression": "zlib", "complevel": 1}}.get(compression, {})
         self._replace = replace
-        self._temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{id(self):x}.partial")
+        name = f".{path.name[:100]}.{os.getpid()}.{id(self):x}.partial"
+        self._temporary = path.with_name(name).absolute()  # whoever changes the folder meanwhile
         self._file: Any = None
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
@@ -40,7 +53,7 @@ class NetcdfSink(Sink):
         self._waiting: dict[str, list[Any]] = {c.name: [] for c in columns if c.grows}
         self._written = dict.fromkeys(self._waiting, 0)
         self._batch: dict[str, int] = {}
-        if not self._path.parent.is_dir():
+        if not self._temporary.parent.is_dir():
             raise StorageError(f"{self._path}: there is no folder {self._path.parent}")
         with self._storing():
             self._file = netCDF4.Dataset(self._temporary, "w", format="NETCDF4")
@@ -72,30 +85,43 @@ class NetcdfSink(Sink):
             self._file.setncatts(attributes)
             self._file.close()
             _sync(self._temporary)
-        self._give_name()
+        with self._storing():
+            self._give_name(attributes["status"] in WHOLE)
         with suppress(OSError):  # the result is there; some file systems cannot sync a folder
-            _sync(self._path.parent)
-
-    def _give_name(self) -> None:
-        """Renames; what somebody else has put there meanwhile is replaced only on request."""
-        if self._replace:
-            with self._storing():
-                self._temporary.replace(self._path)
-            return
-        try:
-            os.link(self._temporary, self._path)
-        except FileExistsError:
-            kept = self._path.with_name(f"{self._path.stem}-{os.getpid()}{self._path.suffix}")
-            self._temporary.replace(kept)
+            _sync(self._temporary.parent)
+        if self.written != self._path and not self._replace:
             raise StorageError(
                 f"{self._path}: appeared while this run was going on and is left as it is; "
-                f"this result is in {kept}"
-            ) from None
+                f"this result is in {self.written}"
+            )
+
+    def _give_name(self, whole: bool) -> None:
+        """Renames. Where it is asked for, a whole result replaces what is there; all else gets a
+        name that is free."""
+        folder, stem, suffix = self._temporary.parent, self._path.stem[:100], self._path.suffix
+        if whole and self._replace:
+            self._temporary.replace(folder / self._path.name)
+            return
+        more = ("" if n == 1 else f"-{n}" for n in count(2 if whole else 1))
+        beside = (
+            self._path.with_name(f"{stem}{'' if whole else PARTIAL}{n}{suffix}") for n in more
+        )
+        names = chain([self._path], beside)
+        self.written = next(name for name in names if self._take(folder / name.name))
+
+    def _take(self, path: Path) -> bool:
+        """Whether the name was free; then it is taken."""
+        try:
+            os.link(self._temporary, path)
+        except FileExistsError:
+            return False
         except OSError:  # no hard links on this file system
-            with self._storing():
-                self._temporary.rename(self._path)
+            if os.path.lexists(path):
+                return False
+            self._temporary.rename(path)
         else:
             self._temporary.unlink()
+        return True
 
     def abandon(self) -> None:
         """Removes the temporary file."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.results.snapshot import Array, Snapshot, label, take_snapshots, variable_label
+from pbdkit.results.snapshot import Array, Snapshot, label, plain, take_snapshots, variable_label
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 if TYPE_CHECKING:
@@ -68,8 +68,9 @@ def draw(
     look = _look(dataset, snapshots, numbers)
     axes = _canvas(1, look) if ax is None else [ax]
     _paint(axes[0], dataset, snapshots[0], look)
-    title = f"{dataset.attrs.get('title', '')}, step {snapshots[0].step}"
-    axes[0].set_title(title.lstrip(", "))
+    axes[0].set_title(
+        f"{plain(dataset.attrs.get('title', ''))}, step {snapshots[0].step}".lstrip(", ")
+    )
     _explain(axes, dataset, look, color, contours)
     return axes[0]
 
@@ -99,7 +100,7 @@ def figure(
     _explain(axes, dataset, look, color, contours)
     whole = axes[0].get_figure(root=True)
     assert whole is not None
-    whole.suptitle(str(dataset.attrs.get("title", "")))
+    whole.suptitle(plain(dataset.attrs.get("title", "")))
     return whole
 
 
@@ -206,7 +207,8 @@ def _dots(ax: Axes, now: Snapshot, norm: Normalize | None, size: float, crowded:
     dense = {"marker": "s", "edgecolors": "none", "rasterized": True}
     style: dict[str, Any] = dense if crowded else {"edgecolors": INK, "lw": 0.08 * size}
     if values is not None and mesh is None:
-        ax.scatter(x, y, (1.2 * size) ** 2, values, cmap=DOT_COLOURS, norm=norm, **style)
+        style |= {"cmap": DOT_COLOURS, "norm": norm, "plotnonfinite": True}
+        ax.scatter(x, y, (1.2 * size) ** 2, values, **style)
         return
     if values is not None and mesh is not None and len(mesh) and isinstance(norm, BoundaryNorm):
         fill, levels = Triangulation(x, y, mesh), norm.boundaries

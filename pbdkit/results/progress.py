@@ -13,21 +13,9 @@ REFRESH_S = 0.1
 
 
 @contextmanager
-def progress_bar(steps: int, wanted: bool) -> Iterator[Callable[[int], None]]:
-    """Yields a function to be told each step; it draws on stderr once a second has passed."""
-    with _bar(steps, "step {task.completed:.0f} of {task.total:.0f}", wanted) as show:
-        yield lambda step: show("stepping", step)
-
-
-@contextmanager
-def equilibrium_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
-    """Yields a function to be told what is done, and which share of it; it draws as the other."""
-    with _bar(1, "{task.percentage:.0f} %", wanted) as show:
-        yield show
-
-
-@contextmanager
-def _bar(total: int, count: str, wanted: bool) -> Iterator[Callable[[str, float], None]]:
+def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
+    """Yields a function to be told what is done, and which share of it; it draws on stderr once a
+    second has passed."""
     bar: Any = None
     due = time.perf_counter() + PATIENCE_S
 
@@ -36,7 +24,7 @@ def _bar(total: int, count: str, wanted: bool) -> Iterator[Callable[[str, float]
         if not wanted or time.perf_counter() < due:
             return
         if bar is None:
-            bar = _new_bar(total, count)
+            bar = _new_bar()
         due = time.perf_counter() + REFRESH_S
         bar.update(bar.task_ids[0], description=what, completed=done)
 
@@ -47,17 +35,17 @@ def _bar(total: int, count: str, wanted: bool) -> Iterator[Callable[[str, float]
             bar.stop()
 
 
-def _new_bar(total: int, count: str) -> Any:
+def _new_bar() -> Any:
     from rich.console import Console
     from rich.progress import Progress, TextColumn, TimeRemainingColumn
 
     bar = Progress(
         *Progress.get_default_columns()[:2],
-        TextColumn(count),
+        TextColumn("{task.percentage:.0f} %"),
         TimeRemainingColumn(),
         console=Console(file=sys.stderr),
         transient=True,
     )
     bar.start()
-    bar.add_task("", total=total)
+    bar.add_task("", total=1)
     return bar

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.registry.wording import one_line
 from pbdkit.scene.raster import FRAME
 
 if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[Any]
+LONGEST = 200
+"""So many characters of a title or name are shown."""
 BRIDGE = 1.35
 """A reference triangle longer than so many usual ones bridges a hole or a notch."""
 
@@ -92,9 +95,14 @@ def variable_label(dataset: xarray.Dataset, name: str) -> str:
     return label(f"length of {meaning}" if vector else meaning, attributes.get("units", ""))
 
 
-def label(meaning: str, units: str) -> str:
+def plain(text: object) -> str:
+    """A text for a picture: short, and never taken for a formula."""
+    return one_line(str(text)[:LONGEST]).replace("$", r"\$")
+
+
+def label(meaning: object, units: object) -> str:
     """A quantity and its units, as they stand at an axis."""
-    units = units.replace("^2", "²").replace("^3", "³")
+    meaning, units = plain(meaning), plain(units).replace("^2", "²").replace("^3", "³")
     return meaning if units in ("", "1") else f"{meaning} ({units})"
 
 

@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.scene.mesh import Patch
+from pbdkit.interfaces import Slot
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.scene.shares import cells_with_shares
-from pbdkit.stepping.evaluator import presence
 from pbdkit.stepping.slots import SlotFollowers
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import presence
+
+Array = TypeVar("Array", bound=NDArray[Any])
+
+
+def read_only(values: Array) -> Array:
+    """The same values, as diagnostics see them: nobody writes to what others read."""
+    view: Array = values.view()
+    view.flags.writeable = False
+    return view
+
+
+def broken_along(scene: Scene, state: State, block: Block, slot: Slot) -> NDArray[np.bool_]:
+    """Where on a block the bond along a slot is broken, in a scene with fracture."""
+    assert state.broken_step is not None
+    plane, at_this_end = scene.neighbourhood.home[slot]
+    home = block if at_this_end else block.seen_through(slot)
+    broken: NDArray[np.bool_] = home.within(state.broken_step[plane]) >= 0
+    return broken
 
 
 class Tables:
@@ -33,20 +52,26 @@ class Tables:
             u[rows[0] : rows[-1] + 1] += self.raster.reference(rows)
         return u
 
+    def of_body(self, planes: Floats) -> Floats:
+        """The values of planes by particle, (particle, ...); NaN at frame points."""
+        table = self.raster.table(planes)
+        table[~self.body] = np.nan
+        return read_only(table)
+
     @cached_property
     def reference(self) -> Floats:
         """X, (particle, axis)."""
-        return self.raster.reference()
+        return read_only(self.raster.reference())
+
+    @cached_property
+    def body(self) -> NDArray[np.bool_]:
+        """(particle,): which are leaders or followers."""
+        return read_only(self.raster.table_kind == FOLLOWER)
 
     @cached_property
     def followers(self) -> SlotFollowers:
         """The rule on the scene, which knows forces and energy."""
         return SlotFollowers(self.scene)
-
-    @cached_property
-    def shares(self) -> list[tuple[Patch, NDArray[np.float64]]]:
-        """The cells of the body with the share of each."""
-        return list(cells_with_shares(self.raster, self.scene.cells))
 
     @cached_property
     def blocks(self) -> list[tuple[Any, ...]]:

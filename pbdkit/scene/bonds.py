@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.raster import EMPTY, FOLLOWER, Block, Raster
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,8 @@ def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
     blocks = [b for b in (forward, backward) if b]
     if not blocks:
         return None
-    start = (min(b.start[0] for b in blocks), min(b.start[1] for b in blocks))
-    stop = (max(b.stop[0] for b in blocks), max(b.stop[1] for b in blocks))
+    start = tuple(map(min, zip(*(b.start for b in blocks), strict=True)))
+    stop = tuple(map(max, zip(*(b.stop for b in blocks), strict=True)))
     return Block(plane.slot.source, start, stop)
 
 
@@ -70,11 +72,10 @@ def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
 def _bonds_of_plane(
     raster: Raster, number: int, plane: BondPlane, block: Block
 ) -> tuple[Indices, Indices, Indices, Indices, Indices]:
-    m, n = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
-    m, n = m + block.start[0], n + block.start[1]
-    slot = plane.slot
-    a = raster.rows_at(np.full(len(m), slot.source), m, n)
-    b = raster.rows_at(np.full(len(m), slot.target), m + slot.cell[0], n + slot.cell[1])
-    within = np.ravel_multi_index((m, n), raster.shape[1:])
+    found = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
+    cells, slot = list(map(add, found, block.start)), plane.slot
+    a = raster.rows_at(np.full(len(found[0]), slot.source), *cells)
+    b = raster.rows_at(np.full(len(found[0]), slot.target), *map(add, cells, slot.cell))
+    within = np.ravel_multi_index(tuple(cells), raster.shape[1:])
     shell = np.full(len(a), plane.slot.shell)
     return np.minimum(a, b), np.maximum(a, b), shell, np.full(len(a), number), within

@@ -1,104 +1,98 @@
-"""The cells of a lattice between neighbours, and the share of each that belongs to the body."""
+"""The cells of a lattice, found once for its repeat cell, and their places on the raster."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Slot
-from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import Where
+from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
+from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.polygons import Polygon, Side, Tiling
+from pbdkit.scene.places import Block, Where
+from pbdkit.scene.raster import FOLLOWER, Raster
 
 Floats = NDArray[np.float64]
+Slots = tuple[tuple[Slot, ...], ...]
+Step = tuple[int, Index]
 Share = NDArray[np.floating[Any]] | float
-Corners = tuple[Slot | None, ...]
-"""The corners of a cell as slots of its first one, which is None itself; counterclockwise."""
+CELLS_AT_ONCE = 65536
+"""So many are looked at together, so that temporaries stay small."""
+LEVEL = 1e-9
+"""Corners whose heights differ by less than this share of their distance lie level."""
+
+
+def tiling_of(cell: Cell, slots: Slots) -> Tiling:
+    """The polygons of a lattice, each once a repeat cell, and those beside its slots; none but
+    in the plane."""
+    if len(cell.vectors) != 2:
+        return Tiling()
+    polygons = tuple(_polygons(cell, s, slots[s]) for s in range(len(cell.sites)))
+    return Tiling(polygons, _beside(polygons, slots))
 
 
 @dataclass(frozen=True)
-class Side:
-    """The cell to one side of a bond: which kind it is, and the slot from the bond's start to the
-    cell's first corner (None: the start itself)."""
+class Patch:
+    """The cells of one shape on a rectangle of the raster: polygon number `kind` of its sublattice,
+    `corners[k]` the block of their k-th corners; `whole` tells of which all corners are particles
+    of the body."""
 
+    polygon: Polygon
     kind: int
-    first: Slot | None
+    corners: tuple[Block, ...]
+    whole: NDArray[np.bool_]
+
+    def differences(self, u: NDArray[Any]) -> tuple[Vector, ...]:
+        """u_k - u_0 of the corners, from planes u, (axis, sublattice, cell, cell)."""
+        corners = [u[(slice(None), *block.slices())] for block in self.corners]
+        return tuple(Vector(*(plane - corners[0])) for plane in corners)
+
+    def bonds(self, slots: Slots) -> list[tuple[Block, Slot]]:
+        """The bonds between corners: the block where they start, and their slot."""
+        corners, found = self.polygon.corners, []
+        for k, a in enumerate(corners):
+            ahead = {_step(a, b) for b in corners[k + 1 :]}
+            own = [slot for slot in slots[a.target] if (slot.target, slot.cell) in ahead]
+            found += [(self.corners[k], slot) for slot in own]
+        return found
+
+    def rows(self, raster: Raster, place: int) -> Indices:
+        """The rows of the corners of the cell at a flat place of the patch."""
+        m, n = np.unravel_index(place, self.whole.shape)
+        s = np.array([block.sublattice for block in self.corners])
+        start = np.array([block.start for block in self.corners])
+        return raster.rows_at(s, start[:, 0] + m, start[:, 1] + n)
+
+
+def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
+    """The places with cells whose corners are all of the body, some at a time."""
+    found = []
+    for kind, polygon in ((k, p) for own in tiling.polygons for k, p in enumerate(own)):
+        block = _within(raster, polygon)
+        for part in block.rows(CELLS_AT_ONCE) if block else ():
+            corners = tuple(part.seen_through(corner) for corner in polygon.corners)
+            inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
+            patch = Patch(polygon, kind, corners, np.logical_and.reduce(inside))
+            found += [patch] if patch.whole.any() else []
+    return tuple(found)
 
 
 @dataclass(frozen=True)
-class Tiling:
-    """The cells between a site and its neighbours: quadrilaterals, or triangles of two kinds.
-
-    `corners[s][kind]` belong to the cell whose first corner is a site of sublattice s;
-    `beside[slot]` are the cells to the left and to the right of a slot.
-    """
-
-    corners: tuple[tuple[Corners, ...], ...]
-    beside: dict[Slot, tuple[Side, Side]]
-
-
-def tiling_of(neighbourhood: Neighbourhood) -> Tiling:
-    """The cells of lattices whose sites have 8 neighbours around quadrilaterals, or 6 around
-    triangles; ExperimentError for others."""
-    sectors: tuple[tuple[int, int | None], ...]
-    corners: tuple[tuple[Corners, ...], ...]
-    around = [_ring(slots) for slots in neighbourhood.slots]
-    if all(map(_is_ring_of_triangles, around)):
-        corners = tuple(((None, s[0], s[1]), (None, s[1], s[2])) for s in around)
-        # Sector by sector around a site: which cell lies there, and where its first corner is.
-        sectors = ((0, None), (1, None), (0, 3), (1, 4), (0, 4), (1, 5))
-    elif all(map(_is_ring_of_quadrilaterals, around)):
-        corners = tuple(((None, s[0], s[1], s[2]),) for s in around)
-        sectors = ((0, None),) * 2 + ((0, 4),) * 2 + ((0, 5),) * 2 + ((0, 6),) * 2
-    else:
-        raise ExperimentError(
-            "the cells between these neighbours are not known: take 8 neighbours around "
-            "quadrilaterals ({type: chebyshev, shells: 1}) or the 6 of the hexagonal lattice"
-        )
-    beside: dict[Slot, tuple[Side, Side]] = {}
-    for slots in around:
-        sides = [Side(kind, None if n is None else slots[n]) for kind, n in sectors]
-        beside |= {slot: (sides[n], sides[n - 1]) for n, slot in enumerate(slots)}
-    return Tiling(corners, beside)
-
-
-def _ring(slots: tuple[Slot, ...]) -> list[Slot]:
-    """The slots counterclockwise; around quadrilaterals an edge comes first."""
-    ring = sorted(slots, key=lambda slot: math.atan2(slot.rest.y, slot.rest.x) % (2 * math.pi))
-    turned = ring[1:] + ring[:1]
-    return turned if _is_ring_of_quadrilaterals(turned) else ring
-
-
-def _is_ring_of_triangles(slots: list[Slot]) -> bool:
-    """Whether each neighbour is the sum of the two next to it."""
-    return len(slots) == 6 and all(
-        _adds_up(slots[n], slots[n - 1], slots[(n + 1) % 6]) for n in range(6)
-    )
-
-
-def _is_ring_of_quadrilaterals(slots: list[Slot]) -> bool:
-    """Whether every second neighbour is the sum of the two next to it."""
-    return len(slots) == 8 and all(
-        _adds_up(slots[n], slots[n - 1], slots[(n + 1) % 8]) for n in (1, 3, 5, 7)
-    )
-
-
-def _adds_up(middle: Slot, one: Slot, other: Slot) -> bool:
-    x, y = (a + b - m for a, b, m in zip(one.rest, other.rest, middle.rest, strict=True))
-    return math.hypot(x, y) <= 1e-6 * math.hypot(*middle.rest)
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The body's cells: `share` (kind, sublattice, cell, cell) of the cell whose first corner is
-    at that place of the raster, 0 to 1."""
+class WeighedCells:
+    """The body's cells, weighed: `share` (kind, sublattice, cell, cell) of the cell whose first
+    corner is at that place of the raster, 0 to 1."""
 
     tiling: Tiling
     share: Floats
+
+    def of(self, patch: Patch) -> Floats:
+        """The shares of the cells of a patch."""
+        return patch.corners[0].of(self.share[patch.kind])
 
     def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
         """The shares to the left and the right of a slot; 1 where all are whole."""
@@ -113,3 +107,110 @@ class Cells:
         share = share.astype(precision)
         share.flags.writeable = False
         return share
+
+
+def _within(raster: Raster, polygon: Polygon) -> Block | None:
+    """The block of first corners in the body whose other corners lie on the raster."""
+    block = raster.body_block(polygon.source)
+    if not block:
+        return None
+    bounds = []
+    for axis in (0, 1):
+        steps = [corner.cell[axis] for corner in polygon.corners]
+        begin = max(block.start[axis], -min(steps))
+        bounds.append((begin, min(block.stop[axis], raster.shape[1 + axis] - max(steps))))
+    (i, k), (j, n) = bounds
+    return Block(polygon.source, (i, j), (k, n)) if i < k and j < n else None
+
+
+def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon, ...]:
+    """Those whose first corner is of sublattice `source`, counter-clockwise; corners that are
+    neighbours lie where the slots say, to the last bit."""
+    exact = {(slot.target, slot.cell): slot.rest for slot in slots}
+    around = [replace(offset, rest=exact.get((offset.target, offset.cell), offset.rest))
+              for offset in cell.offsets(source, _reach(cell))]  # fmt: skip
+    found = []
+    for places in _around_the_origin(np.array([offset.rest for offset in around])):
+        others = tuple(around[k] for k in places)
+        # It is met from each of its corners: kept is the first.
+        if all(_is_ahead(offset.rest) for offset in others):
+            found.append(Polygon(source, (cell.offset(source, source, (0, 0)), *others)))
+    return tuple(sorted(found, key=lambda polygon: math.atan2(*polygon.rest[1][::-1])))
+
+
+def _is_ahead(r: Components) -> bool:
+    level = abs(r.y) <= LEVEL * math.hypot(*r)
+    return bool(r.x > 0.0 if level else r.y > 0.0)
+
+
+def _beside(
+    polygons: tuple[tuple[Polygon, ...], ...], slots: Slots
+) -> dict[Slot, tuple[Side, Side]]:
+    """The cells beside every slot, where the neighbours are the corners of simple cells."""
+    every = [(kind, polygon) for own in polygons for kind, polygon in enumerate(own)]
+    found: dict[Slot, tuple[Side, Side]] = {}
+    for s, own in enumerate(slots):
+        slot_of = {(slot.target, slot.cell): slot for slot in own}
+        left: dict[Step, Side] = {}
+        right: dict[Step, Side] = {}
+        for kind, polygon in every:
+            n = len(polygon.corners)
+            for start in (k for k in range(n) if polygon.corners[k].target == s):
+                keys = [_step(polygon.corners[start], corner) for corner in polygon.corners]
+                for ahead in range(1, n):
+                    end = (start + ahead) % n
+                    side = Side(kind, slot_of.get(keys[0]), start, end)
+                    left |= {keys[end]: side} if ahead < n - 1 else {}
+                    right |= {keys[end]: side} if ahead > 1 else {}
+        if not left.keys() == right.keys() == slot_of.keys():
+            return {}
+        found |= {slot: (left[key], right[key]) for key, slot in slot_of.items()}
+    return found if all(_is_simple(polygon) for _, polygon in every) else {}
+
+
+def _step(here: Offset, there: Offset) -> Step:
+    """(sublattice, repeat cells) from one corner of a polygon to another."""
+    return there.target, (there.cell[0] - here.cell[0], there.cell[1] - here.cell[1])
+
+
+def _is_simple(polygon: Polygon) -> bool:
+    """Whether it is a triangle or a parallelogram, whose triangles around the middle are equal."""
+    r = polygon.rest
+    if len(r) != 4:
+        return len(r) == 3
+    return math.dist(r[2], (r[1].x + r[3].x, r[1].y + r[3].y)) <= 1e-6 * math.hypot(*r[2])
+
+
+def _reach(cell: Cell) -> float:
+    """No side and no diagonal is longer: twice the radius of the largest circle without a site is
+    at most the sum of two cell vectors, made short by Gauss's reduction."""
+    a, b = (np.array(v) for v in cell.vectors)
+    while True:
+        if a @ a > b @ b:
+            a, b = b, a
+        shorter = b - round(float(a @ b) / float(a @ a)) * a
+        if shorter @ shorter >= b @ b:
+            return (math.hypot(*a) + math.hypot(*b)) * (1 + 1e-6)
+        b = shorter
+
+
+def _around_the_origin(x: Floats) -> Iterator[list[int]]:
+    """The polygons that meet in the origin, each by its other corners among x, counter-clockwise;
+    x are the sites around it, the nearest first: that one is always a corner.
+
+    On the left of a side (0, p) lies the polygon whose corners q see the side under the largest
+    angle, of cotangent q·(q - p) / p×q.
+    """
+    side = 0
+    for _ in range(len(x)):
+        p = x[side]
+        turn = p[0] * x[:, 1] - p[1] * x[:, 0]
+        left = turn > 1e-12 * math.hypot(*p) * np.hypot(*x.T)
+        cotangent = np.where(left, (x * (x - p)).sum(axis=1) / np.where(left, turn, 1.0), np.inf)
+        least = cotangent.min()
+        (circle,) = np.nonzero(cotangent <= least + 1e-9 * (1.0 + abs(least)))
+        ahead = sorted(circle.tolist(), key=lambda k: math.atan2(turn[k], float(x[k] @ p)))
+        yield [side, *ahead]
+        side = ahead[-1]
+        if side == 0:
+            return

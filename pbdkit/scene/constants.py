@@ -20,9 +20,8 @@ WHOLE_CELLS = {"left": 1.0, "right": 1.0}
 @dataclass(frozen=True)
 class SceneConstants:
     """Named tuples: the parameters `rule` and `fracture` (``p``); by slot the rule's `weights`
-    (``w``) and, where bonds can break, the fracture model's `limits` (``c`` without what is
-    remembered). `of_bond` makes ``c`` of limits and remembered numbers, `of_particle`
-    ``here.own``."""
+    (``w``) and the fracture model's `limits` (``c`` without what is remembered). `of_bond` makes
+    ``c`` of limits and remembered numbers, `of_particle` ``here.own``."""
 
     rule: Any
     weights: dict[Slot, Any]
@@ -39,15 +38,14 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     with blaming(rule, "when asked for its constants", "rule"):
         of_rule = _named("Parameters", rule.parameters(setting))
         sides = WHOLE_CELLS if rule.uses_cells else {}
-        weights = {s: _named("Weights", rule.weights(s, setting) | sides) for s in slots}
+        weights = {s: _named("Weights", rule.weights(s, setting), **sides) for s in slots}
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        asked = slots if fracture.can_break else []
-        limits = {s: _named("Constants", fracture.constants(s)) for s in asked}
+        limits = {s: _named("Constants", fracture.constants(s)) for s in slots}
         _refuse_other_names(limits, "constants")
         own = tuple(number.name for number in bond_numbers(experiment))
-        names = limits[asked[0]]._fields if asked else ()
+        names = limits[slots[0]]._fields if slots else ()
         if twice := set(names) & set(own):
             raise PluginError(
                 f"'{fracture.type}' has a constant and remembers a number of the name "
@@ -64,11 +62,11 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     )
 
 
-def _named(kind: str, values: Any) -> Any:
+def _named(kind: str, values: Any, **more: float) -> Any:
     """Plain numbers by name: those of numpy would raise single precision to double."""
     if not isinstance(values, dict):
         raise TypeError(f"it returned {type(values).__name__}, not numbers by name: {{'k': 1.0}}")
-    return _kind(kind, tuple(values))(*map(float, values.values()))
+    return _kind(kind, (*values, *more))(*map(float, (*values.values(), *more.values())))
 
 
 @cache

@@ -71,9 +71,12 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
     entries = len(follow.point)
-    shapes = [(entries,), (entries, 2, 2)]
+    axes = raster.sites.ndim
+    shapes = [(entries,), (entries, axes, axes)]
     if len(follow.body) != entries or np.shape(follow.weight) not in shapes:
-        raise ExperimentError("its map needs one point, body and weight (or 2 × 2 matrix) an entry")
+        raise ExperimentError(
+            "its map needs one point, body and weight (or square matrix) an entry"
+        )
     if entries and not (follow.point.min() >= 0 and follow.point.max() < points):
         raise ExperimentError(f"its map names a frame point outside 0 to {points - 1}")
     if entries and (np.diff(follow.point) < 0).any():
@@ -130,15 +133,14 @@ class RasterFrame(FrameSites):
         """The points with a body particle at that offset and none nearer; notes the distance."""
         open_ = np.flatnonzero(offset.length <= _with_ties(nearest))
         places = self.raster.place_of(self.frame_rows[points[open_]])
-        _, m, n = np.unravel_index(places, self.raster.shape)
-        m, n = m + offset.cell[0], n + offset.cell[1]
-        _, m_count, n_count = self.raster.shape
-        inside = (m >= 0) & (m < m_count) & (n >= 0) & (n < n_count)
-        open_, m, n = open_[inside], m[inside], n[inside]
-        met = self.raster.kind[offset.target, m, n] == FOLLOWER
-        open_, m, n = open_[met], m[met], n[met]
+        _, *cells = np.unravel_index(places, self.raster.shape)
+        there = np.stack(cells) + np.array(offset.cell)[:, None]
+        inside = ((there >= 0) & (self.raster.shape[1:] > there.T).T).all(axis=0)
+        open_, there = open_[inside], there[:, inside]
+        met = self.raster.kind[(offset.target, *there)] == FOLLOWER
+        open_, there = open_[met], there[:, met]
         nearest[open_] = np.minimum(nearest[open_], offset.length)
-        return points[open_], self.raster.rows_at(np.full(len(m), offset.target), m, n)
+        return points[open_], self.raster.rows_at(np.full(len(open_), offset.target), *there)
 
 
 def _turned(matrices: Floats, u: Floats) -> Floats:
@@ -149,4 +151,4 @@ def _turned(matrices: Floats, u: Floats) -> Floats:
 
 def _with_ties(distance: Floats) -> Floats:
     """The distance up to which another particle counts as equally near (model.md, section 7)."""
-    return distance * (1 + 1e-9) + 1e-12
+    return distance * (1 + 1e-9)

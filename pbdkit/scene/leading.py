@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
 Floats = NDArray[np.floating[Any]]
+
+SHOWN = 5
+"""So many warnings of one kind are given."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +42,54 @@ def build_leading(
     Raises ExperimentError for a group that selects nobody or a frame point, and for groups that
     move one particle differently in the same step.
     """
-    found = []
+    found, body = [], Selecting(raster)
     for n, group in enumerate(groups):
-        rows = select(raster, group.select, ("leaders", n, "select"))
-        _refuse_infinite(group, raster.reference(rows), steps, ("leaders", n, "motion"))
-        found.append(Leading(group, rows, raster.place_of(rows), raster.reference(rows)))
-    for n, later in enumerate(found):
-        for k, earlier in enumerate(found[:n]):
-            if _known_beforehand(earlier.group, later.group, at_rest):
-                _refuse_contradiction(raster, (k, earlier), (n, later), steps)
+        rows = body.select(group.select, ("leaders", n, "select"))
+        at = raster.reference(rows)
+        _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
+        found.append(Leading(group, rows, raster.place_of(rows), at))
+    for k, n in _meeting(found, steps):
+        if _known_beforehand(found[k].group, found[n].group, at_rest):
+            _refuse_contradiction(raster, (k, found[k]), (n, found[n]), steps)
     return tuple(found)
+
+
+def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
+    """The pairs of groups that lead a particle in the same step, and not by the same motion."""
+    motions: dict[tuple[Any, int], int] = {}
+    table = np.array(
+        [
+            (
+                min(g.group.from_, steps + 1),
+                g.group.last(steps),
+                g.rows[0],
+                g.rows[-1],
+                motions.setdefault((g.group.motion, g.group.from_), len(motions)),
+            )
+            for g in found
+        ]
+    ).reshape(-1, 5)
+    rows = [set(g.rows.tolist()) for g in found] if len(found) > 1 else []
+    for n, (begin, end, low, high, motion) in enumerate(table):
+        others = table[:n]
+        near = (others[:, 0] <= end) & (begin <= others[:, 1]) & (others[:, 4] != motion)
+        near &= (others[:, 2] <= high) & (low <= others[:, 3])
+        yield from (
+            (k, n) for k in np.flatnonzero(near).tolist() if not rows[k].isdisjoint(rows[n])
+        )
+
+
+def doubts(raster: Raster, groups: Iterable[LeaderGroup]) -> list[str]:
+    """Warnings about groups that lead others than was meant."""
+    body, found = Selecting(raster), []
+    for n, group in enumerate(groups):
+        for point in body.far(group.select.nearest or ()):
+            x, y = raster.reference(body.nearest([point]))[0]
+            found.append(
+                f"leaders.{n}.select.nearest: ({point[0]:g}, {point[1]:g}) lies far from the body; "
+                f"the particle that leads is at ({x:.6g}, {y:.6g})"
+            )
+    return found[:SHOWN]
 
 
 def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
@@ -59,41 +101,71 @@ def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[n
     return kinds
 
 
-def select(raster: Raster, selection: Selection, where: tuple[str | int, ...]) -> Indices:
-    """The rows of the selected body particles, sorted."""
-    if selection.edge is not None:
-        rows = _edge(raster, selection.edge)
-    elif selection.box is not None:
-        rows = _box(raster, selection.box)
-    elif selection.numbers is not None:
-        rows = _numbers(raster, selection.numbers, (*where, "numbers"))
-    else:
-        rows = _nearest(raster, selection.nearest or ())
-    if not len(rows):
-        low, high = (np.round(f(raster.reference(raster.body_rows), axis=0), 6).tolist()
-                     for f in (np.min, np.max))  # fmt: skip
-        raise ExperimentError(f"selects no particle; the body reaches from {low} to {high}", where)
-    return np.unique(rows)
+@dataclass(frozen=True)
+class Selecting:
+    """Chooses body particles of a raster; what it looks at is made once."""
+
+    raster: Raster
+
+    @cached_property
+    def _body(self) -> Indices:
+        return self.raster.body_rows
+
+    def far(self, points: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
+        """The points that lie outside the body by more than the cell is wide."""
+        vectors = self.raster.lattice.cell().vectors
+        width = max(math.hypot(*v) for v in vectors)
+        for point in points:
+            if not np.hypot(*(self._x - point).T).min() <= width:
+                yield point
+
+    @cached_property
+    def _x(self) -> Floats:
+        return self.raster.reference(self._body)
+
+    def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
+        """The rows of the selected body particles, sorted."""
+        if selection.edge is not None:
+            rows = self._edge(selection.edge)
+        elif selection.box is not None:
+            rows = self._box(selection.box)
+        elif selection.numbers is not None:
+            rows = _numbers(self.raster, selection.numbers, (*where, "numbers"))
+        else:
+            rows = self.nearest(selection.nearest or ())
+        if not len(rows):
+            low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
+            text = f"selects no particle; the body reaches from {low} to {high}"
+            raise ExperimentError(text, where)
+        return np.unique(rows)
+
+    def _edge(self, edge: str) -> Indices:
+        """The body particle of smallest or largest i in every row j, or j in every column i."""
+        site, axis = self.raster.site_of(self._body), 0 if edge in ("left", "right") else 1
+        along, line = site[:, axis], np.delete(site, axis, axis=1)
+        if edge in ("right", "top"):
+            along = -along
+        order = np.lexsort((along, *line.T))
+        _, first = np.unique(line[order], axis=0, return_index=True)
+        return self._body[order[first]]
+
+    def _box(self, box: tuple[float, float, float, float]) -> Indices:
+        slack = 1e-9 * _spacing(self.raster)
+        low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
+        return self._body[((self._x >= low) & (self._x <= high)).all(axis=1)]
+
+    def nearest(self, points: Iterable[tuple[float, float]]) -> Indices:
+        """The row of the particle nearest to each point, the lowest number on ties."""
+        found = []
+        for point in points:
+            distance = np.hypot(*(self._x - point).T)
+            ties = distance <= distance.min() * (1 + 1e-9) + 1e-12 * _spacing(self.raster)
+            found.append(self._body[np.argmax(ties)])
+        return np.array(found, np.intp)
 
 
-def _edge(raster: Raster, edge: str) -> Indices:
-    """The body particle of smallest or largest i in every row j, or j in every column i."""
-    body = raster.body_rows
-    i, j = raster.site_of(body).T
-    along, line = (i, j) if edge in ("left", "right") else (j, i)
-    if edge in ("right", "top"):
-        along = -along
-    order = np.lexsort((along, line))
-    _, first = np.unique(line[order], return_index=True)
-    return body[order[first]]
-
-
-def _box(raster: Raster, box: tuple[float, float, float, float]) -> Indices:
-    slack = 1e-9 * math.hypot(*raster.lattice.cell().vectors[0])
-    low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
-    body = raster.body_rows
-    x = raster.reference(body)
-    return body[((x >= low) & (x <= high)).all(axis=1)]
+def _spacing(raster: Raster) -> float:
+    return math.hypot(*raster.lattice.cell().vectors[0])
 
 
 def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
@@ -107,17 +179,6 @@ def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, .
                 f"particle {number} is a frame point: only body particles can lead", (*where, n)
             )
     return np.array(numbers, np.intp) - 1
-
-
-def _nearest(raster: Raster, points: Iterable[tuple[float, float]]) -> Indices:
-    body = raster.body_rows
-    x = raster.reference(body)
-    found = []
-    for point in points:
-        distance = np.hypot(x[:, 0] - point[0], x[:, 1] - point[1])
-        ties = distance <= distance.min() * (1 + 1e-9) + 1e-12
-        found.append(body[np.argmax(ties)])
-    return np.array(found, np.intp)
 
 
 def _refuse_contradiction(
@@ -138,7 +199,7 @@ def _refuse_contradiction(
     near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1, 2)}
     for step in sorted(step for step in near if begin <= step <= end):
         one, other = _offset(a.group, step, at), start + _offset(b.group, step, at + start)
-        differs = np.abs(one - other).max(axis=1) > 1e-12 * max(1.0, np.abs(one).max())
+        differs = np.abs(one - other).max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
         if differs.any():
             number = shared[np.argmax(differs)] + 1
             raise ExperimentError(

@@ -7,26 +7,28 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Diagnostic
 from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.mesh import body_cells
+from pbdkit.scene.cells import patches
+from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import FRAME, Raster
 from pbdkit.scene.remembering import remembered_names
 
 
-def check_diagnostics(experiment: Experiment, raster: Raster) -> list[str]:
+def check_diagnostics(
+    experiment: Experiment, raster: Raster, neighbourhood: Neighbourhood
+) -> list[str]:
     """Raises ExperimentError for diagnostics that do not go with the scene or each other; returns
     warnings about them."""
     taken = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
-            diagnostic.check(raster.count)
-            diagnostic.check_leaders(len(experiment.leaders))
+            diagnostic.check(raster.count, len(experiment.leaders))
             diagnostic.coordinates()
-            if diagnostic.uses_cells and not body_cells(raster):
+            if "cells" in diagnostic.needs and not patches(raster, neighbourhood.tiling):
                 raise ExperimentError(
                     f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
                     "belong to the body; make it wider, or leave the diagnostic out"
                 )
-            if diagnostic.uses_material or diagnostic.uses_forces:
+            if diagnostic.needs & {"material", "forces"}:
                 _refuse_without_material(diagnostic, experiment)
             for variable in diagnostic.variables():
                 if variable.name in taken:
@@ -37,7 +39,7 @@ def check_diagnostics(experiment: Experiment, raster: Raster) -> list[str]:
 
 
 def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
-    asking = [(n, d) for n, d in enumerate(experiment.diagnostics) if d.uses_forces]
+    asking = [(n, d) for n, d in enumerate(experiment.diagnostics) if "forces" in d.needs]
     if not asking or not (raster.table_kind == FRAME).any():
         return []
     return [

@@ -6,11 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, Lattice, NeighbourMetric, Offset, Slot, Vector
+from pbdkit.interfaces import Cell, Components, Lattice, NeighbourMetric, Offset, Slot
+from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.polygons import Tiling
+from pbdkit.scene.cells import tiling_of
 
 FLATTEST = 1e-3
 """Cells flatter than this are refused: within a cell vector of a site lie π/flatness others."""
@@ -31,11 +35,17 @@ class BondPlane:
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """`slots[s]` are the neighbours of sublattice s, the nearest shells first and inversion
-    partners side by side; `planes` holds each pair of opposite slots once."""
+    """`slots[s]` are the neighbours of sublattice s of `cell`, the nearest shells first and
+    inversion partners side by side; `planes` holds each pair of opposite slots once."""
 
+    cell: Cell
     slots: tuple[tuple[Slot, ...], ...]
     planes: tuple[BondPlane, ...]
+
+    @cached_property
+    def tiling(self) -> Tiling:
+        """The cells of the lattice, and which of them lie beside the slots."""
+        return tiling_of(self.cell, self.slots)
 
     @property
     def reach(self) -> int:
@@ -43,10 +53,10 @@ class Neighbourhood:
         return max(max(abs(n) for n in slot.site) for slots in self.slots for slot in slots)
 
     @property
-    def reach_in_cells(self) -> tuple[int, int]:
+    def reach_in_cells(self) -> Index:
         """The largest difference of repeat cell along each axis."""
-        steps = [slot.cell for slots in self.slots for slot in slots]
-        return max(abs(m) for m, _ in steps), max(abs(n) for _, n in steps)
+        steps = zip(*(slot.cell for slots in self.slots for slot in slots), strict=True)
+        return tuple(max(map(abs, along)) for along in steps)
 
     @cached_property
     def home(self) -> dict[Slot, tuple[int, bool]]:
@@ -63,32 +73,38 @@ class Neighbourhood:
                 found.setdefault(slot.shell, []).append(math.hypot(*slot.rest))
         return [found[shell] for shell in sorted(found)]
 
-    def spans_plane(self) -> bool:
-        """Whether steps between neighbours reach in two directions; else rows do not feel each
+    def spans_space(self) -> bool:
+        """Whether steps between neighbours reach in all directions; else rows do not feel each
         other."""
-        first = self.slots[0][0].rest
-        return any(
-            abs(first.x * r.y - first.y * r.x) > 1e-9 * math.hypot(*first) * math.hypot(*r)
-            for slots in self.slots
-            for r in (slot.rest for slot in slots)
-        )
+        rests = np.array([slot.rest for slots in self.slots for slot in slots])
+        directions = rests / np.linalg.norm(rests, axis=1)[:, None]
+        rank = int(np.linalg.matrix_rank(directions, tol=1e-9))
+        return rank == len(self.slots[0][0].rest)
 
 
 def checked_cell(lattice: Lattice) -> Cell:
-    """The lattice's cell; ExperimentError where it is degenerate or its sites share an index or a
-    place."""
+    """The lattice's cell; ExperimentError where it is degenerate, its sites share an index or a
+    place, or lie so far off that positions would."""
     cell = lattice.cell()
-    a, b = cell.vectors
+    named = " and ".join(str(tuple(v)) for v in cell.vectors)
     indices = [site.index for site in cell.sites]
-    inside = all(0 <= i < cell.period[0] and 0 <= j < cell.period[1] for i, j in indices)
-    if not np.isfinite([*a, *b]).all() or a.x * b.y - a.y * b.x == 0.0:
-        raise ExperimentError(f"the cell vectors {tuple(a)} and {tuple(b)} span no area")
+    inside = all(0 <= n < p for index in indices for n, p in zip(index, cell.period, strict=True))
+    if not np.isfinite(cell.vectors).all() or flatness(cell) == 0.0:
+        raise ExperimentError(f"the cell vectors {named} span no area")
     if flatness(cell) < FLATTEST:
         raise ExperimentError(
-            f"the cell vectors {tuple(a)} and {tuple(b)} are nearly degenerate: sites lie "
+            f"the cell vectors {named} are nearly degenerate: sites lie "
             f"{1 / flatness(cell):.3g} times closer along one line than the longer is long, and "
             f"{1 / FLATTEST:g} times is the most; open their angle, or make their lengths more "
             "alike"
+        )
+    far = max(map(abs, lattice.origin))
+    apart = min(math.hypot(*v) for v in cell.vectors)
+    if 4 * math.ulp(far) > apart:
+        raise ExperimentError(
+            f"at {far:g} double precision does not tell sites apart that lie {apart:g} from each "
+            "other; move the origin nearer to zero",
+            ("origin",),
         )
     if len(set(indices)) < len(indices) or not inside:
         raise ExperimentError(
@@ -96,7 +112,7 @@ def checked_cell(lattice: Lattice) -> Cell:
             f"period {cell.period}"
         )
     for s, site in enumerate(cell.sites):
-        for near in cell.offsets(s, SAME_PLACE * math.hypot(*a)):
+        for near in cell.offsets(s, SAME_PLACE * math.hypot(*cell.vectors[0])):
             raise ExperimentError(
                 f"the sites with the indices {site.index} and {cell.sites[near.target].index} lie "
                 f"at one place, {tuple(site.at)}; give each its own"
@@ -105,12 +121,10 @@ def checked_cell(lattice: Lattice) -> Cell:
 
 
 def flatness(cell: Cell) -> float:
-    """How much less area than a square a cell has: sites · area / (longer vector)², the sine of
-    the angle for one site and vectors of one length."""
-    a, b = cell.vectors
-    longer = max(math.hypot(*a), math.hypot(*b))
-    area: float = abs(a.x / longer * (b.y / longer) - a.y / longer * (b.x / longer))
-    return len(cell.sites) * area
+    """How much less room than a square or cube a cell has: sites · area / (longest vector)², the
+    sine of the angle for one site and vectors of one length in the plane."""
+    scaled = np.array(cell.vectors) / max(math.hypot(*v) for v in cell.vectors)
+    return len(cell.sites) * abs(float(np.linalg.det(scaled)))
 
 
 def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
@@ -123,27 +137,28 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
     _refuse_gaps(slots, len(by_key))
     planes = []
     for slot in by_key.values():
-        opposite = by_key.get((slot.target, slot.source, (-slot.cell[0], -slot.cell[1])))
+        opposite = by_key.get((slot.target, slot.source, tuple(-n for n in slot.cell)))
         if opposite is None or opposite.shell != slot.shell:
             raise ExperimentError(
                 f"'{metric.type}' is not mutual: the neighbour at site index offset {slot.site} "
                 "does not have this one in the same shell; a body at rest would drift"
             )
-        if slot.site > (0, 0):
+        if slot.site > tuple(0 for _ in slot.site):
             planes.append(BondPlane(slot, opposite))
     for own in slots:
         _refuse_lopsided(own, metric)
-    return Neighbourhood(slots, tuple(planes))
+    return Neighbourhood(cell, slots, tuple(planes))
 
 
 def _refuse_lopsided(own: tuple[Slot, ...], metric: NeighbourMetric) -> None:
     """On lattices whose sites are no centres of inversion, mutual is not enough."""
-    x, y = (math.fsum(slot.rest[axis] for slot in own) for axis in (0, 1))
-    if math.hypot(x, y) > BALANCED * math.fsum(math.hypot(*slot.rest) for slot in own):
+    sums = [math.fsum(along) for along in zip(*(slot.rest for slot in own), strict=True)]
+    if math.hypot(*sums) > BALANCED * math.fsum(math.hypot(*slot.rest) for slot in own):
         raise ExperimentError(
             f"'{metric.type}' is lopsided on this lattice: the {len(own)} neighbours of a site "
-            f"have their barycentre ({x / len(own):.3g}, {y / len(own):.3g}) away from it, and a "
-            "body at rest would drift; choose whole shells of equal distance, {type: coordination}"
+            f"have their barycentre ({', '.join(f'{s / len(own):.3g}' for s in sums)}) away from "
+            "it, and a body at rest would drift; choose whole shells of equal distance, "
+            "{type: coordination}"
         )
 
 
@@ -176,26 +191,23 @@ class _ExactVectors:
     """
 
     def __init__(self) -> None:
-        self._known: list[Vector] = []
-        self._near: dict[tuple[int, int], int] = {}
+        self._known: list[Components] = []
+        self._near: dict[Index, int] = {}
 
-    def of(self, v: Vector) -> tuple[int, bool, Vector]:
+    def of(self, v: Components) -> tuple[int, bool, Components]:
         """(which known vector, whether negated, the value to use)."""
         for negative in (False, True):
-            sign = -1.0 if negative else 1.0
-            number = self._near.get(self._key(Vector(sign * v.x, sign * v.y)))
+            number = self._near.get(self._key(-v if negative else v))
             if number is not None:
                 known = self._known[number]
-                return number, negative, Vector(-known.x, -known.y) if negative else known
-        self._known.append(Vector(v.x + 0.0, v.y + 0.0))
+                return number, negative, -known if negative else known
+        self._known.append(v.each(lambda component: component + 0.0))
         number = len(self._known) - 1
-        x, y = self._key(v)
-        for dx in (-1, 0, 1):
-            for dy in (-1, 0, 1):
-                self._near.setdefault((x + dx, y + dy), number)
+        for near in product(*((n - 1, n, n + 1) for n in self._key(v))):
+            self._near.setdefault(near, number)
         return number, False, self._known[number]
 
-    def _key(self, v: Vector) -> tuple[int, int]:
+    def _key(self, v: Components) -> Index:
         """The place on a grid much finer than any lattice and much coarser than rounding."""
         unit = 1e-6 * math.hypot(*(self._known[0] if self._known else v))
-        return math.floor(v.x / unit), math.floor(v.y / unit)
+        return tuple(math.floor(component / unit) for component in v)

@@ -22,7 +22,7 @@ def build_raster(
     """
     cell = lattice.cell()
     inside = np.pad(body, layers)
-    low = (origin[0] - layers, origin[1] - layers)
+    low = tuple(n - layers for n in origin)
     window = dilated(inside, layers) & existing(cell, low, inside.shape)
     sites = np.where(window, np.int8(FRAME), np.int8(EMPTY))
     sites[inside] = FOLLOWER
@@ -36,17 +36,17 @@ def build_raster(
 
 def existing(cell: Cell, low: Index, shape: tuple[int, ...]) -> Mask:
     """Which sites of a window of indices, from `low` on, the lattice has."""
-    i, j = np.arange(low[0], low[0] + shape[0]), np.arange(low[1], low[1] + shape[1])
+    along = [np.arange(n, n + size) for n, size in zip(low, shape, strict=True)]
     there: Mask = sublattices(cell) >= 0
-    return there[np.ix_(i % cell.period[0], j % cell.period[1])]
+    return there[np.ix_(*(n % p for n, p in zip(along, cell.period, strict=True)))]
 
 
 def dilated(mask: Mask, layers: int) -> Mask:
     """Every place within `layers` of a true one, along either axis or both."""
-    for axis in (0, 1):
+    for axis in range(mask.ndim):
         grown = mask.copy()
         for k in range(1, layers + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead, behind = [slice(None)] * mask.ndim, [slice(None)] * mask.ndim
             ahead[axis], behind[axis] = slice(k, None), slice(None, -k)
             grown[tuple(ahead)] |= mask[tuple(behind)]
             grown[tuple(behind)] |= mask[tuple(ahead)]
@@ -56,14 +56,10 @@ def dilated(mask: Mask, layers: int) -> Mask:
 
 def _extent(
     cell: Cell, low: Index, window: tuple[int, ...], reach: Index
-) -> tuple[Index, tuple[int, int, int]]:
+) -> tuple[Index, tuple[int, ...]]:
     """(first cell, shape) of the rasters: the window's cells and all that a slot can reach."""
-    ends = np.array([[low[0], low[1]], [low[0] + window[0] - 1, low[1] + window[1] - 1]])
-    _, m, n = cells_of_sites(cell, ends[:, 0], ends[:, 1])
-    first = (int(m[0]) - reach[0], int(n[0]) - reach[1])
-    shape = (
-        len(cell.sites),
-        int(m[1]) + reach[0] + 1 - first[0],
-        int(n[1]) + reach[1] + 1 - first[1],
-    )
-    return first, shape
+    ends = np.array([low, np.add(low, window) - 1])
+    _, *cells = cells_of_sites(cell, *ends.T)
+    first = tuple(int(m[0]) - r for m, r in zip(cells, reach, strict=True))
+    last = [int(m[1]) + r for m, r in zip(cells, reach, strict=True)]
+    return first, (len(cell.sites), *(b + 1 - a for a, b in zip(first, last, strict=True)))

@@ -10,20 +10,20 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Cell, Components, Remembers, Setting
+from pbdkit.interfaces import Cell, Components, Setting
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
-from pbdkit.scene.cells import Cells, Tiling, tiling_of
+from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.constants import SceneConstants, ask_for_constants
-from pbdkit.scene.cutting import Filling, fill_with_cells
+from pbdkit.scene.cut_cells import Filling, fill_with_cells
 from pbdkit.scene.filling import fill, has_narrow_slot, window
 from pbdkit.scene.framing import Frame, build_frame
-from pbdkit.scene.leading import Leading, build_leading
+from pbdkit.scene.leading import Leading, build_leading, doubts
 from pbdkit.scene.measuring import check_diagnostics
-from pbdkit.scene.mesh import Patch, body_cells
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.nested import inner_experiment
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.rasterising import Mask, build_raster
 from pbdkit.scene.sizes import refuse_too_large
@@ -46,7 +46,7 @@ class Scene:
     raster: Raster
     constants: SceneConstants
     frame: Frame | None
-    cells: Cells | None
+    cells: WeighedCells | None
     inner: Scene | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
@@ -87,7 +87,7 @@ class Scene:
     @cached_property
     def patches(self) -> tuple[Patch, ...]:
         """The cells of the body."""
-        return body_cells(self.raster)
+        return patches(self.raster, self.neighbourhood.tiling)
 
 
 def build_scene(experiment: Experiment) -> Scene:
@@ -109,16 +109,17 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked for its depth", "frame"):
         layers = frame.depth(neighbourhood.reach)
     low, high = window(experiment.body, experiment.lattice)
-    extent = (high[0] - low[0] + 1, high[1] - low[1] + 1)
+    extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
     refuse_too_large(experiment, neighbourhood, extent, layers)
     if frame.weighs_cells:
-        filling, tiling = _cells(experiment, neighbourhood)
+        filling = _filling(experiment, neighbourhood)
         body, first = filling.body, filling.first
     else:
         body, first = fill(experiment.body, experiment.lattice)
     warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
     raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
-    warnings += check_diagnostics(experiment, raster)
+    warnings += check_diagnostics(experiment, raster, neighbourhood)
+    warnings += doubts(raster, experiment.leaders)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
@@ -130,39 +131,23 @@ def _build(experiment: Experiment) -> Scene:
     leading = build_leading(raster, experiment.leaders, experiment.steps, at_rest=at_rest)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
-    cells = filling.on(raster, tiling) if frame.weighs_cells else None
+    cells = filling.on(raster, neighbourhood.tiling) if frame.weighs_cells else None
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     scene = Scene(experiment, *parts, tuple(warnings))
-    return replace(scene, inner=_inner(scene))
+    return with_inner(scene)
 
 
-def _inner(scene: Scene) -> Scene | None:
-    """The scene with the rule's inner rule in its place."""
-    experiment, rule = scene.experiment, scene.experiment.rule
-    if not isinstance(rule, AppliesTwice):
-        return None
-    with blaming(rule, "when asked for its inner rule", "rule"):
-        inner = rule.inner()
-    remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
-    for unfit, part, remedy in (
-        (scene.frame, "frame", "{type: natural}, which has no points"),
-        (scene.has_fracture, "fracture", "{type: none}"),
-        (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
-        (remembers, "rule", "one that remembers nothing"),
-    ):
-        if unfit:
-            raise ExperimentError(
-                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
-                f"this {part}; take {part}: {remedy}",
-                (part,),
-            )
-    experiment = experiment.model_copy(update={"rule": inner})
-    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    scene = replace(scene, experiment=experiment, constants=constants)
-    return replace(scene, inner=_inner(scene))
+def with_inner(scene: Scene) -> Scene:
+    """The scene with that of its inner rule, where the rule works on the moves of another."""
+    lags = scene.frame is not None and scene.frame.map.lag == 1
+    inner = inner_experiment(scene.experiment, lags=lags)
+    if inner is None:
+        return scene
+    constants = ask_for_constants(inner, setting_of(scene.raster, scene.neighbourhood))
+    return replace(scene, inner=with_inner(replace(scene, experiment=inner, constants=constants)))
 
 
-def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Filling, Tiling]:
+def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
     frame, rule = experiment.frame, experiment.rule
     if not rule.uses_cells:
         raise ExperimentError(
@@ -171,15 +156,21 @@ def _cells(experiment: Experiment, neighbourhood: Neighbourhood) -> tuple[Fillin
             "barycentre), or another frame",
             ("frame",),
         )
-    with blaming(frame, "when asked for the cells", "neighbours"):
-        tiling = tiling_of(neighbourhood)
-    return fill_with_cells(experiment.body, experiment.lattice, tiling), tiling
+    if not neighbourhood.tiling.beside:
+        raise ExperimentError(
+            "the neighbours of a site are not the corners of the cells around it: take 8 on the "
+            "square or the rectangular lattice ({type: chebyshev, shells: 1}), 6 on the hexagonal "
+            "one ({type: coordination, shells: 1})",
+            ("neighbours",),
+        )
+    return fill_with_cells(experiment.body, experiment.lattice, neighbourhood.tiling)
 
 
 def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
     """What a rule may derive its constants from."""
     lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
-    return Setting(raster.lattice.cell(), neighbourhood.slots, lower, upper)
+    cell, slots = raster.lattice.cell(), neighbourhood.slots
+    return Setting(cell, slots, lower, upper, neighbourhood.tiling)
 
 
 def body_box(raster: Raster) -> tuple[Components, Components]:
@@ -201,7 +192,7 @@ def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -
             "one line than its longer cell vector is long, so that neighbours by distance lie "
             "along that line; take chebyshev neighbours, or open the angle between the vectors"
         )
-    if not neighbourhood.spans_plane():
+    if not neighbourhood.spans_space():
         doubts.append(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
             "more shells, or chebyshev neighbours, connect them"

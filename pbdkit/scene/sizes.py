@@ -10,19 +10,30 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Diagnostic, RenewsBonds, RenewsParticles
+from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.remembering import Declared, bond_numbers, particle_numbers
 
 MIB = 2**20
-WORKSPACE_BYTES = 100
-"""Per particle, what making the tables takes at its peak besides what stays (measured)."""
-BOND_BYTES = 74
-"""Per bond, the table of bonds and the making of it (measured)."""
+LEAST = 6 * MIB
+"""What any scene takes, however small: tables are made in chunks."""
 
-CELL_BYTES = 60
-"""Per particle, the shares of the cells and the making of them (measured)."""
+WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
+"""Bytes a particle, measured as the peak of the process over sheets of 90 000 to 500 000: making
+the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
+of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
+
+GRADIENT, FORCES, TABLES = 250, 160, 40
+"""The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
+
+ANEW, ANEW_EACH = 150, 118
+"""The same where neighbours are found anew, and a neighbour."""
+
+FACTORS, COUPLED_FACTORS = 200, 800
+"""The same a neighbour for the matrices of an equilibrium: of rules that leave x and y apart, and
+of calibrated ones. Rough: it depends on the method and on the shape of the body."""
 
 
 @dataclass(frozen=True)
@@ -40,28 +51,42 @@ def estimate(
 ) -> Sizes:
     """From the window of site indices that the body fills at most, with Python's integers."""
     cell = experiment.lattice.cell()
-    share = len(cell.sites) / (cell.period[0] * cell.period[1])
-    particles = math.ceil((window[0] + 2 * layers) * (window[1] + 2 * layers) * share)
+    share = len(cell.sites) / math.prod(cell.period)
+    particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
     return sizes_of(experiment, neighbourhood, particles)
 
 
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
     """The same for a known number of particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
-    value = 8 if experiment.solver.precision == "float64" else 4
+    value = 8 if experiment.stepping.precision == "float64" else 4
     bonds, own = bond_numbers(experiment), particle_numbers(experiment)
     state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1 + value)
     state += planes * _bytes_of(bonds, value) + _bytes_of(own, value)
-    table = (
-        1
-        + 8
-        + 2 * 4
-        + experiment.rule.uses_reference * 16
-        + experiment.shows_bonds * planes * BOND_BYTES
-        + experiment.frame.weighs_cells * CELL_BYTES
-    )
-    memory = math.ceil(particles * (state + table + WORKSPACE_BYTES))
+    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
+    memory = LEAST + math.ceil(particles * (state + table + made))
     return Sizes(particles, memory, _output(experiment, particles, planes))
+
+
+def _workspace(experiment: Experiment, each: int, planes: float) -> float:
+    """Bytes a particle besides state and table, with `each` neighbours."""
+    rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
+    made = WORKSPACE + experiment.shows_bonds * planes * BONDS
+    made += INNER * isinstance(rule, AppliesTwice)
+    made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
+    tables = [d for d in diagnostics if any("particle" in v.dims for v in d.variables())]
+    if any("cells" in d.needs for d in tables):
+        made += GRADIENT
+    elif any("forces" in d.needs for d in diagnostics):
+        made += FORCES
+    elif tables:
+        made += TABLES
+    if experiment.neighbours.nearness():
+        made += ANEW + each * ANEW_EACH
+    if not experiment.solver.makes_steps:
+        made += each * (FACTORS if material_of(rule) is None else COUPLED_FACTORS)
+    return made
 
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:

@@ -40,6 +40,7 @@ def project_files(names: Names, interface: str) -> dict[str, str]:
     templates = {
         "pyproject.toml": "pyproject.toml",
         "README.md": "README.md",
+        "LICENSE": "LICENSE",
         ".gitignore": "gitignore",
         "example.yaml": "example.yaml",
         f"{names.module}.py": f"{interface}.py",

@@ -36,7 +36,7 @@ def choose(scene: Scene) -> Choice:
 
     Raises ExperimentError where the compiled engine is asked for and cannot be had.
     """
-    solver = scene.experiment.solver
+    solver = scene.experiment.stepping
     hindrance = obstacle()
     if solver.engine == "compiled" and hindrance:
         raise scene.experiment.located(
@@ -46,15 +46,13 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
     if solver.engine == "auto" and seconds < PATIENCE_S:
-        return Choice("numpy", 1, "small: there is nothing to gain by compiling")
+        return Choice("numpy", 1, f"{_about(seconds)} in all: compiling would take longer")
     if hindrance:
         return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
         threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
-    reason = (
-        "asked for" if solver.engine == "compiled" else f"numpy would take about {seconds:.0f} s"
-    )
+    reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason)
 
 
@@ -67,7 +65,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
     try:
         return CompiledStepper(scene, choice.threads), choice
     except PluginError as error:
-        if scene.experiment.solver.engine == "compiled":
+        if scene.experiment.stepping.engine == "compiled":
             raise
         reason = f"slower than it could be: {str(error).splitlines()[0]}"
         return Stepper(scene), Choice("numpy", 1, reason)
@@ -86,10 +84,14 @@ def _numpy_seconds(scene: Scene) -> float:
     return a_step * _steps(scene)
 
 
+def _about(seconds: float) -> str:
+    return f"about {seconds:.1g} s" if seconds < 10.0 else f"about {seconds:.0f} s"
+
+
 def _steps(scene: Scene) -> float:
     """How many steps may be made: one that is to settle makes no more than a plain barycentre
     needs on a body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
-    steps, settle = scene.experiment.steps, scene.experiment.solver.settle
+    steps, settle = scene.experiment.steps, scene.experiment.stepping.settle
     if settle is None:
         return steps
     cells = max(scene.raster.shape[1:])

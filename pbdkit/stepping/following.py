@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.experiment.solvers import Equilibrium, Stepping
+from pbdkit.experiment.solvers import Stepping
 from pbdkit.stepping.state import Floats, State
 
 REAL = "fiub"
@@ -25,7 +25,7 @@ class Followers(ABC):
         and particles remember, and renews, in place, what particles do."""
 
 
-def target(here: Any, move: Any, before: Any, solver: Stepping | Equilibrium) -> Any:
+def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
     """u + relaxation · move + memory · (u - before), elementwise for one component.
 
     Raises ValueError where the move is not one real number a particle.

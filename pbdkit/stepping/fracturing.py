@@ -13,8 +13,9 @@ from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import BLOCK_CELLS, Evaluator
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.state import State
+from pbdkit.stepping.surroundings import BLOCK_CELLS
 
 Home = tuple[Any, ...]
 """Where bonds are kept: plane and cells."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,7 @@ class GatheringFollowers(Followers):
             self._remember(total, here, state, movable)
         for u_here, step, plane in zip(u, move, new.reshape(len(new), -1), strict=True):
             before = plane[self._place]
-            moved = target(u_here, step, before, self._scene.experiment.solver)
+            moved = target(u_here, step, before, self._scene.experiment.stepping)
             plane[self._place[self._body]] = u_here[self._body]
             plane[place] = moved[movable]
 
@@ -92,12 +93,12 @@ class GatheringFollowers(Followers):
     def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
         """The number of each pair's slot, the largest of all where it is none, and the rest offset,
         (axis, pair)."""
-        s, m, n = self._site
-        table = self._rank.shape
-        p, q = m[k] - m[j] + table[2] // 2, n[k] - n[j] + table[3] // 2
-        near = (p >= 0) & (p < table[2]) & (q >= 0) & (q < table[3])
+        s, *cells = self._site
+        sizes = np.array(self._rank.shape[2:])[:, None]
+        step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
+        near = ((step >= 0) & (step < sizes)).all(axis=0)
         rank = np.full(len(j), len(self._rest[0]))
-        rank[near] = self._rank[s[j[near]], s[k[near]], p[near], q[near]]
+        rank[near] = self._rank[(s[j[near]], s[k[near]], *step[:, near])]
         slot = np.minimum(rank, len(self._rest[0]) - 1)
         known = rank < len(self._rest[0])
         rest: Floats = np.where(known, self._rest[:, slot], self._X[:, k] - self._X[:, j])
@@ -105,14 +106,13 @@ class GatheringFollowers(Followers):
 
 
 def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
-    """The number of a slot by (sublattice, sublattice, step of cells, step of cells), the count of
+    """The number of a slot by (sublattice, sublattice, step of cells along each axis), the count of
     slots where there is none; and the rest offset by that number, (axis, slot)."""
     slots = [slot for own in neighbourhood.slots for slot in own]
-    m, n = neighbourhood.reach_in_cells
-    size = len(neighbourhood.slots)
-    rank = np.full((size, size, 2 * m + 1, 2 * n + 1), len(slots))
+    reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
+    rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))
     for number, slot in enumerate(slots):
-        rank[slot.source, slot.target, slot.cell[0] + m, slot.cell[1] + n] = number
+        rank[(slot.source, slot.target, *map(add, slot.cell, reach))] = number
     return rank, np.array([slot.rest for slot in slots]).T
 
 

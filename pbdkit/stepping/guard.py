@@ -4,6 +4,7 @@ state that was good."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,52 +22,61 @@ BEYOND = 1e6
 SAMPLES = 64
 
 
+@dataclass
 class Guard:
     """Looks at states, at two passes over the displacements a look.
 
-    A state is good where no displacement is larger than the body, its start and its leaders' ways
-    together.
+    A state is good where no displacement is larger than `size`: the body, its start and its
+    leaders' ways together. `next_look` is the step at which to look at the latest, `good_step` the
+    last that was found good, `kept` a copy of a good state.
     """
 
-    def __init__(self, scene: Scene, start: State) -> None:
-        self._scene = scene
+    size: float
+    good_step: int
+    next_look: int
+    kept: State | None
+
+    @classmethod
+    def of(cls, scene: Scene, start: State) -> Guard:
+        """The guard of a run from that state."""
         ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
-        spacing = max(abs(s.rest.x) + abs(s.rest.y) for s in scene.neighbourhood.slots[0])
+        spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
         ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
-        self._size = size + sum(ways)
-        self._last_good = start.step
-        self._kept: State | None = None
-        self.next_look = EVERY
-        """The step at which to look at the latest."""
+        kept = start.copy() if start.step else None
+        return cls(size + sum(ways), start.step, start.step + EVERY, kept)
 
-    def look(self, state: State) -> None:
+    def look(self, scene: Scene, state: State) -> None:
         """Raises FloatingPointError, with particle and step, where a displacement is not finite or
         beyond all bounds."""
         self.next_look = state.step + EVERY
         most = _most(state)
-        if most <= self._size:
-            self._last_good = state.step
-            if state.step >= KEPT_EVERY + (self._kept.step if self._kept else 0):
-                self._kept = state.copy(self._kept)
-        if most <= BEYOND * self._size:
+        if most <= self.size:
+            self.good_step = state.step
+            if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
+                self.kept = state.copy(self.kept)
+        if most <= BEYOND * self.size:
             return
-        u = self._scene.raster.table(state.u)
-        worst = int(np.argmax(np.abs(u).max(axis=1)))  # a NaN counts as the largest
+        worst = int(np.argmax(np.abs(scene.raster.table(state.u)).max(axis=1)))  # NaN is largest
         raise FloatingPointError(f"particle {worst + 1}, found at step {state.step},")
 
     def last_good(
-        self, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
+        self,
+        scene: Scene,
+        engine: Engine,
+        before: int,
+        patience: int,
+        stopping: Callable[[], bool],
     ) -> State | None:
         """The last good state before a step, found by stepping once more, `patience` steps a call,
         from where the guard kept a copy; None where `stopping` says so meanwhile."""
-        state, self._kept = self._kept or initial_state(self._scene), None
-        while state.step < self._last_good and not stopping():
-            state = engine.advance(state, min(patience, self._last_good - state.step))
+        state, self.kept = self.kept or initial_state(scene), None
+        while state.step < self.good_step and not stopping():
+            state = engine.advance(state, min(patience, self.good_step - state.step))
         good = state.copy()
         while state.step + 1 < before and not stopping():
             state = engine.advance(state)
-            if not _most(state) <= self._size:
+            if not _most(state) <= self.size:
                 break
             good = state.copy(good)
         return None if stopping() else good

@@ -45,8 +45,7 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     apart = np.abs(np.diff(u[:, order], axis=1)).max(axis=0) > 1e-9 * max(1.0, np.abs(u).max())
     if (same & apart).any():
         place = places[order][:-1][same & apart][:1]
-        s, m, n = np.unravel_index(place, scene.raster.shape)
-        number = int(scene.raster.rows_at(s, m, n)[0]) + 1
+        number = int(scene.raster.rows_at(*np.unravel_index(place, scene.raster.shape))[0]) + 1
         raise ExperimentError(
             f"two groups move particle {number} differently in step {step}; select it in one of "
             "them only, or let one end before the other begins",

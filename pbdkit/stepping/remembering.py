@@ -86,12 +86,15 @@ def renew(old: Sequence[Array], new: Sequence[Any], where: Array | None) -> None
         np.copyto(plane, value)
 
 
-def shown(values: Sequence[Array]) -> Values:
+def shown(values: Sequence[Any]) -> tuple[Any, ...]:
     """The same, as components see it: nobody writes to the state but the stepper."""
-    views = tuple(value.view() for value in values)
-    for view in views:
-        view.flags.writeable = False
-    return views
+    return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in values)
+
+
+def _read_only(value: Array) -> Array:
+    view = value.view()
+    view.flags.writeable = False
+    return view
 
 
 def changing(numbers: Sequence[Remembered], values: Sequence[Array]) -> list[Array]:
@@ -100,7 +103,7 @@ def changing(numbers: Sequence[Remembered], values: Sequence[Array]) -> list[Arr
 
 
 def _started(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Values:
-    precision = scene.experiment.solver.precision
+    precision = scene.experiment.stepping.precision
     dtypes = [precision if number.dtype == "f8" else number.dtype for number in numbers]
     return tuple(np.full(shape, n.initial, d) for n, d in zip(numbers, dtypes, strict=True))
 

@@ -7,34 +7,37 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.experiment.solvers import Equilibrium, Stepping
+from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import Here, RenewsParticles, StoresEnergy
 from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Around, Contributions, Evaluator
+from pbdkit.stepping.evaluator import Contributions, Evaluator
 from pbdkit.stepping.following import Followers, target
 from pbdkit.stepping.remembering import changing, renew
 from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import Surroundings, blocks
+
+Summed = tuple[Surroundings, Contributions, Here]
 
 
 class SlotFollowers(Followers):
     """Moves the followers of a scene whose neighbours stay as they are."""
 
-    def __init__(self, scene: Scene, solver: Stepping | Equilibrium | None = None) -> None:
+    def __init__(self, scene: Scene, solver: Stepping | None = None) -> None:
         self._scene = scene
-        self._solver = solver or scene.experiment.solver
+        self._solver = solver or scene.experiment.stepping
         self._rule = scene.experiment.rule
         self._inner = SlotFollowers(scene.inner, Stepping()) if scene.inner else None
         self._numbers = particle_numbers(scene.experiment)
         self._evaluator = Evaluator(scene)
-        self._blocks = self._evaluator.blocks()
+        self._blocks = blocks(scene)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
         for around, total, here in self._summed(m, state):
             self._place(around, self._evaluator.move(total, here), m, new)
             if isinstance(self._rule, RenewsParticles):
-                own = changing(self._numbers, self._evaluator.own(around, state))
+                own = changing(self._numbers, around.own(state))
                 renew(own, self._evaluator.remember(total, here), around.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
@@ -58,7 +61,7 @@ class SlotFollowers(Followers):
             return self._work(m, self.forces(m, state))
         seen, out = self._seen(m, state), np.zeros_like(m[:1])
         for around in self._blocks:
-            _write(self._evaluator.sums(around, seen, state, self._evaluator.energy), around, out)
+            _write(around.sums(self._evaluator.energy, seen, state), around, out)
         return float(out.sum())
 
     def _work(self, u: Floats, forces: Floats) -> float:
@@ -72,16 +75,22 @@ class SlotFollowers(Followers):
 
     def _seen(self, m: Floats, state: State) -> Floats:
         """What the rule works on: displacements, or the moves of its inner rule."""
-        return self._inner.moves(m, state) if self._inner else m
+        if self._inner is None:
+            return m
+        z = self._inner.moves(m, state)
+        if self._scene.frame:
+            flat = z.reshape(len(z), -1)
+            self._scene.frame.follow(flat, flat)
+        return z
 
-    def _summed(self, m: Floats, state: State) -> Iterator[tuple[Around, Contributions, Here]]:
+    def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
         """Every block with the sums of its neighbours' contributions and what stands there."""
         seen = self._seen(m, state)
         for around in self._blocks:
-            total = self._evaluator.sums(around, seen, state)
-            yield around, total, self._evaluator.here(around, seen, state)
+            total = around.sums(self._evaluator.contribution, seen, state)
+            yield around, total, around.here(seen, state)
 
-    def _place(self, around: Around, move: Any, m: Floats, new: Floats) -> None:
+    def _place(self, around: Surroundings, move: Any, m: Floats, new: Floats) -> None:
         """Writes where the particles of a block go."""
         u, out = around.where.of(m), around.where.of(new)
         for here, step, plane in zip(u, move, out, strict=True):
@@ -89,7 +98,7 @@ class SlotFollowers(Followers):
             plane[...] = moved if around.movable is None else np.where(around.movable, moved, here)
 
 
-def _write(values: Any, around: Around, out: Floats) -> None:
+def _write(values: Any, around: Surroundings, out: Floats) -> None:
     """The values of the particles that have neighbours, a plane each."""
     for value, plane in zip(values, around.where.of(out), strict=True):
         plane[...] = value if around.movable is None else np.where(around.movable, value, 0.0)

@@ -76,7 +76,7 @@ def _each(value: Any) -> tuple[Any, ...]:
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
     the given cracks broken at step 0. Nothing has moved before."""
-    shape, precision = (scene.axes, *scene.raster.shape), scene.experiment.solver.precision
+    shape, precision = (scene.axes, *scene.raster.shape), scene.experiment.stepping.precision
     u, previous = np.zeros(shape, precision), np.zeros(shape, precision)
     if not scene.experiment.initial.at_rest:
         _displace(scene, u.reshape(scene.axes, -1))

@@ -154,15 +154,12 @@ def ask_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         u = vector(arrays, "u")
         return _at_slots("fictitious", (model.fictitious(u, slot.rest, p) for slot in slots))
 
-    def c_of(slot: Slot, arrays: Arrays) -> Any:
-        return scene.constants.of_bond(*scene.constants.limits[slot], *own_of(arrays))
-
     def seen(arrays: Arrays) -> Arrays:
         assert isinstance(model, Softens)
-        lost = vector(arrays, "lost")
+        lost, own, limits = vector(arrays, "lost"), own_of(arrays), scene.constants.limits
+        c = {slot: scene.constants.of_bond(*limits[slot], *own) for slot in slots}
         found = (
-            model.seen(vector(arrays, f"d{k}"), lost, s.rest, c_of(s, arrays), p)
-            for k, s in enumerate(slots)
+            model.seen(vector(arrays, f"d{k}"), lost, s.rest, c[s], p) for k, s in enumerate(slots)
         )
         return _at_slots("seen", found)
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.interfaces import (
     Component,
@@ -11,7 +15,9 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
     Lattice,
+    Moment,
     NeighbourMetric,
+    Variable,
 )
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
@@ -53,7 +59,7 @@ def _to_frame(policy: FramePolicy, scene: Scene, seed: int) -> list[Question]:
 
 def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Question]:
     moment = moment_of(scene, seed)
-    names = [variable.name for variable in diagnostic.variables()]
+    variables = diagnostic.variables()
     tables = {
         "displacement": moment.displacement(),
         "previous_displacement": moment.previous_displacement(),
@@ -62,9 +68,21 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
 
     def measure(arrays: Arrays) -> Arrays:
         measured = diagnostic.measure(SeenMoment(moment, tables=arrays))
-        return dict(zip(names, measured, strict=True))
+        return {
+            variable.name: _where_recordable(variable, np.asarray(value), moment)
+            for variable, value in zip(variables, measured, strict=True)
+        }
 
     return [Question("measure", tables, measure)]
+
+
+def _where_recordable(variable: Variable, values: NDArray[Any], moment: Moment) -> NDArray[Any]:
+    """0 in place of the NaN that may stand at frame points."""
+    sizes = dict(zip(variable.dims, values.shape, strict=False))
+    if values.dtype.kind != "f" or sizes.get("particle") != len(moment.body):
+        return values
+    allowed = np.isnan(values) & variable.is_recordable(values, moment.body)
+    return np.where(allowed, 0.0, values)
 
 
 def moment_of(scene: Scene, seed: int) -> StateMoment:

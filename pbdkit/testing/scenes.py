@@ -77,8 +77,8 @@ def alternatives(part: Any) -> list[Any]:
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:
-    wants_material = isinstance(component, Diagnostic) and (
-        component.uses_material or component.uses_forces
+    wants_material = isinstance(component, Diagnostic) and bool(
+        component.needs & {"material", "forces"}
     )
     if wants_material or (isinstance(component, FramePolicy) and component.edges_are_free):
         return [ELASTIC]

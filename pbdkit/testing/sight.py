@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import (
-    Bonds,
     Cell,
     FollowerRule,
     FrameSites,
@@ -19,8 +18,8 @@ from pbdkit.interfaces import (
     Moment,
     Pair,
     Stiffness,
-    Vector,
 )
+from pbdkit.interfaces.diagnostic import BondHistory, CellValues, ForceValues
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
@@ -62,7 +61,7 @@ class SeenFrame(FrameSites):
 
 class SeenMoment(Moment):
     """A moment with other tables in the place of its own, or its particles in another order: row n
-    shows what stands in row order[n]."""
+    shows what stands in row order[n]. What is in no order of particles is that of the moment."""
 
     def __init__(
         self,
@@ -73,17 +72,36 @@ class SeenMoment(Moment):
     ) -> None:
         self.step = moment.step
         self._moment = moment
-        count = len(moment.reference())
-        self._order = np.arange(count) if order is None else order
+        self._order = np.arange(len(moment.body)) if order is None else order
+        self._place = np.argsort(self._order)
         self._tables = tables or {
             "displacement": moment.displacement()[self._order],
             "previous_displacement": moment.previous_displacement()[self._order],
             "reference": moment.reference()[self._order],
         }
 
+    @property
+    def body(self) -> NDArray[np.bool_]:
+        """In this order."""
+        return self._moment.body[self._order]
+
+    @property
+    def cells(self) -> CellValues:
+        """In this order."""
+        return SeenCells(self._moment.cells, self._order)
+
+    @property
+    def forces(self) -> ForceValues:
+        """In this order."""
+        return SeenForces(self._moment.forces, self._order)
+
     def rows(self, numbers: tuple[int, ...]) -> Indices:
         """Where the particles with these numbers now stand."""
-        return np.argsort(self._order)[self._moment.rows(numbers)]
+        return self._place[self._moment.rows(numbers)]
+
+    def nearest(self, points: tuple[Pair, ...]) -> Indices:
+        """Where the nearest particles now stand."""
+        return self._place[self._moment.nearest(points)]
 
     def displacement(self, rows: Indices | None = None) -> NDArray[Any]:
         """From the tables."""
@@ -98,67 +116,71 @@ class SeenMoment(Moment):
         return self._of("reference", rows)
 
     def sum_over_neighbours(
-        self, function: Callable[[Vector, Vector], Any], *, intact_only: bool = False
+        self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> NDArray[Any]:
-        """That of the moment itself, in this order."""
+        """In this order."""
         return self._moment.sum_over_neighbours(function, intact_only=intact_only)[self._order]
-
-    def over_cells(
-        self,
-        function: Callable[[tuple[Vector, ...], tuple[Vector, ...]], Any],
-        *,
-        intact_only: bool = False,
-    ) -> NDArray[Any]:
-        """That of the moment itself: cells are in no order of particles."""
-        return self._moment.over_cells(function, intact_only=intact_only)
-
-    def broken_bonds(self) -> int:
-        """That of the moment itself."""
-        return self._moment.broken_bonds()
-
-    def displacement_gradient(self) -> NDArray[Any]:
-        """That of the moment itself, in this order."""
-        return self._moment.displacement_gradient()[self._order]
-
-    def stiffness(self) -> Stiffness:
-        """That of the moment itself."""
-        return self._moment.stiffness()
-
-    def forces(self) -> NDArray[Any]:
-        """Those of the moment itself, in this order."""
-        return self._moment.forces()[self._order]
-
-    def energy(self) -> float:
-        """That of the moment itself."""
-        return self._moment.energy()
 
     def leader_groups(self) -> tuple[LeaderRows, ...]:
         """Where their particles now stand."""
-        place = np.argsort(self._order)
-        return tuple(LeaderRows(place[g.rows], g.leads) for g in self._moment.leader_groups())
+        groups = self._moment.leader_groups()
+        return tuple(LeaderRows(self._place[g.rows], g.leads) for g in groups)
 
-    def nearest(self, points: tuple[Pair, ...]) -> Indices:
-        """Where the nearest particles now stand."""
-        return np.argsort(self._order)[self._moment.nearest(points)]
+    def broken_bonds(self) -> int:
+        """The same."""
+        return self._moment.broken_bonds()
 
-    def bonds(self) -> Bonds:
-        """That of the moment itself: bonds name their ends by number, and are in no order of
-        particles."""
+    def bonds(self) -> BondHistory:
+        """The same: bonds name their ends by number."""
         return self._moment.bonds()
 
-    def broken_step(self) -> NDArray[np.int32]:
-        """That of the moment itself."""
-        return self._moment.broken_step()
-
-    def broken_strain(self) -> NDArray[np.float64]:
-        """That of the moment itself."""
-        return self._moment.broken_strain()
-
     def remembered(self, name: str) -> NDArray[Any]:
-        """That of the moment itself, in this order where it is of particles."""
+        """In this order where it is of particles."""
         values = self._moment.remembered(name)
         return values[self._order] if len(values) == len(self._order) else values
 
     def _of(self, name: str, rows: Indices | None) -> NDArray[Any]:
         table = self._tables[name]
         return table if rows is None else table[rows]
+
+
+@dataclass(frozen=True)
+class SeenCells(CellValues):
+    """The cells of a moment whose particles are shown in another order."""
+
+    inner: CellValues
+    order: Indices
+
+    def over(
+        self,
+        function: Callable[[tuple[Any, ...], tuple[Any, ...]], Any],
+        *,
+        intact_only: bool = False,
+    ) -> NDArray[Any]:
+        """The same: cells are in no order of particles."""
+        return self.inner.over(function, intact_only=intact_only)
+
+    def gradient(self) -> NDArray[Any]:
+        """In this order."""
+        return self.inner.gradient()[self.order]
+
+
+@dataclass(frozen=True)
+class SeenForces(ForceValues):
+    """The forces of a moment whose particles are shown in another order."""
+
+    inner: ForceValues
+    order: Indices
+
+    @property
+    def stiffness(self) -> Stiffness:
+        """The same."""
+        return self.inner.stiffness
+
+    def on_particles(self) -> NDArray[Any]:
+        """In this order."""
+        return self.inner.on_particles()[self.order]
+
+    def energy(self) -> float:
+        """The same."""
+        return self.inner.energy()

@@ -69,48 +69,48 @@ class Pantograph(pbdkit.FollowerRule):
         examples=[0.01],
     )
 
-    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> tuple[float, ...]:
-        """Stiffness and rest length of the spring, then 1 for the one of the eight points along the
-        fibres that it is."""
+    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
+        """Stiffness and rest length of the spring, and 1 for the one of the eight points along the
+        fibres that it is: `next0` to `next3`, and `after0` to `after3` behind them."""
         roles = {s.rest: role for s, role in _roles(setting.slots[slot.source])}
         what, direction = roles.get(slot.rest, ("", 0))
         stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(what, 0.0)
-        places = [(ALONG, n) for n in range(4)] + [(NEXT, n) for n in range(4)]
-        rest = float(pbdkit.length(slot.rest))
-        return (stiffness, rest, *(float(place == (what, direction)) for place in places))
+        return {
+            "stiffness": stiffness,
+            "rest": pbdkit.length(slot.rest),
+            **{f"next{n}": float((ALONG, n) == (what, direction)) for n in range(4)},
+            **{f"after{n}": float((NEXT, n) == (what, direction)) for n in range(4)},
+        }
 
     @staticmethod
     def gather(d: pbdkit.Vector, r: pbdkit.Vector, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) of the spring, e = |r + d| - |r|; then d and presence at each of the eight
         points along the fibres."""
-        stiffness, rest = w[0], w[1]
-        v = pbdkit.Vector(r.x + d.x, r.y + d.y)
+        v = r + d
         distance = pbdkit.length(v)
         # |v|² - |r|² = d·(r + v): small elongations keep all their digits.
-        elongation = (d.x * (r.x + v.x) + d.y * (r.y + v.y)) / (distance + rest)
-        pull = stiffness * elongation / pbdkit.where(distance > 0.0, distance, 1.0)
-        x, y = d.x, d.y
+        elongation = pbdkit.dot(d, r + v) / (distance + w.rest)
+        pull = w.stiffness * elongation / pbdkit.where(distance > 0.0, distance, 1.0)
         return (
-            pull * v.x, pull * v.y, stiffness,
-            w[2] * x, w[2] * y, w[2], w[3] * x, w[3] * y, w[3],
-            w[4] * x, w[4] * y, w[4], w[5] * x, w[5] * y, w[5],
-            w[6] * x, w[6] * y, w[6], w[7] * x, w[7] * y, w[7],
-            w[8] * x, w[8] * y, w[8], w[9] * x, w[9] * y, w[9],
+            pull * v, w.stiffness,
+            w.next0 * d, w.next0, w.next1 * d, w.next1,
+            w.next2 * d, w.next2, w.next3 * d, w.next3,
+            w.after0 * d, w.after0, w.after1 * d, w.after1,
+            w.after2 * d, w.after2, w.after3 * d, w.after3,
         )  # fmt: skip
 
     @staticmethod
-    def apply(total: Any, here: pbdkit.Here, p: Any) -> tuple[Any, Any]:
+    def apply(total: Any, here: pbdkit.Here, p: Any) -> Any:
         """Σ forces / Σ stiffness; no move where there is neither."""
-        ax, ay, a = _bent(total[3:9], total[15:21])
-        bx, by, b = _bent(total[9:15], total[21:27])
-        x = total[0] + p.bending * (ax + bx)
-        y = total[1] + p.bending * (ay + by)
-        stiffness = total[2] + p.bending * (a + b)
-        share = pbdkit.where(stiffness > 0.0, stiffness, 1.0)
-        return x / share, y / share
+        pull, stiffness = total[0], total[1]
+        one, one_stiffness = _bent(total[2:6], total[10:14])
+        other, other_stiffness = _bent(total[6:10], total[14:18])
+        stiffness = stiffness + p.bending * (one_stiffness + other_stiffness)
+        force = pull + p.bending * (one + other)
+        return force / pbdkit.where(stiffness > 0.0, stiffness, 1.0)
 
 
-def _bent(next_points: Any, after: Any) -> tuple[Any, Any, Any]:
+def _bent(next_points: Any, after: Any) -> tuple[Any, Any]:
     """Force and stiffness of one fibre against bending, from (d, presence) of the points at its
     both ends, next and next but one.
 
@@ -118,12 +118,11 @@ def _bent(next_points: Any, after: Any) -> tuple[Any, Any, Any]:
     offsets along a fibre cancel. The stiffness is half the sum of the moduli of a row of the
     quadratic form: with no less the energy might rise.
     """
-    ux, uy, u, vx, vy, v = next_points
-    uux, uuy, uu, vvx, vvy, vv = after
-    middle, one, other = u * v, u * uu, v * vv
-    x = 2.0 * middle * (ux + vx) + (one * (2.0 * ux - uux) + other * (2.0 * vx - vvx))
-    y = 2.0 * middle * (uy + vy) + (one * (2.0 * uy - uuy) + other * (2.0 * vy - vvy))
-    return x, y, 4.0 * middle + 2.0 * (one + other)
+    u, has_u, v, has_v = next_points
+    uu, has_uu, vv, has_vv = after
+    middle, one, other = has_u * has_v, has_u * has_uu, has_v * has_vv
+    force = 2.0 * middle * (u + v) + (one * (2.0 * u - uu) + other * (2.0 * v - vv))
+    return force, 4.0 * middle + 2.0 * (one + other)
 
 
 def _roles(steps: Iterable[Step]) -> list[tuple[Step, Role]]:
@@ -134,19 +133,16 @@ def _roles(steps: Iterable[Step]) -> list[tuple[Step, Role]]:
     known = list(steps)
     one, other = _families([step.rest for step in known])
     rests = {
-        (ALONG, n): pbdkit.Vector(sign * e.x, sign * e.y)
-        for n, (e, sign) in enumerate((e, sign) for e in (one, other) for sign in (1, -1))
+        (what, n): reach * e
+        for what, reach in ((ALONG, 1), (NEXT, 2))
+        for n, e in enumerate((one, -one, other, -other))
     }
-    rests |= {(NEXT, n): pbdkit.Vector(2 * e.x, 2 * e.y) for (_, n), e in list(rests.items())}
-    diagonals = (1, 1), (-1, -1), (1, -1), (-1, 1)
-    rests |= {
-        (ACROSS, n): pbdkit.Vector(s * one.x + t * other.x, s * one.y + t * other.y)
-        for n, (s, t) in enumerate(diagonals)
-    }
+    diagonals = one + other, -one - other, one - other, other - one
+    rests |= {(ACROSS, n): e for n, e in enumerate(diagonals)}
     return [(_found(known, rest), role) for role, rest in rests.items()]
 
 
-def _families(rests: list[pbdkit.Vector]) -> tuple[pbdkit.Vector, pbdkit.Vector]:
+def _families(rests: list[pbdkit.Components]) -> tuple[pbdkit.Components, pbdkit.Components]:
     """The two shortest that are not in line, of equal ones those of the smallest angle to x."""
     shortest = min(math.hypot(*rest) for rest in rests)
     flat = 1e-6 * shortest
@@ -157,9 +153,9 @@ def _families(rests: list[pbdkit.Vector]) -> tuple[pbdkit.Vector, pbdkit.Vector]
     return one, other
 
 
-def _found(steps: list[Step], rest: pbdkit.Vector) -> Step:
+def _found(steps: list[Step], rest: pbdkit.Components) -> Step:
     for step in steps:
-        if math.hypot(step.rest.x - rest.x, step.rest.y - rest.y) < 1e-6 * math.hypot(*rest):
+        if pbdkit.length(step.rest - rest) < 1e-6 * pbdkit.length(rest):
             return step
     raise pbdkit.ExperimentError(
         f"fibres need a neighbour at ({rest.x:.4g}, {rest.y:.4g}): take a lattice of one site, "

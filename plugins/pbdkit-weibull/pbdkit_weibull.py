@@ -13,7 +13,7 @@ import pbdkit
 pbdkit_api = 1
 
 
-class Weibull(pbdkit.FractureModel):
+class Weibull(pbdkit.Draws, pbdkit.BreaksAtStrain, pbdkit.FractureModel):
     """A bond breaks when its strain |r + d| / |r| - 1 exceeds a strength of its own.
 
     Strengths are drawn once, by the experiment's seed, so that a bond bears the strain ε with
@@ -40,35 +40,34 @@ class Weibull(pbdkit.FractureModel):
         """As `frame_bonds` says."""
         return self.frame_bonds
 
-    def constants(self, slot: pbdkit.Slot) -> tuple[float, ...]:
-        """The rest length; the bond's strength comes after it."""
-        return (float(pbdkit.length(slot.rest)),)
+    def constants(self, slot: pbdkit.Slot) -> dict[str, float]:
+        """The rest length."""
+        return {"rest": pbdkit.length(slot.rest)}
 
-    def bond_state(self) -> tuple[pbdkit.Remembered, ...]:
+    def remembered(self) -> tuple[pbdkit.Remembered, ...]:
         """The strength of each bond, which stays."""
         return (
             pbdkit.Remembered("strength", "strain at which the bond breaks", "1", changes=False),
         )
 
-    def draw(self, bonds: pbdkit.Bonds, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
+    def draw(self, owners: pbdkit.Bonds, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
         """scale · E^(1/modulus), E exponentially distributed with mean 1."""
-        return {"strength": self.scale * generator.weibull(self.modulus, len(bonds))}
+        return {"strength": self.scale * generator.weibull(self.modulus, len(owners))}
 
     @staticmethod
     def breaks(d: pbdkit.Vector, r: pbdkit.Vector, c: Any, p: Any) -> Any:
         """|r + d| > |r| (1 + strength)."""
-        rest, strength = c
-        return pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y)) > rest + rest * strength
+        return pbdkit.length(r + d) > c.rest + c.rest * c.strength
 
     @staticmethod
     def breaking_strain(r: pbdkit.Vector, c: Any, p: Any) -> Any:
         """The strength, for `pbdkit explain`."""
-        return c[1]
+        return c.strength
 
     @staticmethod
     def fictitious(u: pbdkit.Vector, r: pbdkit.Vector, p: Any) -> pbdkit.Vector:
         """The undeformed cell."""
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
 
 @pbdkit.hookimpl

@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from sheets import Running, moving, scene_of
 
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.running import run_into
+from pbdkit.runs.course import Run, record
 from pbdkit.stepping.stepper import Stepper
 
 NEIGHBOURS = {
@@ -94,7 +94,7 @@ def _run(size: int, parts: dict[str, Any], turns: int = 7) -> tuple[float, int]:
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(turns):
             sink = NetcdfSink(Path(folder) / "out.nc", replace=True)
-            report = run_into(sink, scene, progress=False)
+            report = record(Run(scene), sink)
             found = min(found, report.wall_s)
             assert report.outcome.status == "complete"
     return found, scene.raster.count

@@ -12,8 +12,8 @@ from pairing import Ratio, ratio
 from sheets import Running, moving, scene_of
 
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.results.overlapping import OverlappingSink
-from pbdkit.running import run_into
+from pbdkit.results.second_thread import OverlappingSink
+from pbdkit.runs.course import Run, record
 
 
 def recording(size: int, steps: int, every: int) -> tuple[Ratio, str]:
@@ -27,7 +27,7 @@ def recording(size: int, steps: int, every: int) -> tuple[Ratio, str]:
 
         def with_pbdkit():
             path.unlink(missing_ok=True)
-            run_into(OverlappingSink(NetcdfSink(path, replace=True)), scene, progress=False)
+            record(Run(scene), OverlappingSink(NetcdfSink(path, replace=True)))
 
         with_pbdkit()
         snapshot = np.zeros(path.stat().st_size // (steps // every + 1), np.uint8)

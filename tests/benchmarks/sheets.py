@@ -20,12 +20,11 @@ class OwnBarycentre(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, r.x, r.y, 1.0
+        return d, r, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        dx, dy, rx, ry, n = total
-        return (dx + rx) / n, (dy + ry) / n
+        return (total[0] + total[1]) / total[2]
 
 
 class OwnElastic(pbdkit.FollowerRule):
@@ -37,22 +36,23 @@ class OwnElastic(pbdkit.FollowerRule):
     type: Literal["own-elastic"] = "own-elastic"
     poisson_ratio: float = 0.3
 
-    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> tuple[float, ...]:
+    def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
         nu = self.poisson_ratio
         x, y = np.sign(slot.rest.x), np.sign(slot.rest.y)
         if x and y:
             w = (1 + nu) / (4 * (5 - 3 * nu))
-            return (w, w * x * y, w * x * y, w)
+            return {"xx": w, "xy": w * x * y, "yy": w}
         along, across = ((3 - nu) / (2 * (5 - 3 * nu)), (1 - 3 * nu) / (2 * (5 - 3 * nu)))
-        return (along, 0.0, 0.0, across) if x else (across, 0.0, 0.0, along)
+        along, across = (along, across) if x else (across, along)
+        return {"xx": along, "xy": 0.0, "yy": across}
 
     @staticmethod
     def gather(d, r, w, p):
-        return w[0] * d.x + w[1] * d.y, w[2] * d.x + w[3] * d.y
+        return (pbdkit.Vector(w.xx * d.x + w.xy * d.y, w.xy * d.x + w.yy * d.y),)
 
     @staticmethod
     def apply(total, here, p):
-        return total
+        return total[0]
 
 
 HOLD = {"type": "hold"}

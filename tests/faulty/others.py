@@ -124,13 +124,10 @@ class Shrinks(Following):
         return replace(found, weight=0.9 * found.weight)
 
 
-class SaysItAnchors(Following):
+class SaysItAnchors(pbdkit.Anchors, Following):
     """Says that it ties the body to its place, and does not."""
 
     type: Literal["says-it-anchors"] = "says-it-anchors"
-
-    def anchors(self):
-        return True
 
 
 class WritesSites(Following):
@@ -150,15 +147,15 @@ class Strain(pbdkit.FractureModel):
     limit: float = Field(0.5, description="The strain at which bonds break.")
 
     def constants(self, slot):
-        return ((1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest),)
+        return {"square": (1.0 + self.limit) ** 2 * pbdkit.squared_length(slot.rest)}
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) > c[0]
+        return pbdkit.squared_length(r + d) > c.square
 
     @staticmethod
     def fictitious(u, r, p):
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
 
 class Lopsided(Strain):
@@ -177,7 +174,7 @@ class Directed(Strain):
     type: Literal["directed"] = "directed"
 
     def constants(self, slot):
-        return (1e3 + slot.rest.x,)
+        return {"square": 1e3 + slot.rest.x}
 
 
 class DeniesBreaking(Strain):
@@ -201,7 +198,7 @@ class Measures(Strain):
 
     @staticmethod
     def breaks(d, r, c, p):
-        return pbdkit.squared_length(pbdkit.Vector(r.x + d.x, r.y + d.y)) - c[0]
+        return pbdkit.squared_length(r + d) - c.square
 
 
 class Tupled(Strain):
@@ -233,6 +230,21 @@ class NoUnits(Extent):
 
     def variables(self):
         return (pbdkit.Variable("extent", ("particle",), "displacement", ""),)
+
+
+class TakesOurName(Extent):
+    """Calls its dimension as the dataset calls one of its own."""
+
+    type: Literal["takes-our-name"] = "takes-our-name"
+
+    def variables(self):
+        return (pbdkit.Variable("extent", ("site",), "displacement", "lattice unit"),)
+
+    def coordinates(self):
+        return {"site": np.arange(3)}
+
+    def measure(self, now):
+        return (np.zeros(3),)
 
 
 class OneShort(Extent):

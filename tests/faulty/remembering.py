@@ -18,16 +18,18 @@ WEAR = Remembered("wear", "how much the bond has softened", "1")
 TIMES = Remembered("times", "steps in which it has softened", "1", dtype="i4")
 
 
-class Wearing(pbdkit.FractureModel):
+class Wearing(
+    pbdkit.Draws, pbdkit.RenewsBonds, pbdkit.Softens, pbdkit.BreaksAtStrain, pbdkit.FractureModel
+):
     """A bond of a strength of its own softens as it is strained, and counts how often: what the
     others would be without their fault."""
 
     type: Literal["wearing"] = "wearing"
 
     def constants(self, slot):
-        return (float(np.hypot(*slot.rest)),)
+        return {"rest": pbdkit.length(slot.rest)}
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, WEAR, TIMES
 
     def draw(self, bonds, generator):
@@ -35,26 +37,25 @@ class Wearing(pbdkit.FractureModel):
 
     @staticmethod
     def update(d, r, c, p):
-        strain = pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y)) / c[0] - 1.0
-        more = strain > c[2]
-        return pbdkit.where(more, strain, c[2]), pbdkit.where(more, c[3] + 1, c[3])
+        strain = pbdkit.length(r + d) / c.rest - 1.0
+        more = strain > c.wear
+        return pbdkit.where(more, strain, c.wear), pbdkit.where(more, c.times + 1, c.times)
 
     @staticmethod
     def breaks(d, r, c, p):
-        return c[2] > c[1]
+        return c.wear > c.strength
 
     @staticmethod
     def fictitious(u, r, p):
-        return pbdkit.Vector(0.0, 0.0)
+        return 0.0 * r
 
     @staticmethod
     def seen(d, lost, r, c, p):
-        kept = 1.0 - c[2]
-        return pbdkit.Vector(kept * d.x + c[2] * lost.x, kept * d.y + c[2] * lost.y)
+        return (1.0 - c.wear) * d + c.wear * lost
 
     @staticmethod
     def breaking_strain(r, c, p):
-        return pbdkit.where(c[2] > c[1], c[2], c[1])
+        return pbdkit.where(c.wear > c.strength, c.wear, c.strength)
 
 
 class TakesAName(Wearing):
@@ -62,7 +63,7 @@ class TakesAName(Wearing):
 
     type: Literal["takes-a-name"] = "takes-a-name"
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, Remembered("shell", "wear", "1"), TIMES
 
 
@@ -71,7 +72,7 @@ class Shouts(Wearing):
 
     type: Literal["shouts"] = "shouts"
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, Remembered("WEAR", "wear", "1"), TIMES
 
 
@@ -80,7 +81,7 @@ class OfNoUnit(Wearing):
 
     type: Literal["of-no-unit"] = "of-no-unit"
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, Remembered("wear", "wear", ""), TIMES
 
 
@@ -89,7 +90,7 @@ class StartsHalfway(Wearing):
 
     type: Literal["starts-halfway"] = "starts-halfway"
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, WEAR, Remembered("times", "steps", "1", 0.5, dtype="i4")
 
 
@@ -125,7 +126,7 @@ class Overflows(Wearing):
 
     type: Literal["overflows"] = "overflows"
 
-    def bond_state(self):
+    def remembered(self):
         return STRENGTH, WEAR, Remembered("times", "steps", "1", dtype="i1")
 
     def draw(self, bonds, generator):
@@ -168,9 +169,9 @@ class WritesWear(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        wear = c[2]
+        wear = c.wear
         wear += 0.125
-        return wear, c[3]
+        return wear, c.times
 
 
 class OneTooMany(Wearing):
@@ -180,7 +181,7 @@ class OneTooMany(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        return c[1], c[2], c[3]
+        return c.strength, c.wear, c.times
 
 
 class CountsHalves(Wearing):
@@ -190,7 +191,7 @@ class CountsHalves(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        return c[2], c[3] + 0.5
+        return c.wear, c.times + 0.5
 
 
 class WearsTogether(Wearing):
@@ -200,8 +201,8 @@ class WearsTogether(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        most = np.max(pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y)) / c[0] - 1.0)
-        return pbdkit.where(most > c[2], most + 0.0 * c[2], c[2]), c[3]
+        most = np.max(pbdkit.length(r + d) / c.rest - 1.0)
+        return pbdkit.where(most > c.wear, most + 0.0 * c.wear, c.wear), c.times
 
 
 class WearsInOrder(Wearing):
@@ -211,7 +212,8 @@ class WearsInOrder(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        return np.reshape(np.maximum.accumulate(np.ravel(c[2] + d.x * d.x)), np.shape(c[2])), c[3]
+        wear = np.maximum.accumulate(np.ravel(c.wear + d.x * d.x))
+        return np.reshape(wear, np.shape(c.wear)), c.times
 
 
 class WearsInDoubles(Wearing):
@@ -232,11 +234,7 @@ class WearsOneWay(Wearing):
 
     @staticmethod
     def update(d, r, c, p):
-        return pbdkit.where(d.x > c[2], d.x, c[2]), c[3]
-
-    @staticmethod
-    def breaking_strain(r, c, p):
-        return None
+        return pbdkit.where(d.x > c.wear, d.x, c.wear), c.times
 
 
 class Misstates(Wearing):
@@ -246,7 +244,7 @@ class Misstates(Wearing):
 
     @staticmethod
     def breaking_strain(r, c, p):
-        return 2.0 * c[1] + c[2]
+        return 2.0 * c.strength + c.wear
 
 
 class Sags(Wearing):
@@ -256,25 +254,24 @@ class Sags(Wearing):
 
     @staticmethod
     def seen(d, lost, r, c, p):
-        return pbdkit.Vector(d.x + 1e-9, d.y)
+        return d + pbdkit.Vector(1e-9, 0.0)
 
 
-class Tired(Sound):
+class Tired(pbdkit.RenewsParticles, Sound):
     """Follows the less, the farther it has come: what the others would be without their fault."""
 
     type: Literal["tired"] = "tired"
 
-    def particle_state(self):
+    def remembered(self):
         return (Remembered("way", "way made in x", "lattice unit"),)
 
     @staticmethod
     def apply(total, here, p):
-        share = 1.0 / (1.0 + here.own[0])
-        return share * total[0] / total[2], share * total[1] / total[2]
+        return total[0] / (total[1] * (1.0 + here.own.way))
 
     @staticmethod
     def remember(total, here, p):
-        return (here.own[0] + np.abs(total[0] / total[2]),)
+        return (here.own.way + np.abs(total[0].x / total[1]),)
 
 
 class ForgetsTheWay(Tired):
@@ -294,7 +291,7 @@ class WayAndMove(Tired):
 
     @staticmethod
     def remember(total, here, p):
-        return here.own[0] + np.abs(total[0]), total[0]
+        return here.own.way + np.abs(total[0].x), total[0].x
 
 
 class WritesTheWay(Tired):
@@ -304,7 +301,7 @@ class WritesTheWay(Tired):
 
     @staticmethod
     def remember(total, here, p):
-        way = here.own[0]
+        way = here.own.way
         way += 1.0
         return (way,)
 
@@ -316,10 +313,11 @@ class SharesTheWay(Tired):
 
     @staticmethod
     def remember(total, here, p):
-        return (np.mean(here.own[0] + np.abs(total[0])) + 0.0 * here.own[0],)
+        way = here.own.way
+        return (np.mean(way + np.abs(total[0].x)) + 0.0 * way,)
 
 
-class DrawsAgain(Tired):
+class DrawsAgain(pbdkit.Draws, Tired):
     """Draws with the dice of Python."""
 
     type: Literal["draws-again"] = "draws-again"

@@ -18,11 +18,11 @@ class Sound(pbdkit.FollowerRule):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x, d.y, 1.0
+        return d, 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2], total[1] / total[2]
+        return total[0] / total[1]
 
 
 class WritesInput(Sound):
@@ -34,7 +34,7 @@ class WritesInput(Sound):
     def gather(d, r, w, p):
         x, y = d
         x *= 2.0
-        return x, y, 1.0
+        return pbdkit.Vector(x, y), 1.0
 
 
 class CountsPlaces(Sound):
@@ -44,8 +44,8 @@ class CountsPlaces(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        later = np.arange(np.size(total[0]), dtype=total[0].dtype).reshape(np.shape(total[0]))
-        return total[0] * later, total[1] * later
+        x = total[0].x
+        return np.arange(np.size(x), dtype=x.dtype).reshape(np.shape(x)) * total[0]
 
 
 class SumsInOrder(Sound):
@@ -55,7 +55,7 @@ class SumsInOrder(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return 1e8 * r.x + d.x, d.y, 1.0
+        return 1e8 * r + d, 1.0
 
 
 class Doubles(Sound):
@@ -65,8 +65,7 @@ class Doubles(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        half = np.float64(0.5)
-        return half * total[0], half * total[1]
+        return np.float64(0.5) * total[0]
 
 
 class LooksAround(Sound):
@@ -76,7 +75,8 @@ class LooksAround(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return np.mean(total[0]) + 0.0 * total[0], total[1] / total[2]
+        x, y = total[0] / total[1]
+        return pbdkit.Vector(np.mean(x) + 0.0 * x, y)
 
 
 class NeedsArrays(Sound):
@@ -86,7 +86,8 @@ class NeedsArrays(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0].clip(-1.0, 1.0), total[1]
+        x, y = total[0]
+        return pbdkit.Vector(x.clip(-1.0, 1.0), y)
 
 
 SEEN: list[float] = []
@@ -99,8 +100,9 @@ class Remembers(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        SEEN.append(float(np.sum(total[0])))
-        return total[0] + SEEN[-2 if len(SEEN) > 1 else -1], total[1]
+        x, y = total[0]
+        SEEN.append(float(np.sum(x)))
+        return pbdkit.Vector(x + SEEN[-2 if len(SEEN) > 1 else -1], y)
 
 
 class Counts(Sound):
@@ -112,7 +114,7 @@ class Counts(Sound):
     @staticmethod
     def apply(total, here, p):
         Counts.calls["apply"] += 1
-        return total[0] / Counts.calls["apply"], total[1]
+        return total[0] / Counts.calls["apply"]
 
 
 class Throws(Sound):
@@ -122,7 +124,7 @@ class Throws(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] * random.random(), total[1]
+        return random.random() * total[0]
 
 
 class Drifts(Sound):
@@ -132,7 +134,7 @@ class Drifts(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / total[2] + 1e-9, total[1] / total[2]
+        return total[0] / total[1] + pbdkit.Vector(1e-9, 0.0)
 
 
 class DriftsByRounding(Sound):
@@ -142,11 +144,11 @@ class DriftsByRounding(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x + 0.1, d.y, 1.0
+        return d + pbdkit.Vector(0.1, 0.0), 1.0
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] - 0.1 * total[2], total[1]
+        return total[0] - pbdkit.Vector(0.1 * total[1], 0.0)
 
 
 class Divides(Sound):
@@ -156,8 +158,7 @@ class Divides(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        distance = pbdkit.length(pbdkit.Vector(r.x + d.x, r.y + d.y))
-        return d.x / distance, d.y / distance, 1.0
+        return d / pbdkit.length(r + d), 1.0
 
 
 class Square(Sound):
@@ -167,7 +168,8 @@ class Square(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return np.stack([total[0], total[0]]), total[1]
+        x, y = total[0]
+        return pbdkit.Vector(np.stack([x, x]), y)
 
 
 class Varies(Sound):
@@ -177,7 +179,7 @@ class Varies(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return (d.x, d.y, 1.0) if r.x > 0 else (d.x, d.y, 1.0, 1.0)
+        return (d, 1.0) if r.x > 0 else (d, 1.0, 1.0)
 
 
 class ClaimsLinear(Sound):
@@ -188,7 +190,7 @@ class ClaimsLinear(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d.x * d.x, d.y, 1.0
+        return pbdkit.Vector(d.x * d.x, d.y), 1.0
 
 
 class HoldsOn(Sound):
@@ -198,7 +200,7 @@ class HoldsOn(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return -0.5 * here.u.x, total[1] / total[2]
+        return -0.5 * here.u
 
 
 class Unlike(Sound):
@@ -209,7 +211,7 @@ class Unlike(Sound):
     @staticmethod
     def apply(total, here, p):
         side = 3037000500
-        return side * side / 2.0**63 * total[0] / total[2], total[1] / total[2]
+        return side * side / 2.0**63 * (total[0] / total[1])
 
 
 class Restarts(Sound):
@@ -223,7 +225,7 @@ class Restarts(Sound):
 
     @staticmethod
     def apply(total, here, p):
-        return p.share * total[0], total[1]
+        return p.share * total[0]
 
 
 class Raises(Sound):
@@ -233,7 +235,7 @@ class Raises(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return p.strength * d.x, d.y, 1.0
+        return p.strength * d, 1.0
 
 
 class Undescribed(Sound):

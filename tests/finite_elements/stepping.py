@@ -11,7 +11,7 @@ import pbdkit
 from finite_elements.lattices import experiment, on_grid
 from finite_elements.problems import Problem
 from finite_elements.timing import Seconds, best
-from pbdkit.equilibrium.loading import equilibrium_state
+from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.state import initial_state

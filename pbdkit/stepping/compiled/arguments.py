@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import plane_block
-from pbdkit.scene.raster import slot_step
+from pbdkit.scene.places import slot_step
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.state import State
@@ -22,7 +22,7 @@ Arrays = dict[str, NDArray[Any]]
 def constant_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
     """What does not change from step to step."""
     frame, cell = scene.frame, scene.raster.lattice.cell()
-    real = np.dtype(scene.experiment.solver.precision)
+    real = np.dtype(scene.experiment.stepping.precision)
     none = np.empty(0, np.intp)
     entries, mapped = none, np.empty(0)
     if frame:
@@ -45,7 +45,7 @@ def constant_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
 
 def rule_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
     """The parameters of rules and solver."""
-    solver = scene.experiment.solver
+    solver = scene.experiment.stepping
     real = np.dtype(solver.precision)
     # One more, so that no array is empty.
     rules = {level.number: [*level.scene.constants.rule, 0.0] for level in levels}

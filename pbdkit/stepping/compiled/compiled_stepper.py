@@ -55,8 +55,10 @@ class CompiledStepper(Engine):
         self._plan = plan = replace(plan, rows=rows)
         self._arrays = constant_arrays(scene, levels) | {"runs": runs, "starts": starts}
         for level in levels[:-1]:
-            moves = np.zeros((scene.axes, *scene.raster.shape), scene.experiment.solver.precision)
-            self._arrays |= {f"z{level.number}_{c}": z for c, z in zip(plan.axes, moves)}
+            moves = np.zeros((scene.axes, *scene.raster.shape), scene.experiment.stepping.precision)
+            self._arrays |= {
+                f"z{level.number}_{c}": z for c, z in zip(plan.axes, moves, strict=True)
+            }
         source, self._names = write_kernel(plan)
         self._run = load_blamed(levels, source, self._sample())
 
@@ -102,8 +104,11 @@ class CompiledStepper(Engine):
             **{f"v_{c}": plane for c, plane in zip(self._plan.axes, state.previous, strict=True)},
             **{f"bond{n}": value for n, value in enumerate(state.bond_values)},
             **{f"own{n}": value for n, value in enumerate(state.particle_values)},
-            "led": places, "led_values": values, "led_kept": np.empty_like(values),
-            "box": self._reach.box, "growth": self._reach.growth,
+            "led": places,
+            "led_values": values,
+            "led_kept": np.empty_like(values),
+            "box": self._reach.box,
+            "growth": self._reach.growth,
         }
         if state.broken_step is not None and state.broken_length is not None:
             arrays |= {"broken": state.broken_step, "lengths": state.broken_length}
@@ -116,7 +121,7 @@ class CompiledStepper(Engine):
     def _sample(self) -> tuple[Any, ...]:
         """Arguments for no step, so that what does not compile is known before the first."""
         scene, shape = self._scene, (1,) * (self._scene.axes + 1)
-        u = np.zeros((scene.axes, *shape), scene.experiment.solver.precision)
+        u = np.zeros((scene.axes, *shape), scene.experiment.stepping.precision)
         bonds = sample_values(scene, bond_numbers(scene.experiment), shape)
         own = sample_values(scene, particle_numbers(scene.experiment), shape)
         broken = np.zeros(shape, np.int32) if scene.has_fracture else None

@@ -94,14 +94,18 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
         out.add(2, "judged = ready")
         _write_pass(out, plan, 2, passes[1], "low", "high")
     else:
-        for sweep in passes:
+        for n, sweep in enumerate(passes):
             _write_pass(out, plan, 1, sweep, "i0", "i1")
+            if n + 1 < len(passes) and plan.scene.frame:
+                moves = [f"z{n}_{c}" for c in plan.axes]
+                out.add(1, *(f"f{z} = {z}.reshape(-1)" for z in moves))
+                _write_frame(out, plan, f"fz{n}", f"fz{n}")
     out.add(1, "for e in range(led.size):")
     out.add(2, *(f"fv_{c}[led[e]] = led_values[{a}, e]" for a, c in enumerate(plan.axes)))
     out.add(1, "for e in range(led.size):")
     out.add(2, *(f"fu_{c}[led[e]] = led_kept[{a}, e]" for a, c in enumerate(plan.axes)))
     if plan.scene.frame:
-        _write_frame(out, plan)
+        _write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = plan.planes("u"), plan.planes("v")
     out.add(1, f"{u}, {v} = {v}, {u}")
 
@@ -116,9 +120,9 @@ def _write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, 
     out.add(depth + 1, one.call(*span))
 
 
-def _write_frame(out: Function, plan: Plan) -> None:
+def _write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
+    """Frame points from flat planes of the body."""
     assert plan.scene.frame
-    source = "fu" if plan.scene.frame.map.lag else "fv"
     out.add(1, "for f in range(points.size):")
     out.add(2, *(f"t_{c} = {plan.number(0.0)}" for c in plan.axes))
     out.add(2, "for e in range(entries[f], entries[f + 1]):")
@@ -130,4 +134,4 @@ def _write_frame(out: Function, plan: Plan) -> None:
             out.add(3, f"t_{c} = t_{c} + ({' + '.join(terms)})")
         else:
             out.add(3, f"t_{c} = t_{c} + mapped[e] * {source}_{c}[bodies[e]]")
-    out.add(2, *(f"fv_{c}[points[f]] = t_{c}" for c in plan.axes))
+    out.add(2, *(f"{target}_{c}[points[f]] = t_{c}" for c in plan.axes))

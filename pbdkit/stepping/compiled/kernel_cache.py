@@ -41,7 +41,7 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     The key covers the source of every function that rule and fracture model reach, so that an
     edited rule never runs an old kernel.
     """
-    parts = [source, source_key(*functions.values(), length), repr(numba.typeof(arguments))]
+    parts = [source, source_key(*functions.values(), length), repr(_types(arguments))]
     parts += [numba.__version__, np.__version__, sys.version, repr(_processor())]
     parts.append(str(_interpreted()))
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
@@ -75,6 +75,10 @@ def _asked_folder() -> Path:
 def _processor() -> Any:
     """What machine code is made for."""
     return cpu_target.target_context.codegen().magic_tuple()
+
+
+def _types(arguments: tuple[Any, ...]) -> Any:
+    return vars(numba)["typeof"](arguments)
 
 
 def _interpreted() -> bool:

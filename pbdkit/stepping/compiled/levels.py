@@ -43,7 +43,7 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Function]:
     found: dict[str, Function] = {}
     for level in levels:
         rule = level.scene.experiment.rule
-        named = {"gather": rule.gather, "apply": rule.apply}
+        named: dict[str, Function] = {"gather": rule.gather, "apply": rule.apply}
         if isinstance(rule, RenewsParticles):
             named["remember"] = rule.remember
         found |= {f"{name}{level.number}": function for name, function in named.items()}
@@ -78,7 +78,7 @@ def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | Fr
 
 def sample_values(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Any:
     """Arrays of one place as remembered numbers are kept in."""
-    precision = scene.experiment.solver.precision
+    precision = scene.experiment.stepping.precision
     return tuple(
         np.full(shape, number.initial, precision if number.dtype == "f8" else number.dtype)
         for number in numbers
@@ -89,7 +89,7 @@ def _parts(scene: Scene) -> tuple[int, ...]:
     """The components of each contribution. What functions return by mistake is refused as numpy
     refuses it: a kernel would take some of it for numbers."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
-    ones = np.ones(1, experiment.solver.precision)
+    ones = np.ones(1, experiment.stepping.precision)
     one: Components = vector([ones] * scene.axes)
     own = sample_values(scene, particle_numbers(experiment), (1,))
     slot = scene.neighbourhood.slots[0][0]
@@ -104,7 +104,7 @@ def _parts(scene: Scene) -> tuple[int, ...]:
             total = evaluator.contribution(one, one, evaluator.everywhere([slot])[0])
             here = Here(one, one, one, scene.constants.of_particle(*own))
             for component in evaluator.move(total, here):
-                target(ones, component, ones, experiment.solver)
+                target(ones, component, ones, experiment.stepping)
             if isinstance(experiment.rule, RenewsParticles):
                 fresh = changing(particle_numbers(experiment), own)
                 renew(fresh, evaluator.remember(total, here), None)

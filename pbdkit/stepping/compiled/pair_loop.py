@@ -41,7 +41,7 @@ class PairFollowers(Followers):
         }
         source, self._names = _write_kernel(self._plan, level)
         shape = (1,) * (scene.axes + 1)
-        u = np.zeros((scene.axes, *shape), scene.experiment.solver.precision)
+        u = np.zeros((scene.axes, *shape), scene.experiment.stepping.precision)
         own = sample_values(scene, particle_numbers(scene.experiment), shape)
         state = State(0, u, u, None, None, (), (), own)
         none = np.zeros(0, np.intp)

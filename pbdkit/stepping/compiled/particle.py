@@ -84,7 +84,7 @@ def target_lines(
         if not level.last:
             lines.append(f"o{c}[j] = {_chosen(step, movable, plan.number(0.0))}")
             continue
-        solver = plan.scene.experiment.solver
+        solver = plan.scene.experiment.stepping
         relaxed = f"solver[0] * {step}" if solver.relaxation != 1.0 else step
         lines.append(f"new_{c} = u.{c} + {relaxed}")
         if solver.memory != 0.0:

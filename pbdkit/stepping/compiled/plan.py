@@ -17,8 +17,8 @@ MOST_BITS = 32
 
 NAMES = (
     "kind", "share", "broken", "lengths", "lost", "counts", "rests", "limits", "signs", "away",
-    "bonds_away", "cells_away", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts", "first",
-    "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies", "mapped",
+    "bonds_away", "cells_away", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts",
+    "first", "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies", "mapped",
     "box", "growth", "step",
 )  # fmt: skip
 """What kernels of all scenes know."""
@@ -63,8 +63,10 @@ class Plan:
         seen, inner = self.levels[-1].seen, len(self.levels) - 1
         bonds = sum(number.home is Home.BOND for number in seen.bond)
         counted = {
-            "bond": bonds, "own": len(seen.own),
-            "rule": len(self.levels), "weights": len(self.levels),
+            "bond": bonds,
+            "own": len(seen.own),
+            "rule": len(self.levels),
+            "weights": len(self.levels),
         }
         planes = ["u", "v", *(f"z{n}" for n in range(inner))]
         return [
@@ -86,7 +88,7 @@ class Plan:
     @property
     def single(self) -> bool:
         """Whether the run is in single precision."""
-        return self.scene.experiment.solver.precision == "float32"
+        return self.scene.experiment.stepping.precision == "float32"
 
     @property
     def long(self) -> bool:

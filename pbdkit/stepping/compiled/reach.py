@@ -19,9 +19,10 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator, presence
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.leaders import Led
 from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.surroundings import presence
 
 Box = NDArray[np.int64]
 """(first, last + 1) of repeat cells along each axis, one after the other."""
@@ -103,12 +104,12 @@ def _stays(scene: Scene) -> bool:
     """Whether a particle with all its neighbours moves nowhere at rest, and no bond breaks."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
-    with blaming(experiment.rule, "at rest"):
+    with blaming(experiment.rule, "when asked whether it rests"):
         moves = [evaluator.at_rest(own) for own in slots]
     if any(component != 0.0 for move in moves for component in move):
         return False
     if scene.has_fracture:
-        with blaming(experiment.fracture, "at rest"):
+        with blaming(experiment.fracture, "when asked what breaks at rest"):
             limits = scene.constants.limits
             if any(evaluator.breaks(still, k.rest, limits[k], ()) for own in slots for k in own):
                 return False
@@ -131,7 +132,7 @@ def _growth(scene: Scene) -> Box:
     rules, inner = 1, scene.inner
     while inner:
         rules, inner = rules + 1, inner.inner
-    carried = [rules * np.array([slot.cell for slot in slots])]
+    carried = [np.array([slot.cell for slot in slots])]
     if scene.frame:
         points = scene.frame.place[scene.frame.map.point]
         _, *at = np.unravel_index(points, scene.raster.shape)
@@ -144,5 +145,5 @@ def _growth(scene: Scene) -> Box:
             seeing = seeing[:, inside]
             follows = kinds[(slot.source, *seeing)] == FOLLOWER
             carried.append((seeing - np.stack(body)[:, inside]).T[follows])
-    most = np.concatenate(carried)
+    most = rules * np.concatenate(carried)
     return _interleaved(np.minimum(most.min(axis=0), 0), np.maximum(most.max(axis=0), 0))

@@ -4,7 +4,7 @@ offsets, steps and weights are literals, so that what cancels at rest folds away
 from __future__ import annotations
 
 from pbdkit.interfaces import Slot
-from pbdkit.scene.cells import Side
+from pbdkit.interfaces.polygons import Side
 from pbdkit.scene.homes import Home
 from pbdkit.stepping.compiled.particle import (
     RUNS,

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.scene.raster import FOLLOWER, Block
+from pbdkit.scene.places import Block
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.rows import GENERAL, NOBODY, PLAIN, WITH_CELLS
-from pbdkit.stepping.evaluator import presence
+from pbdkit.stepping.surroundings import presence
 
 SHORT = 4
 """Stretches of fewer particles are taken together with a more general one beside them."""
@@ -53,7 +54,8 @@ def _joined(lines: Ints) -> Ints:
     last = np.append(first[1:], len(row)) - 1
     runs = np.stack([*(n[first] for n in lead), row[first], row[last] + 1, begin[first],
                      end[first]], axis=1)  # fmt: skip
-    return runs[np.lexsort(tuple(runs.T[::-1]))]
+    ordered: Ints = runs[np.lexsort(tuple(runs.T[::-1]))]
+    return ordered
 
 
 def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
@@ -69,7 +71,7 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
             fits &= block.seen_through(slot).of(raster.kind) == FOLLOWER
     kinds[fits] = PLAIN
     if scene.cells:
-        precision = scene.experiment.solver.precision
+        precision = scene.experiment.stepping.precision
         for slot in slots:
             for share in scene.cells.beside(slot, block, precision):
                 kinds[fits & (share != 1.0)] = WITH_CELLS
@@ -91,7 +93,8 @@ def _lines_of(kinds: Ints) -> Ints:
     begin, end, kind = _stretches(flat)
     *lead, first = np.unravel_index(begin, closed.shape)
     lines = np.stack([*lead, first, first + end - begin, kind], axis=1)
-    return lines[kind != NOBODY].astype(np.int64)
+    some: Ints = lines[kind != NOBODY].astype(np.int64)
+    return some
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:

@@ -52,13 +52,19 @@ def changes_no_input(subject: Subject) -> None:
     """What it is given it leaves as it is: the arrays belong to the state of the run."""
     for question in subject.questions():
         given = {name: np.array(value) for name, value in question.inputs.items()}
-        with np.errstate(all="ignore"):
-            question.ask(given)
-        if written := differing(dict(question.inputs), given):
-            raise PropertyError(
-                f"`{question.what}` writes into {_listed(written)}: make new arrays, `x = x + 1` "
-                "and not `x += 1`"
-            )
+        try:
+            with np.errstate(all="ignore"):
+                question.ask(given)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise PropertyError(_written(question.what, "what it is given")) from error
+        if names := differing(dict(question.inputs), given):
+            raise PropertyError(_written(question.what, _listed(names)))
+
+
+def _written(function: str, where: str) -> str:
+    return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
 
 
 @asked_of(*ALL, needs=(*NEEDS, "changes-no-input"))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Diagnostic, Variable
+from pbdkit.results.layout import reserved_names
 from pbdkit.testing.properties.answers import REPEATABLE
 from pbdkit.testing.property import PropertyError, asked_of
 from pbdkit.testing.questions import moment_of
@@ -22,7 +23,11 @@ ROUNDING = 1e-12
 @asked_of(Diagnostic)
 def labels_its_variables(subject: Subject) -> None:
     """Every variable has a name in lower case, a long name and units ("1" where it has none), so
-    that a dataset can be read without the program."""
+    that a dataset can be read without the program; none is a name that the dataset has already."""
+    own = [*_diagnostic(subject).coordinates(), _diagnostic(subject).own_dimension]
+    for name in (*own, *(variable.name for variable in _diagnostic(subject).variables())):
+        if name in reserved_names():
+            raise PropertyError(f"the dataset has '{name}' already: give it another name")
     for variable in _diagnostic(subject).variables():
         if not re.fullmatch(NAME, variable.name):
             raise PropertyError(f"the variable '{variable.name}' is not named as `my_quantity` is")
@@ -94,8 +99,8 @@ def takes_rows_in_any_order(subject: Subject) -> None:
         expected = np.asarray(one)
         for axis, dim in enumerate(variable.dims):
             expected = np.take(expected, order, axis) if dim == "particle" else expected
-        size = float(np.abs(expected).max(initial=1e-300))
-        if not (np.abs(np.asarray(other) - expected) <= ROUNDING * size).all():
+        size = float(np.nanmax(np.abs(expected), initial=1e-300))
+        if not np.allclose(other, expected, rtol=0.0, atol=ROUNDING * size, equal_nan=True):
             raise PropertyError(
                 f"'{variable.name}' depends on the order of the rows: ask `now.rows(numbers)` for "
                 "particles by number"

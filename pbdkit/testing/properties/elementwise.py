@@ -31,8 +31,6 @@ def returns_a_value_a_particle(subject: Subject) -> None:
                     f"`{question.what}` returns the shape {value.shape} for particles of shape "
                     f"{SHAPE} ({name}): it is not elementwise"
                 )
-            if question.what == "breaks" and value.dtype != bool:
-                raise PropertyError(f"`breaks` returns {value.dtype}: compare, as in `... > c[0]`")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene()
         counts = {len(c) for c in gathered(scene, differences(scene, 0))}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,12 +54,14 @@ def breaks_as_declared(subject: Subject) -> None:
     model, scene = _model(subject), subject.scene()
     for k, slot in enumerate(scene.neighbourhood.slots[0]):
         d = vector(differences(scene, 0, share=1e3), f"d{k}")
-        c, p = SimpleNamespace(**model.constants(slot)), scene.constants.fracture
-        if not model.can_break and np.any(model.breaks(d, slot.rest, c, p)):
+        if not model.can_break and np.any(breaking(scene, slot, d, ())):
             raise PropertyError("it declares `can_break = False`, and `breaks` says yes")
 
 
-@asked_of(FractureModel, needs=(*ORDERLY, "takes-particles-in-any-order", "is-local"))
+LOCAL = (*ORDERLY, "takes-particles-in-any-order", "is-local")
+
+
+@asked_of(FractureModel, needs=(*LOCAL, "is-seen-alike-from-both-ends"))
 def breaks_beyond_its_strain(subject: Subject) -> None:
     """Where it tells a `breaking_strain`, a bond that is drawn out along itself breaks a little
     above it and, if it has not broken, not a little below: `pbdkit explain` tells users so."""

@@ -24,20 +24,18 @@ def has_a_sound_cell(subject: Subject) -> None:
         cell = checked_cell(lattice)
     except ExperimentError as error:
         raise PropertyError(str(error)) from None
-    a, b = cell.vectors
-    _refuse_equal(cell, "place", np.array([a, b]), lambda site: site.at)
-    (pa, qa), (pb, qb) = cell.primitive
-    if pa * qb == qa * pb:
+    _refuse_equal(cell, "place", np.array(cell.vectors), lambda site: site.at)
+    if np.linalg.det(cell.primitive) == 0.0:
         raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
     _refuse_equal(cell, "primitive index", np.array(cell.primitive), lambda site: site.primitive)
 
 
 def _refuse_equal(
-    cell: Cell, what: str, steps: np.ndarray, of: Callable[[BasisSite], tuple[float, float]]
+    cell: Cell, what: str, steps: np.ndarray, of: Callable[[BasisSite], tuple[float, ...]]
 ) -> None:
     """Raises where two sites have the same value up to whole steps of the cell."""
     for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        apart = np.linalg.solve(steps.T, np.subtract(of(other), of(one)).astype(float))
+        apart = np.linalg.solve(steps.T, np.array(of(other), float) - np.array(of(one), float))
         if np.abs(apart - np.round(apart)).max() < 1e-9:
             raise PropertyError(
                 f"basis sites {m} and {n} have the same {what} {tuple(of(one))}, up to whole "

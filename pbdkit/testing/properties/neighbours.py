@@ -16,7 +16,7 @@ from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
 from pbdkit.testing.scenes import LATTICES, alternatives
 from pbdkit.testing.subject import Subject
 
-Chosen = set[tuple[int, int, tuple[int, int]]]
+Chosen = set[tuple[int, int, tuple[int, ...]]]
 
 
 @asked_of(NeighbourMetric)
@@ -75,7 +75,7 @@ def finds_the_same_anew(subject: Subject) -> None:
             met = {
                 o.site
                 for o in cell.offsets(s, far)
-                if np.hypot(*(scale * o.rest)) <= near.radius * (1 + 1e-9)
+                if np.hypot(*(scale * np.array(o.rest))) <= near.radius * (1 + 1e-9)
             }
             if met != {o.site for o in _flat(metric, cell, s)}:
                 raise PropertyError(
@@ -116,5 +116,5 @@ def _chosen(metric: NeighbourMetric, cell: Cell, sublattice: int) -> Chosen:
     return {(n, *_index(o)) for n, shell in enumerate(shells, 1) for o in shell}
 
 
-def _index(offset: Offset) -> tuple[int, tuple[int, int]]:
+def _index(offset: Offset) -> tuple[int, tuple[int, ...]]:
     return 0, offset.site

@@ -1,4 +1,4 @@
-"""What is looked at while an equilibrium is sought: how far it is, and whether to stop."""
+"""What whoever waits for a run is told, and whether they want it to stop."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 
 class StoppedError(Exception):
-    """The search was asked to stop."""
+    """The run, or the search for an equilibrium, was asked to stop."""
 
 
 def _never() -> bool:
@@ -26,17 +26,16 @@ class Watch:
         stopping: Callable[[], bool] = _never,
         show: Callable[[str, float], None] = _nothing,
     ) -> None:
-        self.load = ""
-        self._stopping, self._show = stopping, show
-        self._what = ""
+        self.load, self._what = "", ""
+        self.stopping, self._show = stopping, show
 
     def begin(self, what: str) -> None:
         """Something else is done from now on. Raises StoppedError."""
-        self._what = what
-        self.look(0.0)
+        self.look(0.0, what)
 
-    def look(self, share: float) -> None:
-        """So much of it is done. Raises StoppedError."""
-        if self._stopping():
+    def look(self, share: float, what: str = "") -> None:
+        """So much is done, of `what` or of what was begun last. Raises StoppedError."""
+        self._what = what or self._what
+        if self.stopping():
             raise StoppedError
         self._show(self.load + self._what, min(1.0, max(0.0, share)))

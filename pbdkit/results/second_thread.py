@@ -8,8 +8,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from pbdkit.results.layout import Column
-from pbdkit.results.recorder import Sink, Values
+from pbdkit.results.layout import Column, Values
+from pbdkit.results.recorder import Sink
 
 LARGE_BYTES = 2**20
 """Below this, handing over costs as much as writing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 FINEST, COARSEST = 256, 4
 """Looks lie apart by between these parts of the steps since the first: what comes late comes late
@@ -13,6 +14,7 @@ time the steps since the first look are this many times more."""
 NEVER = 2**62
 
 
+@dataclass
 class Pace:
     """When to look, from what the looks before have found.
 
@@ -25,42 +27,48 @@ class Pace:
     end, when one mode is left. It only says when a bound is worth its cost.
     """
 
-    def __init__(self, first: int, tolerance: float) -> None:
-        self.next_look = first
-        self._begin, self._tolerance = first - 1, tolerance
-        self._rate = 0.0
-        self._seen: tuple[int, float] | None = None
-        self._bounded: tuple[int, float] | None = None
-        self._overdue: int | None = None
+    next_look: int
+    """The step at which to look next."""
+    tolerance: float
+    begin: int
+    """The step before the first look."""
+    rate: float = 0.0
+    """Of the decay, a step; 0 while none is seen."""
+    seen: tuple[int, float] | None = None
+    """The last look: its step, and the size of the step made there."""
+    bounded: tuple[int, float] | None = None
+    """The last bound: its step, and the distance."""
+    overdue: int | None = None
+    """The steps since the first look after which a bound is made all the same."""
 
     def is_near(self, step: int, longest: float, size: float) -> bool:
         """Whether the distance is worth a bound. `longest` is the longest way that a particle made
         in this step, `size` a norm of all ways."""
-        if self._seen:
-            self._rate = _rate(self._seen, (step, size))
-        self._seen = (step, size)
-        elapsed = step - self._begin
+        if self.seen:
+            self.rate = _rate(self.seen, (step, size))
+        self.seen = (step, size)
+        elapsed = step - self.begin
         # Of two states within the tolerance none is farther from the other than twice that.
-        short = longest <= 2.0 * self._tolerance
-        if short and self._overdue is None:
-            self._overdue = OVERDUE * elapsed
-        distance = _distance(longest, self._rate)
-        stalls = self._rate == 0.0 and elapsed >= (self._overdue or 0)
-        if short and (distance <= self._tolerance or stalls):
+        short = longest <= 2.0 * self.tolerance
+        if short and self.overdue is None:
+            self.overdue = OVERDUE * elapsed
+        distance = _distance(longest, self.rate)
+        stalls = self.rate == 0.0 and elapsed >= (self.overdue or 0)
+        if short and (distance <= self.tolerance or stalls):
             return True
-        self._wait(step, _steps_until(distance, self._tolerance, self._rate))
+        self._wait(step, _steps_until(distance, self.tolerance, self.rate))
         return False
 
     def note_distance(self, step: int, distance: float) -> None:
         """What the bound came to, where the run goes on."""
         here = (step, distance)
-        rate = (_rate(self._bounded, here) if self._bounded else 0.0) or self._rate
-        wanted = self._tolerance if distance > self._tolerance else distance / 2
-        self._bounded, self._overdue = here, OVERDUE * (step - self._begin)
+        rate = (_rate(self.bounded, here) if self.bounded else 0.0) or self.rate
+        wanted = self.tolerance if distance > self.tolerance else distance / 2
+        self.bounded, self.overdue = here, OVERDUE * (step - self.begin)
         self._wait(step, _steps_until(distance, wanted, rate))
 
     def _wait(self, step: int, steps: float) -> None:
-        elapsed = step - self._begin
+        elapsed = step - self.begin
         least, most = max(1, elapsed // FINEST), max(1, elapsed // COARSEST)
         self.next_look = step + math.ceil(min(max(steps, least), most))
 

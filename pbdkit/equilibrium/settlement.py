@@ -8,8 +8,8 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import CORRECTION, Certificate, scale_of
 from pbdkit.equilibrium.outlook import Foresight, Outlook
-from pbdkit.equilibrium.pacing import NEVER, Pace
-from pbdkit.equilibrium.watching import Watch
+from pbdkit.equilibrium.pace import NEVER, Pace
+from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.fracturing import Fracturing
@@ -31,7 +31,8 @@ class Settling:
         self._tolerance = settle.tolerance * self._scale
         steps, leading = scene.experiment.steps, scene.leading
         ends = not any(is_cut_short(group, steps) for group in leading)
-        self._pace = Pace(last_event(scene) if ends else NEVER, self._tolerance)
+        first = max(last_event(scene), start.step + 1) if ends else NEVER
+        self.pace = Pace(first, self._tolerance, first - 1)
         self._foresight = Foresight(scene, watch)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
@@ -40,18 +41,13 @@ class Settling:
         )
         """Why the run has not settled, as found at the last look."""
 
-    @property
-    def next_look(self) -> int:
-        """The step at which to look next."""
-        return self._pace.next_look
-
     def look(self, state: State) -> Certificate | None:
         """At the end of that step: the certificate where the run has settled. Raises StoppedError
         where the watch says so."""
         with np.errstate(all="ignore"):
             way = (state.u - state.previous).ravel()
             longest, size = float(np.abs(way).max()), float(np.linalg.norm(way))
-        if not self._pace.is_near(state.step, longest, size):
+        if not self.pace.is_near(state.step, longest, size):
             self.obstacle = f"in step {state.step} particles still moved by up to {longest:.2g}"
             return None
         outlook = self._foresight.from_(state)
@@ -59,7 +55,7 @@ class Settling:
         self.obstacle = self._obstacle(state, outlook, distance)
         if not self.obstacle:
             return self._certificate(outlook, distance)
-        self._pace.note_distance(state.step, distance)
+        self.pace.note_distance(state.step, distance)
         return None
 
     def _obstacle(self, state: State, outlook: Outlook, distance: float) -> str:
@@ -94,6 +90,6 @@ class Settling:
 def _carrying(scene: Scene) -> float:
     """How many times the last step a body may be carried on: |b| / (1 - |b|) by memory b, which
     makes each step b times the last, and once by a frame that lags."""
-    memory = abs(scene.experiment.solver.memory)
+    memory = abs(scene.experiment.stepping.memory)
     lag = scene.frame.map.lag if scene.frame else 0
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + lag

@@ -14,7 +14,8 @@ from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
-from pbdkit.scene.cells import Cells, Corners, Tiling
+from pbdkit.interfaces.polygons import Polygon, Tiling
+from pbdkit.scene.cells import WeighedCells
 from pbdkit.scene.filling import rounding_of, window
 from pbdkit.scene.raster import Raster, cells_of_sites, positions
 from pbdkit.scene.rasterising import Mask
@@ -42,14 +43,14 @@ class Filling:
     first: Index
     share: Floats
 
-    def on(self, raster: Raster, tiling: Tiling) -> Cells:
+    def on(self, raster: Raster, tiling: Tiling) -> WeighedCells:
         """The shares by place of a raster."""
         out = np.zeros((len(self.share), *raster.shape))
         rows = raster.body_rows
         i, j = raster.site_of(rows).T
         for kind, share in enumerate(self.share):
             out[kind].ravel()[raster.place_of(rows)] = share[i - self.first[0], j - self.first[1]]
-        return Cells(tiling, out)
+        return WeighedCells(tiling, out)
 
 
 def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
@@ -58,16 +59,15 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     A body of given sites has the whole cells between them. Raises ExperimentError where there is
     no cell.
     """
-    cutter = _Cutter(body, lattice)
-    kinds = max(map(len, tiling.corners))
+    cutter = _Cutter(body, lattice, tiling)
+    kinds = max(map(len, tiling.polygons))
     share = np.zeros((kinds, *cutter.shape))
     corner = np.zeros(cutter.shape, bool)
-    for s, cells in enumerate(tiling.corners):
-        for kind, corners in enumerate(cells):
-            i, j, found = cutter.shares(s, corners)
+    for polygons in tiling.polygons:
+        for kind, polygon in enumerate(polygons):
+            i, j, found = cutter.shares(polygon)
             share[kind, i, j] = found
-            for slot in corners:
-                m, n = (0, 0) if slot is None else slot.site
+            for m, n in (at.site for at in polygon.corners):
                 corner[i + m, j + n] = True
     if not corner.any():
         raise ExperimentError(
@@ -84,10 +84,11 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
 class _Cutter:
     """The signed distance at all sites of a window around the body, and within cells."""
 
-    def __init__(self, body: Body, lattice: Lattice) -> None:
+    def __init__(self, body: Body, lattice: Lattice, tiling: Tiling) -> None:
         self._body, self._lattice, self._cell = body, lattice, lattice.cell()
         low, high = window(body, lattice)
-        margin = 2
+        corners = (at for own in tiling.polygons for p in own for at in p.corners)
+        margin = max(2, *(abs(n) for at in corners for n in at.site))
         self.low = (low[0] - margin, low[1] - margin)
         self.shape = (high[0] - low[0] + 1 + 2 * margin, high[1] - low[1] + 1 + 2 * margin)
         self._of_sites = any(box.in_sites for box in body.boxes())
@@ -97,17 +98,15 @@ class _Cutter:
         x, y = positions(self._cell, self._sublattice, m, n)
         self._x, self._y = x + lattice.origin[0], y + lattice.origin[1]
         self._tolerance = rounding_of(self._cell, self._x, self._y)
-        self._distance = self._signed(Sites(i, j, self._x, self._y))
+        self._distance = self._signed(Sites((i, j), Vector(self._x, self._y)))
 
-    def shares(
-        self, sublattice: int, corners: Corners
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-        """(i, j, share) of the cells with a share whose first corner, at place (i, j) of the
-        window, is of that sublattice."""
-        steps = [(0, 0) if slot is None else slot.site for slot in corners]
+    def shares(self, polygon: Polygon) -> tuple[Indices, Indices, Floats]:
+        """(i, j, share) of the cells of that shape with a share, by the place of their first corner
+        on the window."""
+        steps = [corner.site for corner in polygon.corners]
         low, high = np.min(steps, axis=0), np.max(steps, axis=0)
         ends = np.array(self.shape) - high
-        near = self._sublattice[-low[0] : ends[0], -low[1] : ends[1]] == sublattice
+        near = self._sublattice[-low[0] : ends[0], -low[1] : ends[1]] == polygon.source
         i, j = (n - lowest for n, lowest in zip(np.nonzero(near), low, strict=True))
         share, nearest = np.ones(len(i)), np.full(len(i), np.inf)
         for m, n in steps:
@@ -115,7 +114,7 @@ class _Cutter:
             share[distance > 0.0] = 0.0
             nearest = np.minimum(nearest, np.abs(distance))
         if not self._of_sites:
-            reach = (1.0 if self._body.exaggerates() else NEAREST) * _width(corners)
+            reach = (1.0 if self._body.exaggerates() else NEAREST) * _width(polygon)
             cut = np.flatnonzero(nearest <= reach)
             for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
                 at = [(i[some] + m, j[some] + n) for m, n in steps]
@@ -127,15 +126,15 @@ class _Cutter:
     def _cut_shares(self, x: Floats, y: Floats) -> Floats:
         """The share inside of cells with corners (corner, cell): the mean over its triangles, cut
         into small ones in which the distance is linear."""
-        triangles = [(0, 1, 2)]
-        if len(x) == 4:
+        triangles, n = [(0, 1, 2)], len(x)
+        if n > 3:
             x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
-            triangles = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
+            triangles = [(k, (k + 1) % n, n) for k in range(n)]
         corners = np.array(triangles).T
         weights, small = _small_triangles()
         px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
         nowhere = np.zeros(px.shape, int)
-        distance = self._signed(Sites(nowhere, nowhere, px, py))
+        distance = self._signed(Sites((nowhere, nowhere), Vector(px, py)))
         share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
         cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
         a, b, c = (distance[corner][..., cut] for corner in small.T)
@@ -147,10 +146,9 @@ class _Cutter:
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
 
 
-def _width(corners: Corners) -> float:
+def _width(polygon: Polygon) -> float:
     """The largest distance between corners of a cell."""
-    places = [Vector(0.0, 0.0) if slot is None else slot.rest for slot in corners]
-    return max(math.hypot(a.x - b.x, a.y - b.y) for a in places for b in places)
+    return max(math.dist(a, b) for a in polygon.rest for b in polygon.rest)
 
 
 @cache

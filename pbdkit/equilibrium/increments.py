@@ -6,9 +6,8 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, never_rests, scale_of
 from pbdkit.equilibrium.finding import Finder, UnconvergedError
-from pbdkit.equilibrium.watching import StoppedError, Watch
+from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.engine import Engine
@@ -32,8 +31,7 @@ def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificat
     the watch says so: then the state is the last that had been reached.
     """
     watch = watch or Watch()
-    solver, steps = scene.experiment.solver, scene.experiment.steps
-    assert isinstance(solver, Equilibrium)
+    asked, steps = scene.experiment.solver.sought, scene.experiment.steps
     for n, leading in enumerate(scene.leading):
         if never_rests(leading, steps):
             raise ExperimentError(
@@ -42,9 +40,9 @@ def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificat
                 ("leaders", n, "motion"),
             )
     scale = scale_of(scene, state)
-    finder = Finder(scene, solver.tolerance * scale, scale, solver.method, watch)
+    finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture:
-        return _load(scene, state, finder, solver.increments)
+        return _load(scene, state, finder, asked.increments)
     if last := _last_change_of_roles(scene):
         _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
@@ -114,10 +112,9 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     fracturing.break_bonds(state.u, state, step)
     if _broken(state) > broken:
         return True
-    solver = scene.experiment.solver
-    assert isinstance(solver, Equilibrium)
+    tolerance = scene.experiment.solver.sought.tolerance
     for old, new in zip(before, state.bond_values, strict=True):
-        if (np.abs(new - old) > solver.tolerance * np.maximum(1.0, np.abs(old))).any():
+        if (np.abs(new - old) > tolerance * np.maximum(1.0, np.abs(old))).any():
             return True
     for old, new in zip(before, state.bond_values, strict=True):
         new[...] = old

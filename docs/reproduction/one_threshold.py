@@ -1,0 +1,70 @@
+"""At which times the sheets of d, f and g tear, and whether one threshold fits all figures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from claims import Claim
+from runs import parted, run, steps_text
+
+FIGURES = {"d1": (5, 7), "d2": (5, 8), "f1": (7, 10), "f2": (7, 10), "g": (8, 9)}
+"""The first and last of the consecutive times about the tearing that figures 14, 15, 18, 20 and 22
+show."""
+TRIED = np.arange(4.4, 6.41, 0.1).round(2)
+SHIPPED = 5.2
+
+
+def limits(case: str, threshold: float) -> str:
+    """The setting of one threshold for all shells of a case."""
+    return f"fracture.thresholds={[threshold] * (1 if case.endswith('1') else 2)}"
+
+
+def times(case: str, threshold: float = SHIPPED) -> tuple[int, int] | None:
+    """The paper's times at which the first and the last row part; None where not all do so."""
+    rows = parted(run(f"paper/{case}", limits(case, threshold), "steps=15", "diagnostics=[]"))
+    steps = [step for step in rows if step is not None]
+    return (min(steps) + 1, max(steps) + 1) if len(steps) == len(rows) else None
+
+
+def fits(case: str, threshold: float) -> bool:
+    """Whether the last row parts after the first and not after the last time that is shown."""
+    torn, (first, last) = times(case, threshold), FIGURES[case]
+    return torn is not None and first < torn[1] <= last
+
+
+def fitting(*cases: str) -> list[float]:
+    """The thresholds that were tried, and fit the figures of all these cases."""
+    return [float(t) for t in TRIED if all(fits(case, float(t)) for case in cases)]
+
+
+def span(case: str) -> str:
+    """The times at which the rows of a case part at the shipped threshold."""
+    torn = times(case)
+    assert torn is not None
+    return f"{torn[0]} to {torn[1]}" if torn[0] < torn[1] else f"{torn[0]}"
+
+
+def which(thresholds: Sequence[float]) -> str:
+    """A list of thresholds in words."""
+    return ", ".join(f"{t:g}" for t in thresholds) or "none"
+
+
+def same_parameters() -> Claim:
+    """What case f says of its parameters."""
+    one, two = run("paper/d1"), run("paper/d1", "frame.layers=2", "diagnostics=[]")
+    shift = float(np.abs(one.u - two.u).max())
+    high = steps_text(parted(run("paper/f1", limits("f1", 6.0), "steps=15", "diagnostics=[]")))
+    found = fitting(*FIGURES)
+    return Claim(
+        "all parameters are the same as the square lattice fracture case",
+        f"speed and threshold can be: at {SHIPPED:g}, as shipped in d, f and g alike, rows part at "
+        f"times {', '.join(f'{span(case)} ({case})' for case in FIGURES)}. Of {len(TRIED)} "
+        f"thresholds from {TRIED[0]:g} to {TRIED[-1]:g} the last row parts after the first and not "
+        "after the last of the consecutive times shown in figures 14, 15, 18, 20 and 22 at "
+        f"{which(found)}; at 6 rows of f1 part at steps {high}. The frame cannot be: 103 of d is "
+        f"the particle that the paper describes with one layer (with two that one is "
+        f"{two.number(7, 5)}), 133 of f with two. On the square lattice a second layer changes "
+        f"the body by {shift:.1g}",
+        False,
+        "one threshold of 5.2 or 5.3 for all, and another frame",
+        found == [5.2, 5.3] and one.number(7, 5) == 103 != two.number(7, 5),
+    )

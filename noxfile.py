@@ -1,0 +1,68 @@
+#!/usr/bin/env -S uv run --script
+# /// script
+# dependencies = ["nox>=2025.2.9"]
+# ///
+"""What must hold of a change, one session a concern: `nox -s lint`, or all of them by `nox`.
+
+Each has an environment of its own; in one that has the group `dev`: `nox --no-venv --no-install`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nox
+
+nox.needs_version = ">=2025.2.9"
+nox.options.default_venv_backend = "virtualenv"
+
+PROJECT = nox.project.load_toml("pyproject.toml")
+PLUGINS = sorted(str(project.parent) for project in Path("plugins").glob("*/pyproject.toml"))
+
+
+def install(session: nox.Session, group: str) -> None:
+    """pbdkit with all extras, and a dependency group."""
+    session.install("-e", ".[all]", *nox.project.dependency_groups(PROJECT, group))
+
+
+@nox.session
+def tests(session: nox.Session) -> None:
+    """The tests, or those that are named: `nox -s tests -- tests/test_paper.py`."""
+    install(session, "test")
+    session.run("pytest", *(session.posargs or ["-n", "auto", "--dist", "worksteal"]))
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Style and types."""
+    install(session, "lint")
+    session.run("ruff", "check", ".")
+    session.run("ruff", "format", "--check", ".")
+    session.run("mypy", "pbdkit")
+    session.run("mypy", *map(str, Path("plugins").glob("*/pbdkit_*.py")))
+
+
+@nox.session
+def schemas(session: nox.Session) -> None:
+    """The JSON Schemas are those of the program; `nox -s schemas -- write` makes them anew."""
+    install(session, "test")
+    for what in ("experiment", "dataset"):
+        made = session.run("pbdkit", "schema", what, "--builtin", silent=True)
+        kept = Path("schemas", f"{what}.schema.json")
+        if "write" in session.posargs:
+            kept.write_text(str(made), encoding="utf-8")
+        elif kept.read_text(encoding="utf-8") != made:
+            session.error(f"{kept} is out of date: nox -s schemas -- write")
+
+
+@nox.session
+def plugins(session: nox.Session) -> None:
+    """The tests of the plugins, installed beside one another."""
+    install(session, "test")
+    session.run_install("pip", "install", *(word for plugin in PLUGINS for word in ("-e", plugin)))
+    session.run("pytest", "-n", "auto", "--dist", "worksteal", *PLUGINS)
+    session.run("pbdkit", "plugins", "list")
+
+
+if __name__ == "__main__":
+    nox.main()

@@ -1,0 +1,75 @@
+"""The file that a command is to write: looked at before the work, not after."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.scene.scene import Scene
+from pbdkit.scene.sizes import MIB, sizes_of
+
+KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
+"""What may be at a path and no plain file, by the type that the system gives it."""
+
+
+@contextmanager
+def folder_kept() -> Iterator[None]:
+    """Goes back to the current folder: a plugin may change it when it is imported. Raises
+    StorageError where there is none."""
+    try:
+        here = Path.cwd()
+    except OSError as error:
+        raise StorageError(f"the current folder: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        os.chdir(here)
+
+
+def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
+    """Raises ExperimentError where nothing is to be written there: a name that is no UTF-8, a
+    folder, a file without `force`, and, forced or not, what is no plain file, and the experiment
+    under this or another name. Raises StorageError where the system does not tell."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
+        raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
+    try:
+        mode = path.lstat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise StorageError(f"{str(path)[:80]}...: {error.strerror}") from None
+    if stat.S_ISDIR(mode):
+        raise ExperimentError(f"{path}: is a folder; name a file with -o")
+    if not stat.S_ISREG(mode):
+        kind = KINDS.get(stat.S_IFMT(mode), "no plain file")
+        raise ExperimentError(
+            f"{path}: is {kind}, which is not replaced; remove it, or name another file with -o"
+        )
+    if experiment and experiment.exists() and path.samefile(experiment):
+        raise ExperimentError(f"{path}: is the experiment itself; name another file with -o")
+    if not force:
+        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
+
+
+def disk_warnings(path: Path, scene: Scene) -> tuple[str, ...]:
+    """What is to be said where the output may not fit on its disk."""
+    output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output
+    try:
+        free = shutil.disk_usage(path.parent).free
+    except OSError:  # no such folder: said when the file is opened
+        return ()
+    if output <= free:
+        return ()
+    return (
+        f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
+        f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or name a file "
+        "on another disk with -o",
+    )

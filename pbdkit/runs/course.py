@@ -1,0 +1,126 @@
+"""The run of a scene, and its recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+from pbdkit.analysis.forecast import prediction, quick_warnings
+from pbdkit.equilibrium.watch import Watch
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
+from pbdkit.results.recorder import Outcome, Recorder, Sink
+from pbdkit.runs.driver import Driver
+from pbdkit.runs.stepwise import Stepwise
+from pbdkit.runs.straight import Straight
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import Choice
+from pbdkit.stepping.state import State, initial_state
+
+DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
+    Stepping: Stepwise,
+    Equilibrium: Straight,
+}
+"""What carries out what an experiment asks for under `solver`."""
+
+
+class Run:
+    """One run of a scene, gone through once: ``for state in Run(scene): ...``.
+
+    A state comes at every step of which the experiment records something, the first and the last
+    included, and at some between. It is valid, and may be changed, until the next is asked for:
+    ``state.copy()`` keeps it. `watch` is told how far the run is and says whether to stop; `start`
+    is the state to go on from, which the run takes over. Raises ExperimentError, with its place in
+    the file, and PluginError.
+    """
+
+    def __init__(
+        self, scene: Scene, *, start: State | None = None, watch: Watch | None = None
+    ) -> None:
+        self.scene = scene
+        self.outcome: Outcome | None = None
+        """How the run ended; None until it has."""
+        with _located(scene):
+            make = DRIVERS[type(scene.experiment.solver)]
+            self.driver = make(scene, start or initial_state(scene), watch or Watch())
+
+    def __iter__(self) -> Iterator[State]:
+        with _located(self.scene):
+            self.outcome = yield from self.driver.states()
+
+    @property
+    def state(self) -> State:
+        """Where the run stands; of one that diverged, what it came to."""
+        return self.driver.state
+
+    @property
+    def ending(self) -> bool:
+        """Whether the state just given out is the last of a run that ends before its last step, to
+        be kept whatever the experiment records. It may have come before without that."""
+        return self.driver.ending
+
+    @property
+    def choice(self) -> Choice:
+        """The engine, its threads, and why."""
+        return self.driver.choice
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be said before the first step: of the scene, and of stability."""
+        return quick_warnings(self.scene)
+
+    def reject(self, error: FloatingPointError) -> None:
+        """The state just given out has values that are not finite: the run is to end here."""
+        self.driver.rejection = error
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a recorded run went, for those who look at its cost, and what is to be said of its
+    end."""
+
+    outcome: Outcome
+    particles: int
+    wall_s: float
+    choice: Choice
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def ns_per_particle_step(self) -> float:
+        """Wall time of stepping and recording together."""
+        return self.wall_s * 1e9 / (self.particles * max(1, self.outcome.steps))
+
+
+def record(run: Run, sink: Sink) -> Report:
+    """Takes a run to its end, and what the experiment records of it into the sink."""
+    begun, scene = time.perf_counter(), run.scene
+    recorder = Recorder(scene, sink)
+    try:
+        with _located(scene):
+            recorder.begin()
+        for state in run:
+            try:
+                with _located(scene):
+                    (recorder.observe_last if run.ending else recorder.observe)(state)
+            except FloatingPointError as error:
+                run.reject(error)
+        assert run.outcome is not None
+        with _located(scene):
+            recorder.finish(run.state, run.outcome, prediction(scene))
+    except BaseException:
+        sink.abandon()
+        raise
+    wall_s = time.perf_counter() - begun
+    return Report(run.outcome, scene.raster.count, wall_s, run.choice, recorder.warnings)
+
+
+@contextmanager
+def _located(scene: Scene) -> Iterator[None]:
+    """An ExperimentError gets the place of its field in the file."""
+    try:
+        yield
+    except ExperimentError as error:
+        raise scene.experiment.located(error) from None

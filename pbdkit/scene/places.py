@@ -1,0 +1,87 @@
+"""Some particles of one sublattice of a raster: a rectangle of cells, or flat places."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from operator import add, sub
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Offset, Slot
+from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.lattice import Index
+
+
+@dataclass(frozen=True)
+class Block:
+    """A rectangle of repeat cells of one sublattice; `stop` is excluded."""
+
+    sublattice: int
+    start: Index
+    stop: Index
+
+    def slices(self) -> tuple[Any, ...]:
+        """Where it lies in an array (sublattice, cell, cell)."""
+        return (self.sublattice, *map(slice, self.start, self.stop))
+
+    def seen_through(self, slot: Slot | Offset) -> Block:
+        """The block of the neighbours at that slot, or of the sites at that offset."""
+        start, stop = (tuple(map(add, end, slot.cell)) for end in (self.start, self.stop))
+        return Block(slot.target, start, stop)
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., sublattice, cell, cell) here, as a view."""
+        return values[(..., *self.slices())]
+
+    def within(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., cell, cell) here, as a view."""
+        return values[(..., *self.slices()[1:])]
+
+    def rows(self, cells: int) -> list[Block]:
+        """The block cut along its first axis into parts of about so many cells."""
+        (first, *start), (last, *stop) = self.start, self.stop
+        step = max(1, cells // max(1, math.prod(map(sub, stop, start))))
+        return [
+            Block(self.sublattice, (i, *start), (min(i + step, last), *stop))
+            for i in range(first, last, step)
+        ]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Some particles of one sublattice by their flat place on rasters of a shape; they can be asked
+    as a Block can."""
+
+    shape: tuple[int, ...]
+    place: Indices
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., sublattice, cell, cell) here."""
+        flat = values.reshape(*values.shape[: values.ndim - len(self.shape)], -1)
+        found: NDArray[Any] = flat[..., self.place]
+        return found
+
+    def within(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values of (..., cell, cell) here."""
+        flat = values.reshape(*values.shape[: values.ndim - len(self.shape) + 1], -1)
+        found: NDArray[Any] = flat[..., self.place % math.prod(self.shape[1:])]
+        return found
+
+    def seen_through(self, slot: Slot | Offset) -> Places:
+        """The neighbours at that slot; `step` away."""
+        return Places(self.shape, self.place + slot_step(self.shape, slot))
+
+
+Where = Block | Places
+"""Some particles of one sublattice."""
+
+
+def slot_step(shape: tuple[int, ...], slot: Slot | Offset) -> int:
+    """From a flat place of rasters to that of the neighbour at a slot."""
+    source = slot.source if isinstance(slot, Slot) else slot.target
+    step = slot.target - source
+    for size, cells in zip(shape[1:], slot.cell, strict=True):
+        step = step * size + cells
+    return step

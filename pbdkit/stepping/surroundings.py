@@ -1,0 +1,128 @@
+"""Particles of a scene with what is around them, as the evaluator is asked about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Components, Here, Slot, Softens
+from pbdkit.interfaces.vector import vector
+from pbdkit.scene.places import Where
+from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Contributions, Mask, Neighbour, summed
+from pbdkit.stepping.remembering import shown
+from pbdkit.stepping.state import State
+
+BLOCK_CELLS = 16384
+"""Places a block: small enough for its temporaries to stay in the cache."""
+
+
+class Surroundings:
+    """Some particles of one sublattice: their `slots` with what is constant of each neighbour, and
+    where particles of the body have a neighbour, `movable` (None: everywhere)."""
+
+    def __init__(self, scene: Scene, where: Where, sublattice: int) -> None:
+        self._scene, self.where = scene, where
+        self.slots = scene.neighbourhood.slots[sublattice]
+        self._present = presence(scene.raster, where, self.slots)
+        self._weights = [self._weights_of(slot) for slot in self.slots]
+        neighbours = sum(1 if there is None else there.astype(int) for there in self._present)
+        movable = (where.of(scene.raster.kind) == FOLLOWER) & (neighbours > 0)
+        self.movable: Mask | None = None if movable.all() else movable
+
+    @cached_property
+    def _reference(self) -> tuple[Any, Any]:
+        """X and its distance from the middle of the body, where the rule asks for them."""
+        if not self._scene.experiment.rule.uses_reference:
+            return None, None
+        local = self._scene.raster.reference_planes(self.where)
+        origin = self._scene.raster.lattice.origin
+        return local.each(np.add, origin), local.each(np.subtract, self._scene.middle)
+
+    def differences(self, u: NDArray[Any]) -> list[Components]:
+        """u_k - u_j along each slot."""
+        here = vector(self.where.of(u))
+        return [vector(self.where.seen_through(slot).of(u)) - here for slot in self.slots]
+
+    def neighbours(self, state: State) -> list[Neighbour]:
+        """The neighbours through each slot, as they are in a state."""
+        parts = zip(self.slots, self._weights, self._present, strict=True)
+        return [
+            Neighbour(slot.rest, w, present, *self._bond(slot, state)) for slot, w, present in parts
+        ]
+
+    def here(self, u: NDArray[Any], state: State) -> Here:
+        """What stands at the particles."""
+        own = self._scene.constants.of_particle(*shown(self.own(state)))
+        return Here(read_only(vector(self.where.of(u))), *self._reference, own)
+
+    def own(self, state: State) -> list[NDArray[Any]]:
+        """What is remembered of the particles; of a block, views into the state."""
+        return [self.where.of(value) for value in state.particle_values]
+
+    def sums(
+        self,
+        function: Callable[[Components, Components, Neighbour], Contributions],
+        u: NDArray[Any],
+        state: State,
+    ) -> Contributions:
+        """Σ function(d, u, neighbour), as the evaluator's `contribution` is."""
+        own = read_only(vector(self.where.of(u)))
+        parts = zip(self.differences(u), self.neighbours(state), strict=True)
+        return summed((function(d, own, to), to.present) for d, to in parts)
+
+    def _weights_of(self, slot: Slot) -> Any:
+        """w of a slot; the shares of cells are arrays where they differ."""
+        weights, cells = self._scene.constants.weights[slot], self._scene.cells
+        if cells is None:
+            return weights
+        left, right = cells.beside(slot, self.where, self._scene.experiment.stepping.precision)
+        return weights._replace(left=left, right=right)
+
+    def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
+        """Where the bond along a slot is broken, and its constants where they reach the rule."""
+        if state.broken_step is None:
+            return None, None
+        scene = self._scene
+        plane, at_this_end = scene.neighbourhood.home[slot]
+        home = self.where if at_this_end else self.where.seen_through(slot)
+        broken = home.within(state.broken_step[plane]) >= 0
+        c = None
+        if isinstance(scene.experiment.fracture, Softens):
+            own = shown([home.within(value[plane]) for value in state.bond_values])
+            c = scene.constants.of_bond(*scene.constants.limits[slot], *own)
+        return (broken if broken.any() else None), c
+
+
+def blocks(scene: Scene) -> list[Surroundings]:
+    """The surroundings of the body's particles, block by block."""
+    whole = ((s, scene.raster.body_block(s)) for s in range(scene.raster.shape[0]))
+    return [
+        Surroundings(scene, part, s)
+        for s, block in whole
+        if block
+        for part in block.rows(BLOCK_CELLS)
+    ]
+
+
+def read_only(v: Any) -> Any:
+    """The same, as components hand it to a rule: nobody writes to the state but the stepper."""
+    for plane in v:
+        plane.flags.writeable = False
+    return v
+
+
+def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:
+    """For each slot, where the neighbour exists, None where it does everywhere; only places with a
+    particle count."""
+    nobody = place.of(raster.kind) == EMPTY
+    found: list[Mask | None] = []
+    for slot in slots:
+        present = place.seen_through(slot).of(raster.kind) != EMPTY
+        found.append(None if (present | nobody).all() else present)
+    return found

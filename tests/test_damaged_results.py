@@ -1,0 +1,115 @@
+"""Damaged or crafted result files are refused with one line; nothing hangs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+
+import pbdkit
+
+Call = Callable[..., Any]
+TORN = ["--set=leaders.1.motion.velocity=[1.2, 0.0]", "--set=steps=12"]
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a run in which bonds broke."""
+    from pbdkit.cli import main
+
+    path = tmp_path_factory.mktemp("sound") / "sound.nc"
+    with pytest.raises(SystemExit):
+        main(["run", "paper/d1", "-o", str(path), "--quiet", *TORN])
+    return path
+
+
+def attribute(name: str, value: Any) -> Callable[[Any], None]:
+    return lambda file: file.setncattr(name, value)
+
+
+def value(name: str, at: Any, new: Any) -> Callable[[Any], None]:
+    def change(file: Any) -> None:
+        file[name][at] = new
+
+    return change
+
+
+def rename(name: str) -> Callable[[Any], None]:
+    return lambda file: file.renameVariable(name, f"{name}_gone")
+
+
+CRAFTED: dict[str, Callable[[Any], None]] = {
+    "no position": rename("position"),
+    "no reference": rename("reference"),
+    "no kind": rename("kind"),
+    "no time": rename("time"),
+    "positions not finite": value("position", (slice(None), 40), np.nan),
+    "a reference not finite": value("reference", 3, np.inf),
+    "bonds of nobody": value("bond", 5, [10**6, -7]),
+    "kinds unknown": value("kind", slice(None), 77),
+    "no JSON": attribute("experiment", "{"),
+    "JSON of another kind": attribute("experiment", "[1, 2]"),
+    "nested JSON": attribute("experiment", "[" * 100_000),
+    "a number for JSON": attribute("experiment", 3.0),
+    "another experiment": attribute("experiment", '{"name": "x"}'),
+    "plugins no JSON": attribute("plugins", "{"),
+    "an odd version": attribute("schema_version", "one"),
+    "a formula for a title": attribute("title", r"$\frac{$"),
+    "a number for a title": attribute("title", 3.0),
+    "a title of a megabyte": attribute("title", "x " * 2**19),
+}
+
+
+@pytest.mark.parametrize("name", CRAFTED)
+def test_a_crafted_file_is_drawn_or_refused_in_a_line(name: str, sound: Path, call: Call) -> None:
+    shutil.copy(sound, "crafted.nc")
+    with netCDF4.Dataset("crafted.nc", "a") as file:
+        CRAFTED[name](file)
+    for arguments in (["explain"], ["plot", "--color", "pe1"]):
+        result = call(arguments[0], "crafted.nc", *arguments[1:])
+        assert result.code in (0, 2, 6), result.err
+        assert len(result.err) < 1000
+        if result.code:
+            assert result.err.startswith("pbdkit: ")
+            assert result.err.count("\n") == 1
+            assert "crafted.nc" in result.err
+
+
+REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", "nested JSON"]
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_damaged_is_not_explained(name: str, sound: Path, call: Call) -> None:
+    shutil.copy(sound, "crafted.nc")
+    with netCDF4.Dataset("crafted.nc", "a") as file:
+        CRAFTED[name](file)
+    assert call("explain", "crafted.nc").code in (2, 6)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_file_with_bytes_overwritten_is_read_or_refused(
+    seed: int, sound: Path, call: Call
+) -> None:
+    random, damaged = np.random.default_rng(seed), bytearray(sound.read_bytes())
+    begin = int(random.integers(len(damaged)))
+    damaged[begin : begin + 400] = random.bytes(min(400, len(damaged) - begin))
+    Path("damaged.nc").write_bytes(damaged)
+    for command in ("explain", "plot"):
+        result = call(command, "damaged.nc")
+        assert result.code in (0, 2, 3, 6), result.err
+        assert "a bug in pbdkit" not in result.err
+        assert ("damaged.nc" in result.err) == bool(result.code)
+
+
+def test_a_file_cut_short_is_refused(sound: Path, call: Call) -> None:
+    whole = sound.read_bytes()
+    for length in (0, 10, 1000, len(whole) // 2, len(whole) - 10):
+        Path("cut.nc").write_bytes(whole[:length])
+        assert call("explain", "cut.nc").code == 6
+        with pytest.raises(pbdkit.StorageError, match=r"cut\.nc"):
+            pbdkit.open("cut.nc")

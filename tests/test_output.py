@@ -1,0 +1,207 @@
+"""Where results go: what is never replaced, what a failed run leaves, and what is said before."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import pbdkit
+from pbdkit.cli.output import refuse_output
+
+Call = Callable[..., Any]
+OUT = Path("tensile.nc")
+PROBED = ("--set", "diagnostics=[{type: probe}]")
+
+
+def left() -> list[str]:
+    return sorted(path.name for path in Path().iterdir() if path.name != "e.json")
+
+
+def link(to: str) -> Callable[[], None]:
+    return lambda: OUT.symlink_to(to)
+
+
+SPECIAL = {
+    "link": (link("e.json"), "is a symbolic link"),
+    "dangling link": (link("nowhere"), "is a symbolic link"),
+    "pipe": (lambda: os.mkfifo(OUT), "is a pipe"),
+    "the experiment by a hard link": (lambda: os.link("e.json", OUT), "is the experiment itself"),
+}
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "forced"])
+@pytest.mark.parametrize(("make", "word"), SPECIAL.values(), ids=SPECIAL)
+def test_only_plain_files_that_are_not_the_experiment_are_replaced(
+    call: Call, make: Callable[[], None], word: str, force: tuple[str, ...]
+) -> None:
+    make()
+    kind, text = stat.S_IFMT(OUT.lstat().st_mode), Path("e.json").read_text()
+    result = call("run", "e.json", *force)
+    assert (result.code, result.out) == (2, "")
+    assert result.err.startswith(f"pbdkit: tensile.nc: {word}")
+    assert "name another file with -o" in result.err
+    assert (stat.S_IFMT(OUT.lstat().st_mode), Path("e.json").read_text()) == (kind, text)
+    assert left() == ["tensile.nc"]
+
+
+def test_a_device_is_not_replaced() -> None:
+    """Asked of the check alone: a command that failed it would cost this machine its device."""
+    with pytest.raises(pbdkit.ExperimentError, match="is a device, which is not replaced"):
+        refuse_output(Path(os.devnull), force=True)
+
+
+@pytest.mark.parametrize("name", ["e.json", "./e.json", "linked.json"])
+def test_the_experiment_itself_is_not_replaced(call: Call, name: str) -> None:
+    Path("linked.json").symlink_to("e.json")
+    text = Path("e.json").read_text()
+    for given, output in ((name, "e.json"), ("e.json", "../work/e.json")):
+        result = call("run", given, "-o", output, "--force")
+        assert (result.code, "is the experiment itself" in result.err) == (2, True)
+    assert Path("e.json").read_text() == text
+
+
+def test_a_name_that_is_no_utf_8_is_refused(call: Call) -> None:
+    result = call("run", "e.json", "-o", os.fsdecode(b"o\xff.nc"))
+    assert (result.code, left()) == (2, [])
+    assert "o\\xff.nc: is no UTF-8; name another file with -o" in result.err
+
+
+FAILING = {
+    "diverged": (4, ["--set=solver.relaxation=50", "--set=steps=300"]),
+    "unconverged": (
+        4,
+        [
+            "--set=solver={type: equilibrium, tolerance: 1e-17}",
+            "--set=body.rows=20",
+            "--set=leaders.1.until=10",
+        ],
+    ),
+    "interrupted": (130, PROBED),
+}
+
+
+@pytest.mark.parametrize(("status", "code", "settings"), [(k, *v) for k, v in FAILING.items()])
+def test_a_run_that_fails_leaves_a_good_result_as_it_is(
+    call: Call, probing: Any, status: str, code: int, settings: list[str]
+) -> None:
+    probing("signal.raise_signal(signal.SIGINT)")
+    again = "--set=rule={type: mean-displacement}"
+    assert call("run", "e.json", "--quiet", again).code == 0
+    good = OUT.read_bytes()
+    for name in ("tensile-partial.nc", "tensile-partial-2.nc"):
+        result = call("run", "e.json", "--force", *settings)
+        assert (result.code, OUT.read_bytes() == good) == (code, True)
+        ending = f"what was recorded until then is in {name}; tensile.nc is left as it was\n"
+        assert result.err.endswith(ending)
+        assert pbdkit.open(name).attrs["status"] == status
+    assert left() == ["tensile-partial-2.nc", "tensile-partial.nc", "tensile.nc"]
+    figures = json.loads(call("run", "e.json", "--force", "--json", *settings).out)
+    assert figures["output"] == "tensile-partial-3.nc"
+
+
+def test_a_run_that_fails_takes_its_name_where_nobody_has_it(call: Call, probing: Any) -> None:
+    probing("signal.raise_signal(signal.SIGINT)")
+    result = call("run", "e.json", "--force", *PROBED)
+    assert (result.code, left()) == (130, ["tensile.nc"])
+    assert result.err.endswith("what was recorded until then is in tensile.nc\n")
+
+
+def test_a_result_beside_is_kept_where_there_are_no_hard_links(
+    call: Call, probing: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError("no hard links here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    probing("signal.raise_signal(signal.SIGINT)")
+    OUT.write_text("mine")
+    assert call("run", "e.json", "--force", *PROBED).code == 130
+    assert (OUT.read_text(), left()) == ("mine", ["tensile-partial.nc", "tensile.nc"])
+
+
+def test_an_output_that_does_not_fit_on_the_disk_is_warned_of_before_the_run(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = SimpleNamespace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: small)
+    result = call("run", "e.json")
+    assert (result.code, left()) == (0, ["tensile.nc"])
+    warning = r"warning: record: the output of about 0.0\d+ MiB may not fit into the 0.000954 MiB"
+    assert pytest.approx(1000 / 2**20, rel=1e-3) == 0.000954
+    assert re.match(warning, result.err), result.err
+    assert call("run", "e.json", "--force", "--quiet").err == ""
+
+
+MOVES = "import os, tempfile\nos.chdir(tempfile.mkdtemp())\n"
+
+
+@pytest.mark.parametrize("when", ["imported", "used"])
+def test_a_plugin_that_changes_the_folder_moves_no_output(
+    call: Call, probing: Any, tmp_path: Path, when: str
+) -> None:
+    probing("import tempfile; os.chdir(tempfile.mkdtemp())" if when == "used" else "pass")
+    source = tmp_path / "site" / "pbdkit_probe.py"
+    if when == "imported":
+        source.write_text(MOVES + source.read_text())
+    folder = Path.cwd()
+    result = call("run", "e.json", *PROBED)
+    assert result.code == 0, result.err
+    assert (folder / "tensile.nc").is_file()
+
+
+def test_where_there_is_no_folder_it_is_said(call: Call) -> None:
+    gone = Path.cwd() / "gone"
+    gone.mkdir()
+    os.chdir(gone)
+    gone.rmdir()
+    result = call("run", "paper/a")
+    assert (result.code, result.err.startswith("pbdkit: the current folder: ")) == (6, True)
+
+
+def test_plot_replaces_a_picture_only_where_it_is_told_to(call: Call) -> None:
+    assert call("run", "e.json", "--quiet").code == 0
+    picture = Path("tensile.png")
+    picture.write_text("mine")
+    result = call("plot", "tensile.nc")
+    message = "pbdkit: tensile.png: exists; --force replaces it, -o names another file\n"
+    assert (result.code, result.err, picture.read_text()) == (2, message, "mine")
+    assert call("plot", "tensile.nc", "--force").code == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    picture.unlink()
+    picture.symlink_to("tensile.nc")
+    assert call("plot", "tensile.nc", "--force").code == 2
+    assert pbdkit.open(OUT).attrs["status"] == "complete"
+
+
+INTERRUPT = """
+import runpy, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == NAME:
+            raise KeyboardInterrupt
+
+sys.argv = ["pbdkit", "run", "e.json"]
+sys.meta_path.insert(0, Interrupt())
+runpy.run_module("pbdkit", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("module", ["pbdkit.cli", "click", "pbdkit.api", "netCDF4"])
+def test_an_interruption_while_the_program_is_loaded_shows_no_traceback(
+    call: Call, module: str
+) -> None:
+    command = [sys.executable, "-c", INTERRUPT.replace("NAME", repr(module))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr.strip(), left()) == (130, "pbdkit: interrupted", [])

@@ -1,0 +1,212 @@
+"""One run: states come one after the other, and whoever wants to keep them does."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium.pace import Pace
+from pbdkit.equilibrium.watch import Watch
+from pbdkit.experiment.solvers import Equilibrium, Solver
+from pbdkit.results.memory import MemorySink
+from pbdkit.runs.course import DRIVERS, Run, record
+from pbdkit.runs.stepwise import Stepwise
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stepping.guard import Guard
+from pbdkit.stepping.state import State
+
+SOLVERS = {
+    "stepping": {"type": "stepping"},
+    "memory": {"type": "stepping", "memory": 0.5},
+    "compiled": {"type": "stepping", "engine": "compiled"},
+    "settle": {"type": "stepping", "settle": {"tolerance": 1e-4}},
+    "equilibrium": {"type": "equilibrium"},
+}
+
+
+ROLES = "stepping until the roles change"
+
+
+def scene_of(given: dict[str, Any], **parts: Any) -> Scene:
+    return build_scene(pbdkit.Experiment(**given | parts))
+
+
+def test_every_solver_has_a_driver_and_only_its_own_parameters() -> None:
+    assert set(DRIVERS) == set(Solver.__subclasses__())
+    assert set(Equilibrium.model_fields) == {"type", "method", "tolerance", "increments"}
+    assert not hasattr(Equilibrium(), "relaxation")
+
+
+def test_nobody_asks_a_solver_for_its_class() -> None:
+    asked = []
+    for path in Path(pbdkit.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "isinstance":
+                names = {getattr(n, "id", "") for n in ast.walk(node.args[1])}
+                asked += [path.name] if names & {"Stepping", "Equilibrium"} else []
+    assert asked == []
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_the_states_of_a_run_are_those_that_are_recorded(
+    tensile: dict[str, Any], solver: dict[str, Any]
+) -> None:
+    given = tensile | {"solver": solver, "steps": 500, "record": {"every": 7}}
+    run = Run(scene_of(given))
+    assert run.outcome is None
+    places = {state.step: run.scene.raster.table(state.u).copy() for state in run}
+    assert run.outcome is not None
+    ds = pbdkit.run(given, progress=False)
+    assert run.outcome.status == ds.attrs["status"]
+    assert run.outcome.stop_reason == ds.attrs["stop_reason"]
+    assert set(ds.time.values) <= set(places)
+    for step in ds.time.values:
+        there = ds.position.sel(time=step) - ds.reference
+        np.testing.assert_allclose(there, places[step], atol=1e-14)
+    assert max(places) == ds.time[-1] == run.outcome.steps
+
+
+def test_a_run_can_be_watched_between_its_records_and_changed(tensile: dict[str, Any]) -> None:
+    given = tensile | {"leaders": tensile["leaders"][:1], "record": {"at": [0]}}
+    run = Run(scene_of(given, diagnostics=[{"type": "track", "numbers": [13]}]))
+    steps, moved = [], 0.0
+    for state in run:
+        steps.append(state.step)
+        if state.step == 4:
+            state.u[0] += 1.0
+        if state.step == 5:
+            moved = float(state.u[0].max())
+    assert steps == list(range(11))
+    assert 0.5 < moved <= 1.0
+
+
+@pytest.mark.parametrize("solver", ["stepping", "memory", "compiled"])
+def test_a_run_goes_on_from_a_state(tensile: dict[str, Any], solver: str) -> None:
+    given = tensile | {"solver": SOLVERS[solver], "steps": 60}
+    kept: State | None = None
+    whole = Run(scene_of(given))
+    for state in whole:
+        if state.step == 23:
+            kept = state.copy()
+    rest = Run(scene_of(given), start=kept)
+    assert [state.step for state in rest] == list(range(23, 61))
+    assert np.array_equal(rest.state.u, whole.state.u)
+    assert rest.outcome == whole.outcome
+
+
+def test_all_that_decides_when_a_run_settles_is_data(tensile: dict[str, Any]) -> None:
+    """A run that is left, and gone on with from its state, guard and pace, ends where it would
+    have."""
+    given = tensile | {"solver": SOLVERS["settle"], "steps": 5000, "record": {"at": [0]}}
+    whole, left = Run(scene_of(given)), Run(scene_of(given))
+    steps = [state.step for state in whole]
+    middle = steps[len(steps) // 2]
+    for state in left:
+        if state.step == middle:
+            break
+    driver, state = left.driver, left.state.copy()
+    assert isinstance(driver, Stepwise)
+    assert driver.settling is not None
+    rest = Run(scene_of(given), start=state)
+    assert isinstance(rest.driver, Stepwise)
+    assert rest.driver.settling is not None
+    rest.driver.guard = Guard(**vars(copy.deepcopy(driver.guard)))
+    rest.driver.settling.pace = Pace(**dataclasses.asdict(driver.settling.pace))
+    assert [state.step for state in rest] == steps[steps.index(middle) :]
+    assert (rest.outcome.status, rest.outcome.steps) == ("settled", whole.outcome.steps)  # type: ignore[union-attr]  # they ended
+
+
+@pytest.mark.parametrize("solver", ["stepping", "equilibrium"])
+def test_who_watches_a_run_can_stop_it(tensile: dict[str, Any], solver: str) -> None:
+    given = tensile | {"solver": SOLVERS[solver], "record": {"at": [0]}, "steps": 10**6}
+    told: list[str] = []
+    watch = Watch(lambda: len(told) > 2, lambda what, share: told.append(what))
+    sink, run = MemorySink(), Run(scene_of(given), watch=watch)
+    report = record(run, sink)
+    assert report.outcome.status == "interrupted"
+    assert told[0] == {"stepping": "step 0 of 1000000", "equilibrium": ROLES}[solver]
+    assert sink.dataset().time[-1] == report.outcome.steps < 10**6
+
+
+def test_python_is_warned_of_what_the_command_warns_of(call: Any, tensile: dict[str, Any]) -> None:
+    doubtful = tensile | {"leaders": [], "solver": {"type": "stepping", "relaxation": 1.5}}
+    Path("doubtful.json").write_text(json.dumps(doubtful))
+    lines = call("run", "doubtful.json").err.splitlines()
+    said = [line.removeprefix("warning: ") for line in lines]
+    with pytest.warns(pbdkit.PbdkitWarning) as told:
+        pbdkit.run(doubtful, progress=False)
+    assert [str(warning.message) for warning in told] == said
+    assert {warning.filename for warning in told} == {__file__}
+    assert any("nothing will move" in text for text in said)
+    assert any("can diverge" in text for text in said)
+
+
+def test_an_unbounded_relaxation_is_refused(tensile: dict[str, Any]) -> None:
+    with pytest.raises(pbdkit.ExperimentError, match=r"solver.relaxation: .*1e\+?06|1000000"):
+        pbdkit.Experiment(**tensile | {"solver": {"type": "stepping", "relaxation": 1e300}})
+
+
+@pytest.mark.parametrize("relaxation", [1e6, 1e-300])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_numbers_leave_all_bounds_in_silence(tensile: dict[str, Any], relaxation: float) -> None:
+    solver = {"type": "stepping", "relaxation": relaxation, "memory": 1e6}
+    with (
+        pytest.warns(pbdkit.PbdkitWarning, match="can diverge"),
+        pytest.raises(pbdkit.DivergedError),
+    ):
+        pbdkit.run(tensile | {"solver": solver, "steps": 200}, progress=False)
+
+
+def test_why_an_engine_was_taken_is_true_of_a_large_body(tensile: dict[str, Any]) -> None:
+    body = {"type": "grid", "columns": 300, "rows": 300}
+    run = Run(scene_of(tensile, body=body, steps=1))
+    assert run.choice.engine == "numpy"
+    assert "small" not in run.choice.reason
+    assert run.choice.reason.endswith("s in all: compiling would take longer")
+
+
+def test_rerun_warns_of_other_versions(tensile: dict[str, Any], install: Any) -> None:
+    source = (
+        "import pbdkit\nfrom typing import Literal\n"
+        "class Same(pbdkit.FollowerRule):\n"
+        "    type: Literal['same'] = 'same'\n"
+        "    @staticmethod\n"
+        "    def gather(d, r, w, p): return d, 1.0\n"
+        "    @staticmethod\n"
+        "    def apply(total, here, p): return total[0] / total[1]\n"
+        "@pbdkit.hookimpl\ndef pbdkit_components(): return [Same]\n"
+    )
+    install("pbdkit-same", source, "0.3")
+    ds = pbdkit.run(tensile | {"rule": {"type": "same"}}, progress=False)
+    again = pbdkit.rerun(ds, progress=False)
+    assert np.array_equal(again.position, ds.position)
+    made_by = json.loads(ds.attrs["plugins"])
+    ds.attrs["plugins"] = json.dumps(made_by | {"pbdkit-same": "9.9"})
+    with pytest.warns(pbdkit.PbdkitWarning, match=r"made by pbdkit-same 9\.9, run again by 0\.3"):
+        pbdkit.rerun(ds, progress=False)
+
+
+def test_rerun_warns_of_another_pbdkit(tensile: dict[str, Any]) -> None:
+    ds = pbdkit.run(tensile, progress=False)
+    ds.attrs["plugins"] = json.dumps({"pbdkit": "9.9"})
+    with pytest.warns(pbdkit.PbdkitWarning, match=r"made by pbdkit 9\.9, run again by 0\.1\.0"):
+        pbdkit.rerun(ds, progress=False)
+
+
+@pytest.mark.parametrize("name", ["experiment", "plugins"])
+@pytest.mark.parametrize("value", ["{", "[1]", 3])
+def test_a_damaged_attribute_is_said_to_be_one(
+    tensile: dict[str, Any], name: str, value: Any
+) -> None:
+    ds = pbdkit.run(tensile, progress=False)
+    ds.attrs[name] = value
+    with pytest.raises(pbdkit.ExperimentError, match=f"attribute '{name}' is damaged"):
+        pbdkit.rerun(ds, progress=False)
