@@ -18,8 +18,8 @@ MOST_BITS = 32
 NAMES = (
     "kind", "share", "broken", "lengths", "lost", "counts", "rests", "limits", "signs", "away",
     "bonds_away", "cells_away", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts",
-    "first", "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies", "mapped",
-    "box", "growth", "step",
+    "first", "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies",
+    "mapped", "box", "growth", "step",
 )  # fmt: skip
 """What kernels of all scenes know."""
 
