@@ -98,12 +98,11 @@ def test_what_is_refused_is_refused_in_one_line(call, arguments, code, words):
 def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile):
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
-    swarm = "neighbours={type: euclidean, radius: 1.1, reevaluate: true}"
-    never = Method("never", "float64", 1, ("solver.engine=compiled", swarm))
+    never = Method("never", "float64", 1, ("frame={type: natural}",))
     exact, other = Bench(str(file), (), 3).measure([never], None, lambda _: None)
     assert isinstance(exact, Measured)
     assert isinstance(other, NotMeasured)
-    assert "neighbours are found anew" in other.reason
+    assert "'natural' weighs the cells between neighbours" in other.reason
     assert as_dict(Bench("e", (), 3), [exact, other])["not_measured"][0]["reason"] == other.reason
 
 

@@ -161,11 +161,13 @@ COMPONENTS = {
 
 
 @pytest.mark.parametrize("parts", COMPONENTS.values(), ids=COMPONENTS)
-def test_compiled_equals_numpy(parts):
+def test_compiled_equals_numpy(parts, monkeypatch):
     if isinstance(parts.get("rule"), str):
         parts = {"rule": {"type": parts["rule"]}}
     scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
     assert_bitwise_equal(scene, CompiledStepper(scene))
+    monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
+    assert choose(scene).engine == "compiled"
 
 
 THREADED = {

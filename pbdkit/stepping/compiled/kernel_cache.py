@@ -147,6 +147,7 @@ def _module(source: str, names: dict[str, Any], folder: Path | None) -> ModuleTy
         "np": np,
         "int64": np.int64,
         "real": np.float32,
+        "double": np.float64,
         "length": compiled(length),
         "KEPT": folder is not None,
     }

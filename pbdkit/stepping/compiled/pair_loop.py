@@ -85,7 +85,7 @@ def _write_kernel(plan: Plan, level: Level) -> tuple[str, list[str]]:
         0, "for e in range(first_body, last_body):", "    row = body[e]", "    j = place[row]"
     )
     sweep.add(1, f"u = {plan.vector(f'u_{c}[j]' for c in plan.axes)}")
-    sweep.add(1, *(f"t{n} = 0.0" for n in sums))
+    sweep.add(1, *(f"t{n} = double(0.0)" for n in sums))
     sweep.add(1, "for n in range(begin[e], begin[e + 1]):", "    there = place[other[n]]")
     sweep.add(2, f"d = {plan.vector(f'u_{c}[there] - u.{c}' for c in plan.axes)}")
     sweep.add(2, f"r = {plan.vector(f'rests[{a}, n]' for a in range(len(plan.axes)))}")

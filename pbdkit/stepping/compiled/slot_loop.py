@@ -42,7 +42,11 @@ def _write_one_by_one(out: Function, plan: Plan, level: Level) -> None:
     sums = [f"t{n}" for n in range(sum(level.parts))]
     out.add(0, *(["changed = 0"] if plan.judged else []), "for j in range(width):")
     # -0.0 + x is x, whatever its sign.
-    out.add(1, *(f"{t} = {plan.number(-0.0)}" for t in sums), "near, at_j = 0, base + j")
+    out.add(
+        1,
+        *(f"{t} = {'real' if plan.single else 'double'}(-0.0)" for t in sums),
+        "near, at_j = 0, base + j",
+    )
     if plan.judged:
         out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
     out.add(1, *_displacements(plan, level), "for k in range(counts[s]):")
