@@ -19,8 +19,8 @@ from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.memory import MemorySink
 from pbdkit.results.progress import progress_bar
+from pbdkit.results.sinks import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
@@ -96,7 +96,7 @@ def identify(
 ) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
     elastic body, with its constants, from the rule's answer to plane waves."""
-    from pbdkit.identity.finding import identified
+    from pbdkit.identity.identity import identified
 
     return identified(build_scene(_experiment(experiment, components)))
 

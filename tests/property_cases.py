@@ -9,9 +9,9 @@ import pbdkit
 from pbdkit import Experiment
 from pbdkit.scene.raster import FOLLOWER, FRAME
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.stepping.stepper import Stepper
-from pbdkit.testing.scenes import LATTICES, NEIGHBOURS
+from pbdkit.testing.subject import LATTICES, NEIGHBOURS
 
 RULES: dict[str, dict[str, Any]] = {
     "barycentre": {"type": "barycentre"},

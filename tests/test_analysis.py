@@ -14,12 +14,12 @@ from scene_strategies import calibrated_experiments, experiments
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.symbol import wave_bound
+from pbdkit.analysis.plane_waves import wave_bound
 from pbdkit.cli import program
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 HELD = [{"select": {"edge": e}, "motion": {"type": "hold"}} for e in ("left", "right")]
 

@@ -21,7 +21,7 @@ ORDER = [
     "equilibrium",
     "runs",
     "api",
-    "benching",
+    "bench",
     "testing",
     "cli",
 ]

@@ -7,26 +7,23 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.benching.measuring import Bench
-from pbdkit.benching.method import REFERENCE, Measured, Method, NotMeasured, methods
-from pbdkit.benching.picture import FLOOR, work_precision
-from pbdkit.benching.report import as_dict, table
-from pbdkit.benching.resizing import resized
+from pbdkit.bench.measurement import Row, engines, measure
+from pbdkit.bench.size import resized
+from pbdkit.bench.work_precision import FLOOR, as_dict, picture, table
 from pbdkit.scene.scene import build_scene
 
-FOUR = [["numpy", "float64", 1], ["numpy", "float32", 1], ["compiled", "float64", 1]]
+FOUR = [("numpy", "float64", 1), ("numpy", "float32", 1), ("compiled", "float64", 1)]
 HOLD = {"type": "hold"}
 
 
 @pytest.fixture
 def few(monkeypatch):
     """Three methods, each of which takes a second or two."""
-    chosen = [m for m in methods() if [m.name, m.precision, m.threads] in FOUR]
-    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: chosen)
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: FOUR)
 
 
-def measured(method=REFERENCE, size=10, error=0.0):
-    return Measured(method, size, size**2, 5, 1.0, 0.1, 20.0, 3.0, error)
+def measured(method=FOUR[0], size=10, error=0.0):
+    return Row(size, *method, particles=size**2, ns_per_particle_step=20.0, error=error)
 
 
 def test_the_table_the_figures_and_the_picture(call, few):
@@ -35,12 +32,10 @@ def test_the_table_the_figures_and_the_picture(call, few):
     )
     assert result.code == 0, result.err
     found = json.loads(Path("b.json").read_text())
-    assert set(found) == {
-        "experiment", "settings", "steps", "machine", "measurements", "not_measured"
-    }  # fmt: skip
+    assert set(found) == {"experiment", "settings", "steps", "machine", "rows"}
     assert found["steps"] == 8
-    rows = found["measurements"]
-    assert [[r["method"], r["precision"], r["threads"]] for r in rows] == FOUR
+    rows = found["rows"]
+    assert [(r["method"], r["precision"], r["threads"]) for r in rows] == FOUR
     for row in rows:
         assert row["size"] == 6
         assert row["particles"] == 8 * 6
@@ -59,11 +54,11 @@ def test_the_table_the_figures_and_the_picture(call, few):
 
 
 def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
-    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: [REFERENCE])
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: FOUR[:1])
     result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
     assert result.code == 0, result.err
     assert "as it is" in result.out
-    (row,) = json.loads(Path("b").read_text())["measurements"]
+    (row,) = json.loads(Path("b").read_text())["rows"]
     assert row["size"] is None
     assert row["particles"] == 6 * 5
 
@@ -95,15 +90,18 @@ def test_what_is_refused_is_refused_in_one_line(call, arguments, code, words):
     assert "Traceback" not in result.err
 
 
-def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile):
+def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile, monkeypatch):
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
-    never = Method("never", "float64", 1, ("frame={type: natural}",))
-    exact, other = Bench(str(file), (), 3).measure([never], None, lambda _: None)
-    assert isinstance(exact, Measured)
-    assert isinstance(other, NotMeasured)
-    assert "'natural' weighs the cells between neighbours" in other.reason
-    assert as_dict(Bench("e", (), 3), [exact, other])["not_measured"][0]["reason"] == other.reason
+    never = ("abacus", "float64", 1)
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [FOUR[0], never])
+    exact, other = rows = list(measure(str(file), (), None, lambda _: None))
+    assert (exact.reason, exact.error) == ("", 0.0)
+    assert "engine" in other.reason
+    assert as_dict("e", (), 3, rows)["rows"][1]["reason"] == other.reason
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [never])
+    with pytest.raises(pbdkit.ExperimentError, match="engine"):
+        list(measure(str(file), (), None, lambda _: None))
 
 
 def sheet(**parts):
@@ -179,11 +177,11 @@ def test_a_grid_within_another_body_cannot_be_resized():
 
 
 def test_every_method_is_a_row_and_a_marker():
-    rows = [measured(m, s, e) for m, e in zip(methods(), (0.0, 1e-7) * 3, strict=False)
+    rows = [measured(m, s, e) for m, e in zip(engines(), (0.0, 1e-7) * 3, strict=False)
             for s in (10, 20)]  # fmt: skip
     assert table(rows).row_count == len(rows)
-    (ax,) = work_precision([*rows, measured(error=None)], "a title").axes
-    drawn = np.concatenate([points.get_offsets() for points in ax.collections])
+    panels = picture([*rows, measured(error=np.inf)], "a title").axes
+    drawn = np.concatenate([points.get_offsets() for ax in panels for points in ax.collections])
     assert len(drawn) == len(rows)
     assert drawn[:, 1].min() == FLOOR
-    assert "0" in [label.get_text() for label in ax.get_yticklabels()]
+    assert "0" in [label.get_text() for label in panels[0].get_yticklabels()]

@@ -21,7 +21,7 @@ from pbdkit.components.rules import (
     MixedCoordinate,
 )
 from pbdkit.components.springs import Springs
-from pbdkit.components.straining import StrainFracture
+from pbdkit.components.strain_fracture import StrainFracture
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
 from pbdkit.scene.cells import tiling_of

@@ -21,6 +21,7 @@ test_built_in_components_conform = conformance(*pbdkit_components())
 
 SOUND = [
     rules.Sound(),
+    others.Rows(),
     others.Following(),
     others.Strain(),
     others.Extent(),
@@ -39,6 +40,7 @@ FAULTS = [
     (rules.Remembers, "remembers-nothing", "keeps `SEEN` from call to call"),
     (rules.Counts, "remembers-nothing", "keeps `Counts.calls` from call to call"),
     (rules.Throws, "answers-the-same", "otherwise the second time"),
+    (rules.Seeds, "answers-the-same", "seeds or uses the generator of random numbers that all"),
     (rules.Drifts, "rests", "a body at rest moves by 1e-09 in step 1 on the square lattice"),
     (rules.DriftsByRounding, "rests", "a body at rest moves by"),
     (rules.Divides, "is-finite", "where all neighbours meet in the particle"),
@@ -61,6 +63,9 @@ FAULTS = [
     (rules.Chooses, "takes-part", "name the parts that go with it"),
     (others.Twins, "has-a-sound-cell", "(0, 0) and (0, 1) lie at one place, (0.0, 0.0)"),
     (others.Flat, "has-a-sound-cell", "span no area"),
+    (others.Astray, "has-a-sound-cell", "basis site 1 lies a cell or more from where its index"),
+    (others.Miscounts, "has-a-sound-cell", "`primitive` counts the step"),
+    (others.Skips, "has-a-sound-cell", "`primitive` counts steps that no site takes"),
     (others.Rooted, "keeps-its-cell-wherever-it-lies", "leave `self.origin` out of `cell`"),
     (others.OneSided, "is-mutual", "'one-sided' is not mutual"),
     (others.Approximate, "takes-offsets-of-the-cell", "is none of the cell's"),
@@ -91,6 +96,7 @@ FAULTS = [
     (remembering.DrawsNothingFinite, "draws-what-it-remembers", "'strength' that is not finite"),
     (remembering.Overflows, "draws-what-it-remembers", "which i1 does not hold"),
     (remembering.DrawsElsewhere, "answers-the-same", "`draw` answers the same question otherwise"),
+    (remembering.DrawsByRow, "takes-particles-in-any-order", "`draw` gives 'strength' by the row"),
     (remembering.DrawsAgain, "answers-the-same", "at random that nobody gave it"),
     (remembering.DrawsOnItsOwn, "continues-where-it-stopped", "a run made anew gives another"),
     (remembering.WritesBonds, "changes-no-input", "`draw` writes into `shell`"),
@@ -194,6 +200,29 @@ def test_a_class_without_usable_examples_is_told(field, words):
     (report,) = examine_all([needy])
     assert not report.holds
     assert words in report.failed[0].reason
+
+
+class Unfinished(pbdkit.FollowerRule):
+    """Lacks `apply`."""
+
+    type: Literal["unfinished"] = "unfinished"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return (1.0,)
+
+
+def test_a_class_that_lacks_a_method_is_told():
+    for report in (examine(Unfinished), *examine_all([Unfinished])):
+        assert [outcome.property for outcome in report.failed] == ["has-examples"]
+        assert "Unfinished cannot be made: " in report.failed[0].reason
+        assert "apply" in report.failed[0].reason
+    with pytest.raises(pbdkit.PluginError, match="Unfinished cannot be made"):
+        conformance(Unfinished)
+
+
+def test_a_class_stands_for_its_first_example():
+    assert examine(rules.Sound) == examine(rules.Sound())
 
 
 def test_what_goes_with_its_own_lattice_alone_is_tried_on_that():

@@ -11,8 +11,8 @@ from scene_strategies import experiments
 import pbdkit
 from pbdkit.cli import program
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 STRAIGHT = {"type": "equilibrium"}
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.benching import equilibria
-from pbdkit.benching.equilibria import EquilibriumBench, Solved, Unsolved
-from pbdkit.benching.equilibria_picture import equilibria_picture
-from pbdkit.benching.equilibria_report import equilibria_reasons, equilibria_table, gains
-from pbdkit.benching.exact import Decay, decay_of, exact_answer
+from pbdkit.bench import measurement
+from pbdkit.bench.decay import Decay, decay_of, followers_of
+from pbdkit.bench.measurement import Row, measure
+from pbdkit.bench.work_precision import gains, lines, picture, table
+from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -45,31 +45,17 @@ def scene_of(leaders, **parts):
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer processes and tolerances."""
-    monkeypatch.setattr(equilibria, "METHODS", ("lu", "conjugate-gradients"))
-    monkeypatch.setattr(equilibria, "processors", lambda: 1)
-    monkeypatch.setattr(EquilibriumBench, "__init__", _with_few_tolerances)
-
-
-def _with_few_tolerances(self, experiment, settings, steps):
-    for name, value in (("experiment", experiment), ("settings", settings), ("steps", steps),
-                        ("tolerances", TOLERANCES)):  # fmt: skip
-        object.__setattr__(self, name, value)
-
-
-def test_the_exact_answer_is_affine_where_nobody_moves_there():
-    scene = scene_of(AFFINE)
-    exact = exact_answer(scene)
-    assert exact.how == "affine"
-    np.testing.assert_allclose(np.unique(exact.u[0].round(12)), np.arange(1, 8) / 8, atol=1e-12)
-    assert abs(exact.u[1]).max() < 1e-15
-    assert exact_answer(scene_of(BENT)).how == "lu"
-    assert exact_answer(scene_of(BENT)).within < 1e-13
+    monkeypatch.setattr(measurement, "METHODS", ("lu", "conjugate-gradients"))
+    monkeypatch.setattr(measurement, "processors", lambda: 1)
+    monkeypatch.setattr(measurement, "TOLERANCES", TOLERANCES)
 
 
 def test_the_slowest_mode_decays_as_the_closed_form_says():
     """λ = (1 + cos(π/N))/2, and u = x/N has the share (2/π) (π/2N)/tan(π/2N) of its sine."""
-    scene = scene_of([HOLD, pulled(edge="right")], columns=21)
-    decay = decay_of(scene, exact_answer(scene))
+    solver = {"type": "equilibrium", "tolerance": 1e-11}
+    scene = scene_of([HOLD, pulled(edge="right")], columns=21, solver=solver)
+    state, _ = equilibrium_state(scene)
+    decay = decay_of(scene, state.u.reshape(2, -1)[:, followers_of(scene)])
     assert decay.rate == pytest.approx((1 + np.cos(np.pi / 20)) / 2, rel=1e-8)
     share = 1 / (20 * np.tan(np.pi / 40))
     assert decay.share == pytest.approx(share, rel=1e-3)
@@ -88,10 +74,9 @@ def test_the_table_the_figures_and_the_picture(call, quick, leaders):
     result = call("bench", "s.json", "--json", "b.json", "--plot", "b.png")
     assert result.code == 0, result.err
     found = json.loads(Path("b.json").read_text())
-    assert set(found) == {
-        "experiment", "settings", "steps", "machine", "exact", "measurements", "not_measured"
-    }  # fmt: skip
-    rows = found["measurements"]
+    assert set(found) == {"experiment", "settings", "steps", "machine", "rows"}
+    exact, *rows = found["rows"]
+    assert (exact["method"], exact["certified"] < 1e-12) == ("exact, by lu", True)
     assert [(r["method"], r["tolerance"]) for r in rows] == [
         ("lu", 1e-6),
         *((m, t) for m in ("conjugate-gradients", "stepping") for t in TOLERANCES),
@@ -100,13 +85,11 @@ def test_the_table_the_figures_and_the_picture(call, quick, leaders):
         assert row["seconds"] > 0
         assert not row["is_predicted"]
         if row["method"] != "stepping":
-            within = found["exact"][0]["within"]
-            assert row["error"] <= row["certified"] + within
+            assert row["error"] <= row["certified"] + 2 * exact["certified"]
             assert row["certified"] <= row["tolerance"]
         else:
             # The steps that the slowest mode needs leave what they are to leave.
             assert row["error"] == pytest.approx(row["tolerance"], rel=0.25)
-    assert found["exact"][0]["how"] == ("affine" if leaders is AFFINE else "lu")
     assert "as it is, to 1e-06: " in result.out
     assert Path("b.png").read_bytes().startswith(b"\x89PNG")
     for row in rows:
@@ -115,36 +98,36 @@ def test_the_table_the_figures_and_the_picture(call, quick, leaders):
 
 
 def test_steps_that_take_too_long_are_counted_ahead(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr(equilibria, "METHODS", ("lu",))
-    monkeypatch.setattr(equilibria, "LARGEST_DIRECT", 10)
-    monkeypatch.setattr(equilibria, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(measurement, "METHODS", ("lu",))
+    monkeypatch.setattr(measurement, "LARGEST_DIRECT", 10)
+    monkeypatch.setattr(measurement, "PATIENCE_S", 0.0)
     file = tmp_path / "s.json"
     file.write_text(json.dumps(sheet(AFFINE)))
-    truth, rows = EquilibriumBench(str(file), (), 1).measure(12, lambda _: None)
-    none, *steps = rows
-    assert isinstance(none, Unsolved)
+    _, none, *steps = measure(str(file), (), 12, lambda _: None)
     assert "left out above 10 particles" in none.reason
     assert [row.is_predicted for row in steps] == [True, True]
     loose, tight = steps
     assert (loose.error, tight.error) == TOLERANCES
     assert loose.cpu_s > 0
-    assert loose.seconds / loose.iterations == pytest.approx(tight.seconds / tight.iterations)
-    # Four decades more, each ln 10 / -ln ρ steps.
-    more = 4 * np.log(10) / -np.log(truth.rate)
-    assert tight.iterations - loose.iterations == pytest.approx(more, abs=1)
+    assert loose.seconds / loose.steps == pytest.approx(tight.seconds / tight.steps)
+    # Four decades more, each ln 10 / -ln ρ steps, with 11 bonds between the leaders.
+    more = 4 * np.log(10) / -np.log((1 + np.cos(np.pi / 11)) / 2)
+    assert tight.steps - loose.steps == pytest.approx(more, abs=1)
 
 
-def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer(tmp_path, monkeypatch):
-    monkeypatch.setattr(equilibria, "METHODS", ("conjugate-gradients",))
-    rows = {"rows": [{"iterations": 9, "seconds": 99.0, "cpu_s": 99.0, "certified": 1e-3,
-                      "error": 1e-4}], "peak_memory_mib": 1.0}  # fmt: skip
-    monkeypatch.setattr(EquilibriumBench, "_work", lambda *a, **k: rows)
-    truth = equilibria.Truth(None, 54, "affine", 0.0, 0.9)
-    found = list(EquilibriumBench("s", (), 1)._settled("conjugate-gradients", truth, (), tmp_path))
-    assert [type(row) for row in found] == [Solved] + 4 * [Unsolved]
-    assert equilibria_reasons(found)[0] == (
-        "conjugate-gradients at size as it is, 1e-04: 99 s for the tolerance before"
-    )
+def test_a_method_that_took_too_long_is_left_out_where_it_would_take_longer():
+    row = {"steps": 9, "seconds": 99.0, "cpu_s": 99.0, "certified": 1e-3, "distance": 1e-4}
+
+    def work(*asked, **job):
+        return {"rows": [row], "peak_memory_mib": 1.0}
+
+    base, exact = Row(None, "conjugate-gradients"), {"scale": 1.0, "within": 0.0}
+    tolerances = list(measurement.TOLERANCES)
+    found = list(measurement._settled(work, base, tolerances, exact))
+    assert [bool(row.reason) for row in found] == [False] + 4 * [True]
+    assert (
+        "left out: conjugate-gradients at size as it is, 1e-04: 99 s for the tolerance before"
+    ) in lines(found)
 
 
 def test_bonds_that_can_break_are_refused(call):
@@ -157,7 +140,8 @@ def test_bonds_that_can_break_are_refused(call):
 
 
 def row(method, tolerance, seconds, certified, error, **more):
-    return Solved(method, 9, 54, tolerance, 7, 9.0, seconds, certified, error, None, **more)
+    made = {"particles": 54, "steps": 7, "seconds": 9.0, "cpu_s": seconds}
+    return Row(9, method, tolerance=tolerance, certified=certified, error=error, **made, **more)
 
 
 ROWS = [
@@ -166,24 +150,25 @@ ROWS = [
     row("multigrid", 1e-8, 0.2, 2e-8, 1e-12),
     row("stepping", 1e-4, 50.0, None, 1e-4),
     row("stepping", 1e-8, 1000.0, None, 1e-8, is_predicted=True),
-    Unsolved("conjugate-gradients", 9, None, "it cannot"),
+    Row(9, "conjugate-gradients", reason="it cannot"),
 ]
 
 
 def test_the_gain_is_over_the_fastest_that_reaches_the_same():
     assert gains(ROWS) == [
-        "size 9, to 1e-08: 7 steps would take 1e+03 s of processor time, lu 0.5 s, 2e+03 times less"
+        "size 9, to 1e-08: 7 steps would take 1e+03 s of processor time, lu 0.5 s"
     ]
     assert gains([r for r in ROWS if r.method != "lu"]) == [
-        "size 9, to 1e-04: 7 steps take 50 s of processor time, multigrid 0.1 s, 500 times less"
+        "size 9, to 1e-04: 7 steps take 50 s of processor time, multigrid 0.1 s"
     ]
 
 
 def test_every_row_is_in_the_table_and_every_measurement_in_the_picture():
-    assert equilibria_table(ROWS).row_count == len(ROWS)
-    measured = [r for r in ROWS if isinstance(r, Solved)]
-    (ax,) = (a for a in equilibria_picture(measured, "a title").axes if a.get_visible())
-    drawn = np.concatenate([points.get_offsets() for points in ax.collections])
+    assert table(ROWS).row_count == len(ROWS)
+    measured = [r for r in ROWS if not r.reason]
+    (ax,) = (a for a in picture(ROWS, "a title").axes if a.get_visible())
+    points = [one for one in ax.collections if len(one.get_offsets())]
+    drawn = np.concatenate([one.get_offsets() for one in points])
     assert sorted(map(tuple, drawn)) == sorted((r.cpu_s, r.error) for r in measured)
-    hollow = [points for points in ax.collections if (points.get_facecolor() == 1.0).all()]
+    hollow = [face for one in points for face in one.get_facecolor() if (face == 1.0).all()]
     assert len(hollow) == 1

@@ -7,8 +7,8 @@ from property_cases import pull_right
 import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 RATE = 0.03125  # exact in binary, so that strains are

@@ -23,7 +23,7 @@ from identity_cases import (
 from property_cases import LATTICES, NEIGHBOURS, advanced, body_sites
 
 import pbdkit
-from pbdkit.analysis.region import modes
+from pbdkit.analysis.spectrum import modes
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.experiment.source import Source
 from pbdkit.identity.waves import operator, slow_waves

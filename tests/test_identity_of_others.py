@@ -20,7 +20,7 @@ from identity_cases import (
 from remembering_parts import Tiring
 
 import pbdkit
-from pbdkit.identity.picture import by_direction
+from pbdkit.identity.polar import by_direction
 
 HONEYCOMB = {"type": "honeycomb"}
 
@@ -210,7 +210,7 @@ def test_the_picture(call, monkeypatch):
         "pbdkit: e.txt: a picture ends in .png, .svg, .pdf\n"
     )
     assert call("identify", "e.json", "--picture", "no/e.png").code == 6
-    monkeypatch.setattr("pbdkit.cli.pictures.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.cli.output.find_spec", lambda name: None)
     assert call("identify", "e.json", "--picture", "e.png").err == (
         "pbdkit: a picture needs matplotlib: pip install 'pbdkit[plot]'\n"
     )

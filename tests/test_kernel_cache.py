@@ -14,8 +14,8 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.compiled import kernel_cache
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 SHEET = {
     "name": "sheet",

@@ -18,8 +18,8 @@ from property_cases import (
 
 import pbdkit
 from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 
 def pulled(columns, rows, x, y=0.0, steps=10, **parts):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import linear
+from pbdkit.equilibrium import linear_solver as linear
 from pbdkit.equilibrium.krylov import conjugate_gradients
-from pbdkit.equilibrium.linear import linear_solver
+from pbdkit.equilibrium.linear_solver import linear_solver
 from pbdkit.equilibrium.watch import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
@@ -70,7 +70,7 @@ def test_every_method_solves_both_ways(method, upwind):
 
 def test_a_cycle_of_the_grids_is_symmetric_and_contracts():
     pytest.importorskip("pyamg")
-    from pbdkit.equilibrium.grids import classical
+    from pbdkit.equilibrium.multigrid import classical
 
     matrix = averaging(60, 50)
     cycle, (a, b) = classical(matrix), np.random.default_rng(2).normal(size=(2, 3000))

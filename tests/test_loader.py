@@ -13,7 +13,6 @@ import pytest
 from plugin_sources import BROKEN, NEWER, listed, rule
 
 import pbdkit
-from pbdkit.benching.method import REFERENCE
 from pbdkit.cli import COMMANDS
 from pbdkit.registry.registry import Registry
 
@@ -55,7 +54,8 @@ def test_every_command_is_tried() -> None:
 def test_all_broken_plugins_together_stop_no_command(
     install: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pbdkit.benching.method.methods", lambda: [REFERENCE])  # one is enough
+    one = ("numpy", "float64", 1)
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [one])  # is enough
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
         install(f"pbdkit-broken-{n}", source, f"0.{n}")
@@ -122,8 +122,9 @@ def test_another_api_version_is_incompatible(install: Install, call: Call) -> No
     assert (row["version"], row["state"]) == ("9.0", "incompatible")
     assert row["reason"].startswith(f"{expected}{pbdkit.__version__} has version 1; install")
     result = call("run", "e.json", "--set=rule={type: newer}")
-    assert result.code == 3
-    assert "'newer' comes from pbdkit-newer 9.0, which is incompatible: it is written" in result.err
+    assert result.code == 2
+    assert "unknown type 'newer'" in result.err
+    assert "; pbdkit-newer 9.0 is incompatible: it is written" in result.err
 
 
 def test_this_api_version_is_fine(install: Install) -> None:
@@ -152,34 +153,33 @@ def test_an_api_version_is_a_number(install: Install) -> None:
     )
 
 
-NEEDED = {
-    "named with its distribution": ("pbdkit-broken:lost", "'lost' is asked of pbdkit-broken 0.3"),
-    "found in its source": ("lost", "'lost' comes from pbdkit-broken 0.3"),
-}
-
-
-@pytest.mark.parametrize(("name", "whose"), NEEDED.values(), ids=NEEDED)
-def test_a_run_that_needs_the_broken_part_says_whose_it_is(
-    install: Install, call: Call, name: str, whose: str
-) -> None:
+def test_a_run_that_needs_the_broken_part_says_whose_it_is(install: Install, call: Call) -> None:
     install("pbdkit-broken", "import no_such_module\n" + rule("lost"), "0.3")
-    result = call("run", "e.json", f"--set=rule={{type: '{name}'}}")
+    reason = "ModuleNotFoundError: No module named 'no_such_module' (pbdkit_broken.py, line 1)"
+    result = call("run", "e.json", "--set=rule={type: 'pbdkit-broken:lost'}")
     assert (result.code, Path("tensile.nc").exists()) == (3, False)
-    reason = "which is broken: ModuleNotFoundError: No module named 'no_such_module'"
-    assert f": rule.type: {whose}, {reason} (pbdkit_broken.py, line 1)\n" in result.err
+    whose = "'lost' is asked of pbdkit-broken 0.3, which is broken"
+    assert f": rule.type: {whose}: {reason}\n" in result.err
+    result = call("run", "e.json", "--set=rule={type: lost}")
+    assert (result.code, Path("tensile.nc").exists()) == (2, False)
+    assert "unknown type 'lost'; " in result.err
+    assert f"; pbdkit-broken 0.3 is broken: {reason}" in result.err
 
 
-def test_the_source_of_a_package_is_searched_too(install: Install, tmp_path: Path) -> None:
-    install("pbdkit-pack", "")
-    package = tmp_path / "site" / "pbdkit_pack"
-    (package / "deep").mkdir(parents=True)
-    (package / "__init__.py").write_text("raise ImportError")
-    (package / "deep" / "rules.py").write_text(rule("lost"))
-    (tmp_path / "site" / "pbdkit_pack.py").unlink()
-    with pytest.raises(pbdkit.PluginError, match=r"'lost' comes from pbdkit-pack 1\.0"):
-        Registry().find(pbdkit.FollowerRule, "lost")
-    with pytest.raises(pbdkit.ExperimentError, match="unknown type 'last'"):
-        Registry().find(pbdkit.FollowerRule, "last")
+def test_a_plugin_that_changes_the_folder_changes_it_for_itself(
+    install: Install, call: Call, tmp_path: Path
+) -> None:
+    install("pbdkit-moving", f"import os\nos.chdir({str(tmp_path)!r})\n" + rule("moving"))
+    assert call("run", "e.json", "--set=rule={type: moving}", "-o", "here.nc").code == 0
+    assert Path("here.nc").exists()
+
+
+def test_a_name_is_echoed_in_one_short_line(install: Install, call: Call) -> None:
+    for name in ("\x1b[31mred", "y" * 100_000, "pbdkit-\x1b:red"):
+        result = call("run", "e.json", "--set", f"rule.type={json.dumps(name)}")
+        assert result.code in (2, 3)
+        assert "\x1b" not in result.err.split("rule.type: ")[1]
+        assert len(result.err.split("rule.type: ")[1]) < 2000
 
 
 HALF = rule(

@@ -7,8 +7,8 @@ import pytest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 FRAMES = [
     "{type: mean}",
@@ -17,7 +17,7 @@ FRAMES = [
     "{type: none}",
     "{type: mean, layers: 3}",
 ]
-SMALL = ("body.columns=5", "body.rows=4", "leaders.1.motion.velocity=[0.02, 0.0]")
+SMALL = ("diagnostics=[]", "body.columns=5", "body.rows=4", "leaders.1.motion.velocity=[0.02, 0.0]")
 NESTED = "applies a rule to the moves of another"
 
 

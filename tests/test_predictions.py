@@ -23,9 +23,9 @@ from scene_strategies import lattices, neighbours
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import prediction
-from pbdkit.analysis.symbol import wave_bound
+from pbdkit.analysis.plane_waves import wave_bound
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 MILLION, LONGEST, FIVE_PERCENT = math.log(1e6), 400, 2.0
 BURN_IN = 300

@@ -10,9 +10,9 @@ from remembering_parts import Tiring, Weakest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.remembering import generator_for
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.remembered_values import generator_for
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 PARTS = [Weakest, Tiring]
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.pace import Pace
+from pbdkit.equilibrium.settlement import Pace
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Equilibrium, Solver
-from pbdkit.results.memory import MemorySink
+from pbdkit.results.sinks import MemorySink
 from pbdkit.runs.course import DRIVERS, Run, record
-from pbdkit.runs.stepwise import Stepwise
+from pbdkit.runs.drivers import Stepwise
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State
@@ -208,5 +208,5 @@ def test_a_damaged_attribute_is_said_to_be_one(
 ) -> None:
     ds = pbdkit.run(tensile, progress=False)
     ds.attrs[name] = value
-    with pytest.raises(pbdkit.ExperimentError, match=f"attribute '{name}' is damaged"):
+    with pytest.raises(pbdkit.StorageError, match=f"attribute '{name}' is damaged"):
         pbdkit.rerun(ds, progress=False)

@@ -17,8 +17,8 @@ from scene_strategies import experiments
 import pbdkit
 from pbdkit.cli import program
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 run = partial(pbdkit.run, progress=False)
 PULLED = [HOLD_LEFT, pull_right(0.1, 0.05)]

@@ -13,13 +13,12 @@ from property_cases import body_of
 
 import pbdkit
 from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.region import modes, slowest_swing
-from pbdkit.analysis.spectrum import spectrum
+from pbdkit.analysis.spectrum import modes, slowest_swing, spectrum
 from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
-from pbdkit.stepping.stepper import Stepper
 
 TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
 STEPPED = "solver={type: stepping, relaxation: 0.2}"

@@ -10,11 +10,11 @@ from finite_elements.problems import HEXAGONAL_BAR
 from scipy import sparse
 
 import pbdkit
-from pbdkit.analysis import linearising
-from pbdkit.analysis.derivatives import derivative, derivatives
+from pbdkit.analysis import linear_response
 from pbdkit.analysis.operator import step_operator
-from pbdkit.equilibrium import linear
-from pbdkit.equilibrium.dissection import FEWEST, dissected
+from pbdkit.analysis.stencil import derivative, derivatives
+from pbdkit.equilibrium import linear_solver as linear
+from pbdkit.equilibrium.linear_solver import FEWEST, dissected
 from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
@@ -121,7 +121,7 @@ def test_operators_do_not_depend_on_how_many_directions_go_together(rule, monkey
     scene = build_scene(pbdkit.Experiment(**given))
     found = []
     for values in (1, 150, 10**6):
-        monkeypatch.setattr(linearising, "VALUES_AT_ONCE", values)
+        monkeypatch.setattr(linear_response, "VALUES_AT_ONCE", values)
         found.append(step_operator(scene, initial_state(scene)))
     for other in found[1:]:
         assert np.array_equal(found[0].entries_now.values, other.entries_now.values)

@@ -52,14 +52,14 @@ import json, sys
 from pathlib import Path
 from pbdkit.api import load
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.running import run_into
+from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.scene.sizes import sizes_of
 
 def run(side):
     size = [f"body.columns={side}", f"body.rows={side}"]
     scene = build_scene(load("paper/a", settings=[*sys.argv[3:], *size]))
-    run_into(NetcdfSink(Path(sys.argv[1]), replace=True), scene, progress=False)
+    record(Run(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
     status = Path("/proc/self/status").read_text()
     return scene, 1024 * int(status.split("VmHWM:")[1].split()[0])
 

@@ -9,7 +9,7 @@ import pbdkit
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.results.netcdf import NetcdfSink
 from pbdkit.results.recorder import Sink
-from pbdkit.results.second_thread import LARGE_BYTES, MOST_WAITING, OverlappingSink
+from pbdkit.results.sinks import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

@@ -10,19 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.expense import excess
-from pbdkit.analysis.lagging import Lag, lag_of
-from pbdkit.analysis.matrices import Entries, connected
+from pbdkit.analysis.couplings import Entries, connected
+from pbdkit.analysis.lag import Lag, lag_of
 from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.analysis.region import (
+from pbdkit.analysis.spectrum import (
     NEUTRAL,
+    Spectrum,
     Swing,
+    excess,
+    just_below,
     largest_stable_relaxation,
     modes,
     slowest_swing,
+    spectrum,
+    spectrum_of,
     swings_below,
 )
-from pbdkit.analysis.spectrum import Spectrum, just_below, spectrum, spectrum_of
 from pbdkit.interfaces import Anchors
 from pbdkit.scene.scene import Scene
 

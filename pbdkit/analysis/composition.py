@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import Couplings, frame_matrices
-from pbdkit.analysis.linearising import has_neighbours, respond
+from pbdkit.analysis.linear_response import has_neighbours, respond
 from pbdkit.analysis.stencil import NOWHERE, Stencil, stencil_of
 from pbdkit.interfaces import Here, Slot
 from pbdkit.interfaces.frame import Indices

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from pbdkit.analysis.analysis import NO_REMEDY, Analysis
-from pbdkit.analysis.region import NEUTRAL
-from pbdkit.analysis.symbol import bounds_the_body, wave_bound
+from pbdkit.analysis.plane_waves import bounds_the_body, wave_bound
+from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
-from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, machine_memory, sizes_of

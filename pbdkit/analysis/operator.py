@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.composition import moves_and_couplings
-from pbdkit.analysis.couplings import Couplings, frame_matrices, some_of
-from pbdkit.analysis.linearising import Response, has_neighbours, respond
-from pbdkit.analysis.matrices import Entries
+from pbdkit.analysis.couplings import Couplings, Entries, frame_matrices, some_of
+from pbdkit.analysis.linear_response import Response, has_neighbours, respond
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state

@@ -1,9 +1,4 @@
-"""The eigenvalues of a step operator that decide whether and how fast a run settles.
-
-The operator is taken apart into the strongly connected groups of its unknowns: its eigenvalues are
-those of the groups. That finds x and y uncoupled, and keeps rules that couple them one way only
-(mixed coordinates) from looking defective.
-"""
+"""Whether a scene is small enough for its step operator to be looked at in about a second."""
 
 from __future__ import annotations
 
@@ -12,9 +7,77 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pbdkit.analysis.matrices import DENSE, connected
-from pbdkit.analysis.region import Complex
+from pbdkit.analysis.couplings import DENSE, connected
+from pbdkit.scene.scene import Scene
+
+MOST_PARTICLES, MOST_ENDS, MOST_ANSWERS, MANY = 50_000, 800_000, 2e8, 42
+"""The most particles, ends of bonds, and answers of a rule: where somebody has more than MANY
+neighbours each particle is asked what each neighbour does to each."""
+
+
+def excess(scene: Scene) -> str:
+    """What the scene has too much of, in words; empty where it is small enough."""
+    particles, neighbourhood = scene.raster.count, scene.neighbourhood
+    if particles > MOST_PARTICLES:
+        return f"{particles} particles, {MOST_PARTICLES} at most"
+    each = 2 * len(neighbourhood.planes) // len(neighbourhood.slots)
+    most = min(MOST_ENDS // each, int(MOST_ANSWERS / each**2) if each > MANY else particles)
+    if particles > most:
+        return f"{particles} particles with {each} neighbours each, {most} at most"
+    return ""
+
+
+Complex = NDArray[np.complexfloating[Any, Any]]
+NEUTRAL = 1e-9
+"""Eigenvalues this near to 1 in modulus count as 1."""
+STRAIGHT = 1e-6
+"""Imaginary parts below this are rounding: a mode that turns by less a step does not swing."""
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A mode that swings: its period in steps, 2π / |arg μ|, and by what it shrinks a step, |μ|."""
+
+    period: float
+    decay: float
+
+
+def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
+    """(2n,): both roots μ for each of n eigenvalues λ of the rule's own step; the λ themselves,
+    relaxed, and zeros without memory."""
+    half = (1.0 + memory - relaxation * (1.0 - eigenvalues)) / 2.0
+    root = np.sqrt(half * half - memory + 0j)
+    return np.concatenate([half + root, half - root])
+
+
+def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | None:
+    """The w below which all modes λ shrink with this memory, those with λ = 1 apart.
+
+    None where there is no such w > 0 (an eigenvalue above 1, |memory| ≥ 1) or no bound to it.
+    """
+    z = 1.0 - eigenvalues[np.abs(1.0 - eigenvalues) > NEUTRAL]
+    if not len(z) or z.real.min() < NEUTRAL or abs(memory) >= 1.0:
+        return None
+    stretched = z.imag * ((1.0 + memory) / (1.0 - memory))
+    return float((2.0 * (1.0 + memory) * z.real / (z.real**2 + stretched**2)).min())
+
+
+def slowest_swing(found: Complex) -> Swing | None:
+    """The swing of the longest period among modes μ of a step; None where all have real μ."""
+    swinging = found[np.abs(found.imag) > STRAIGHT]
+    if not len(swinging):
+        return None
+    slowest = swinging[np.argmin(np.abs(np.angle(swinging)))]
+    return Swing(float(2.0 * np.pi / np.abs(np.angle(slowest))), float(np.abs(slowest)))
+
+
+def swings_below(relaxation: float, memory: float) -> float:
+    """Real λ swing from here down, 1 - (1 - √b)² / w for 0 < b, as long as they are above
+    1 - (1 + √b)² / w."""
+    return 1.0 - float((1.0 - np.sqrt(memory)) ** 2) / relaxation
+
 
 BEYOND = 1e-7
 """How far outside the spectrum the shift of the inverse iteration lies."""

@@ -22,7 +22,7 @@ COMMANDS = {
     "explain": "explain",
     "bench": "bench",
     "plugins": "plugins",
-    "schema": "schema",
+    "schema": "experiments",
 }
 """Every command with the module of pbdkit.cli in which it stands."""
 COMPLETING = "_PBDKIT_COMPLETE"
@@ -41,7 +41,7 @@ class Commands(click.Group):
         if name not in COMMANDS:
             if ctx.resilient_parsing:  # a shell asks how to go on
                 return None
-            from pbdkit.interfaces.naming import did_you_mean
+            from pbdkit.interfaces.component import did_you_mean
 
             ctx.fail(f"there is no command '{name}'{did_you_mean(name, COMMANDS)}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)

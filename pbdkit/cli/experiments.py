@@ -1,10 +1,16 @@
-"""``pbdkit experiments`` and ``pbdkit init``: the shipped experiments."""
+"""``pbdkit experiments``, ``init`` and ``schema``: what there is to start from, for a shell too."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    import click
+    from click.shell_completion import CompletionItem
 
 
 @click.command()
@@ -34,3 +40,39 @@ def init(file: Path) -> None:
     except OSError as error:
         raise StorageError(f"{file}: cannot be written: {error.strerror}") from None
     click.echo(f"{file} written; next: pbdkit check {file}, then pbdkit run {file}")
+
+
+@click.command()
+@click.argument("what", type=click.Choice(["experiment", "dataset"]), default="experiment")
+@click.option("--builtin", is_flag=True, help="Leave third-party components out.")
+def schema(what: str, builtin: bool) -> None:
+    """Print the JSON Schema of experiments or datasets, closed over what is installed."""
+    from pbdkit.experiment.schema import experiment_schema
+    from pbdkit.registry.registry import Registry
+    from pbdkit.results.dataset_schema import dataset_schema
+
+    make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
+    click.echo(json.dumps(make(Registry(), installed=not builtin), indent=2))
+
+
+SUFFIXES = (".yaml", ".yml", ".json")
+
+
+def complete_experiments(
+    context: click.Context, parameter: click.Parameter, begun: str
+) -> list[CompletionItem]:
+    """The shipped experiments and the experiment files here that begin so; where no shipped one
+    does, whatever the shell itself offers as files."""
+    from click.shell_completion import CompletionItem
+
+    from pbdkit.experiment.shipped import shipped_names
+
+    names = [name for name in shipped_names() if name.startswith(begun)]
+    if not names:
+        return [CompletionItem(begun, type="file")]
+    return [CompletionItem(name) for name in [*names, *_experiment_files(begun)]]
+
+
+def _experiment_files(begun: str) -> list[str]:
+    files = [path for path in Path().glob("*") if path.suffix in SUFFIXES]
+    return sorted(path.name for path in files if path.name.startswith(begun))

@@ -13,7 +13,7 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.results.explaining import Explained, Standing
+    from pbdkit.results.explanation import Explained, Standing
 
 SHOWN = 20
 """So many broken bonds are listed in words; --json has all."""
@@ -28,7 +28,7 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     is, or was, from breaking, and what happened around it."""
     from pbdkit.api import experiment_of
     from pbdkit.results.accessor import reading
-    from pbdkit.results.explaining import Explained
+    from pbdkit.results.explanation import Explained
     from pbdkit.scene.scene import build_scene
 
     with reading(file) as dataset:

@@ -23,7 +23,7 @@ def identify(
 ) -> None:
     """Say what the experiment's rule is physically, on its lattice and neighbours."""
     from pbdkit.api import identify, load
-    from pbdkit.cli.pictures import refuse_unwritable, save
+    from pbdkit.cli.output import refuse_unwritable, save
 
     refuse_unwritable(picture)
     found = identify(load(experiment, settings=settings))
@@ -32,7 +32,7 @@ def identify(
     else:
         from rich.console import Console
 
-        from pbdkit.identity.report import table
+        from pbdkit.identity.verdict import table
 
         console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH, highlight=False)
         click.echo(f"{found.name}: {found.rule}, {found.lattice} lattice, {found.neighbours}")
@@ -40,6 +40,6 @@ def identify(
         for note in found.notes:
             click.echo(f"note: {note}")
     if picture:
-        from pbdkit.identity.picture import by_direction
+        from pbdkit.identity.polar import by_direction
 
         save(picture, by_direction(found), quiet=as_json)

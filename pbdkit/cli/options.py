@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import click
 
-from pbdkit.cli.completion import complete_experiments
+from pbdkit.cli.experiments import complete_experiments
 
 C = TypeVar("C", bound=click.Command)
 

@@ -7,11 +7,18 @@ import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
 
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, sizes_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
 """What may be at a path and no plain file, by the type that the system gives it."""
@@ -73,3 +80,33 @@ def disk_warnings(path: Path, scene: Scene) -> tuple[str, ...]:
         f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or name a file "
         "on another disk with -o",
     )
+
+
+FORMATS = (".png", ".svg", ".pdf")
+
+
+def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
+    """ExperimentError or StorageError where a picture or another file cannot be written there."""
+    from pbdkit.errors import ExperimentError, StorageError
+
+    if picture and picture.suffix not in FORMATS:
+        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
+    if picture and find_spec("matplotlib") is None:
+        raise ExperimentError("a picture needs matplotlib: pip install 'pbdkit[plot]'")
+    for path in (picture, *others):
+        if path and path.is_dir():
+            raise ExperimentError(f"{path}: is a folder; name a file")
+        if path and not path.parent.is_dir():
+            raise StorageError(f"{path}: there is no folder {path.parent}")
+
+
+def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
+    """Writes a figure and says so; StorageError where the system refuses."""
+    from pbdkit.errors import StorageError
+
+    try:
+        drawn.savefig(picture)
+    except OSError as error:
+        raise StorageError(f"{picture}: cannot be written: {error.strerror}") from None
+    if not quiet:
+        click.echo(f"{picture} written")

@@ -26,8 +26,7 @@ def plot(
     force: bool,
 ) -> None:
     """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
-    from pbdkit.cli.output import refuse_output
-    from pbdkit.cli.pictures import FORMATS, save
+    from pbdkit.cli.output import FORMATS, refuse_output, save
     from pbdkit.errors import ExperimentError
     from pbdkit.results.accessor import reading
     from pbdkit.results.picture import draw, figure

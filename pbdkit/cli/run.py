@@ -38,7 +38,7 @@ def run(
     from pbdkit.equilibrium.watch import Watch
     from pbdkit.results.netcdf import NetcdfSink
     from pbdkit.results.progress import progress_bar
-    from pbdkit.results.second_thread import OverlappingSink
+    from pbdkit.results.sinks import OverlappingSink
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 

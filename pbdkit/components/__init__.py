@@ -17,7 +17,7 @@ COMPONENTS = {
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame",
     "free_edges": "Natural TractionFree",
     "fracture": "NoFracture Threshold",
-    "straining": "StrainFracture Damage",
+    "strain_fracture": "StrainFracture Damage",
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
     "fields": "Strain Rotation Stress",
     "forces": "StrainEnergy Reaction StressStrain",

@@ -11,7 +11,7 @@ from pydantic import Field
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Diagnostic, Moment, Variable, Vector, length
 from pbdkit.interfaces.diagnostic import Need
-from pbdkit.interfaces.fracture import breaking_order
+from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.interfaces.polygons import area_share
 
 LENGTH = "lattice unit"

@@ -19,7 +19,7 @@ from pbdkit.interfaces import (
     squared_length,
     where,
 )
-from pbdkit.interfaces.fracture import Segment
+from pbdkit.interfaces.fracture_model import Segment
 
 Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, never_rests, scale_of
-from pbdkit.equilibrium.finding import Finder, UnconvergedError
+from pbdkit.equilibrium.newton import Finder, UnconvergedError
 from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.engine import Engine
-from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.leaders import last_event, place, prescribe
+from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.prescription import last_event, place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 VALUES_A_CALL = 200_000_000

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.solving import LinearSolver
 from pbdkit.equilibrium.watch import Watch
 
 Floats = NDArray[np.float64]
@@ -17,6 +17,21 @@ Preconditioner = Callable[[Floats], Floats]
 MOST_ITERATIONS = 400
 FINEST = 1e-14
 """No residual becomes smaller than this share."""
+
+
+class LinearSolver(ABC):
+    """Solves A x = b for one matrix, with an unknown a row."""
+
+    name: str
+    iterations = 0
+
+    @abstractmethod
+    def solve(self, b: Floats, accuracy: float) -> Floats:
+        """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
+
+    @abstractmethod
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """The same for Aᵀ."""
 
 
 class Krylov(LinearSolver):

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.equilibrium.certificate import spacing_of
-from pbdkit.equilibrium.finding import FIRST_ORDER, LINEAR
-from pbdkit.equilibrium.moves import Moves, owed_by, rounding
+from pbdkit.equilibrium.certificate import Moves, owed_by, rounding, spacing_of
+from pbdkit.equilibrium.newton import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError

@@ -1,20 +1,109 @@
-"""Whether a run has settled: nothing is left to happen that would take it farther than asked."""
+"""When to look whether a run has settled: often at the length of a step, rarely at the distance."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from pbdkit.equilibrium.certificate import CORRECTION, Certificate, scale_of
 from pbdkit.equilibrium.outlook import Foresight, Outlook
-from pbdkit.equilibrium.pace import NEVER, Pace
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.fracturing import Fracturing
-from pbdkit.stepping.leaders import is_cut_short, last_event
+from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.prescription import is_cut_short, last_event
 from pbdkit.stepping.state import State
+
+FINEST, COARSEST = 256, 4
+"""Looks lie apart by between these parts of the steps since the first: what comes late comes late
+by a 256th, or by a step."""
+OVERDUE = 4
+"""Where steps are short but shrink no more (rounding, or a body that swings), a bound is made each
+time the steps since the first look are this many times more."""
+NEVER = 2**62
+
+
+@dataclass
+class Pace:
+    """When to look, from what the looks before have found.
+
+    Where the modes of a symmetric step shrink by ρ and less, the sizes of its steps fall at a rate
+    of at least -ln ρ, and fall ever more slowly. What is extrapolated from two looks,
+
+        distance ≈ ρ / (1 - ρ) · |last step|,  ρ from the ratio of two steps,
+
+    comes out too small, so that one looks too early rather than too late, and it is sharp in the
+    end, when one mode is left. It only says when a bound is worth its cost.
+    """
+
+    next_look: int
+    """The step at which to look next."""
+    tolerance: float
+    begin: int
+    """The step before the first look."""
+    rate: float = 0.0
+    """Of the decay, a step; 0 while none is seen."""
+    seen: tuple[int, float] | None = None
+    """The last look: its step, and the size of the step made there."""
+    bounded: tuple[int, float] | None = None
+    """The last bound: its step, and the distance."""
+    overdue: int | None = None
+    """The steps since the first look after which a bound is made all the same."""
+
+    def is_near(self, step: int, longest: float, size: float) -> bool:
+        """Whether the distance is worth a bound. `longest` is the longest way that a particle made
+        in this step, `size` a norm of all ways."""
+        if self.seen:
+            self.rate = _rate(self.seen, (step, size))
+        self.seen = (step, size)
+        elapsed = step - self.begin
+        # Of two states within the tolerance none is farther from the other than twice that.
+        short = longest <= 2.0 * self.tolerance
+        if short and self.overdue is None:
+            self.overdue = OVERDUE * elapsed
+        distance = _distance(longest, self.rate)
+        stalls = self.rate == 0.0 and elapsed >= (self.overdue or 0)
+        if short and (distance <= self.tolerance or stalls):
+            return True
+        self._wait(step, _steps_until(distance, self.tolerance, self.rate))
+        return False
+
+    def note_distance(self, step: int, distance: float) -> None:
+        """What the bound came to, where the run goes on."""
+        here = (step, distance)
+        rate = (_rate(self.bounded, here) if self.bounded else 0.0) or self.rate
+        wanted = self.tolerance if distance > self.tolerance else distance / 2
+        self.bounded, self.overdue = here, OVERDUE * (step - self.begin)
+        self._wait(step, _steps_until(distance, wanted, rate))
+
+    def _wait(self, step: int, steps: float) -> None:
+        elapsed = step - self.begin
+        least, most = max(1, elapsed // FINEST), max(1, elapsed // COARSEST)
+        self.next_look = step + math.ceil(min(max(steps, least), most))
+
+
+def _rate(earlier: tuple[int, float], later: tuple[int, float]) -> float:
+    """The rate of decay a step between two values, 0 where they do not fall."""
+    (begin, before), (end, after) = earlier, later
+    if not after < before or not math.isfinite(before):
+        return 0.0
+    return math.log(before / after) / (end - begin) if after > 0.0 else math.inf
+
+
+def _distance(length: float, rate: float) -> float:
+    """ρ / (1 - ρ) · length for ρ = exp(-rate)."""
+    if length == 0.0:
+        return 0.0
+    return length / math.expm1(min(rate, 500.0)) if rate > 0.0 else math.inf
+
+
+def _steps_until(value: float, wanted: float, rate: float) -> float:
+    """The steps in which a value that falls at a rate comes to what is wanted."""
+    if value <= wanted:
+        return 0.0
+    return math.log(value / wanted) / rate if rate > 0.0 and math.isfinite(value) else math.inf
 
 
 class Settling:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import Couplings
-from pbdkit.analysis.matrices import DENSE, connected
+from pbdkit.analysis.couplings import DENSE, Couplings, connected
 from pbdkit.analysis.operator import StepOperator
-from pbdkit.equilibrium.floating import Floating
-from pbdkit.equilibrium.parts import DriftingError, Held, Part
+from pbdkit.equilibrium.floating_parts import Floating
+from pbdkit.equilibrium.system_parts import DriftingError, Held, Part
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 

@@ -18,11 +18,10 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.experiment.bodies import AnyBody
-from pbdkit.experiment.faults import located, report
+from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
-from pbdkit.experiment.parts import brief, fault, open_part
+from pbdkit.experiment.parts import brief, fault, located, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source

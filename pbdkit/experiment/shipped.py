@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.naming import did_you_mean
+from pbdkit.interfaces.component import did_you_mean
 
 SUFFIX = ".yaml"
 

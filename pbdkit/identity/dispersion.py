@@ -16,15 +16,15 @@ elasticity, where rows beyond the next attract.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.region import Complex, largest_stable_relaxation
-from pbdkit.identity.elasticity import at_direction
-from pbdkit.identity.primitive import Primitive
-from pbdkit.identity.waves import SlowWaves, operator
+from pbdkit.analysis.spectrum import Complex, largest_stable_relaxation
+from pbdkit.identity.elastic_constants import Elasticity, at_direction
+from pbdkit.identity.waves import Primitive, SlowWaves, operator
 
 Floats = NDArray[np.float64]
 WAVES, ANGLES = 48, 180
@@ -53,6 +53,39 @@ class Gradient:
     rows_apart: float
     total: tuple[float, float]
     material: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class LongWaves:
+    """What long waves see, in units of the spacing and of a step.
+
+    `second` is Q_abcd, of which a step moves a body by Q_abcd ∂_c ∂_d u_b; `diffusivity` D_cd where
+    x and y diffuse by themselves and alike; `elasticity` the body that the rule solves for, also
+    that of a diffusion; `fast` and `slow` the diffusivities of the two waves by direction;
+    `gradients` the lengths of the fourth order.
+    """
+
+    waves: SlowWaves
+    second: Floats
+    diffusivity: Floats | None
+    elasticity: Elasticity | None
+    fast: Range
+    slow: Range
+    gradients: tuple[Gradient, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The figures as plain values."""
+        tensor = self.diffusivity
+        return {
+            "second_order": self.second.tolist(),
+            "diffusivity_tensor": None if tensor is None else tensor.tolist(),
+            "fast": asdict(self.fast),
+            "slow": asdict(self.slow),
+            "gradients": [
+                asdict(g) | {"total": list(g.total), "material": list(g.material)}
+                for g in self.gradients
+            ],
+        }
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
-from pbdkit.interfaces.fracture import (
+from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
     RenewsBonds,
@@ -11,7 +11,7 @@ from pbdkit.interfaces.fracture import (
 )
 from pbdkit.interfaces.frame import Anchors, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.lattice import BasisSite, Cell, Lattice, Offset
-from pbdkit.interfaces.neighbours import Nearness, NeighbourMetric, Slot
+from pbdkit.interfaces.neighbour_metric import Nearness, NeighbourMetric, Slot
 from pbdkit.interfaces.rule import (
     AppliesTwice,
     Calibrated,

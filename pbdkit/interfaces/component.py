@@ -1,15 +1,24 @@
-"""What every exchangeable part is: one frozen model with a `type`, parameters and behaviour."""
+"""The nearest right name for a misspelt one."""
 
 from __future__ import annotations
 
+import difflib
 from abc import ABC
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import printable
-from pbdkit.interfaces.naming import did_you_mean
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``; did you mean 'x'?``, or nothing where no known name is near."""
+    by_lower = {k.lower(): k for k in known}
+    near = difflib.get_close_matches(name[:80].lower(), by_lower, n=1, cutoff=0.5)
+    return f"; did you mean '{by_lower[near[0]]}'?" if near else ""
+
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 """Two numbers, (x, y); an experiment file writes them as a list of two."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces.lattice import Offset
-from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.vector import Components
 
 

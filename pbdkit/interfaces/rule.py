@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell
-from pbdkit.interfaces.neighbours import Slot
+from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.interfaces.values import Remembers
 from pbdkit.interfaces.vector import Components

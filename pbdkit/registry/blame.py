@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib.metadata import entry_points
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
-from pbdkit.interfaces import Component
-from pbdkit.registry.checking import interface_of
-from pbdkit.registry.discovery import BUILTIN, installed_points
-from pbdkit.registry.wording import worded
+from pbdkit.interfaces import INTERFACES, Component
+from pbdkit.interfaces.answers import AnswerError
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.registry.hooks import GROUP
+
+LONGEST = 400
+
+
+def interface_of(component: type[Component]) -> type[Component]:
+    """The open interface that a component class implements."""
+    return next(i for i in INTERFACES.values() if issubclass(component, i))
+
+
+def whose(component: type[Component]) -> str:
+    """``FollowerRule 'odd' of pbdkit-odd 0.3``, where a distribution's entry point leads to its
+    package."""
+    package, origin = component.__module__.split(".")[0], ""
+    with suppress(Exception):  # metadata of others can be torn
+        for point in entry_points(group=GROUP):
+            if point.module.split(".")[0] == package != GROUP and point.dist:
+                origin = f" of {point.dist.name} {point.dist.version}".rstrip()
+    return f"{interface_of(component).__name__} '{component.type_name()}'{origin}"
 
 
 def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
     """The error to raise where a component's own code has failed."""
-    package = component.__module__.split(".")[0]
-    return PluginError(f"{_whose(component)} failed {when}: {worded(error, package)}")
+    told = worded(error, component.__module__.split(".")[0])
+    return PluginError(f"{whose(component)} failed {when}: {told}")
 
 
 @contextmanager
@@ -26,7 +46,7 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"in {_whose(type(component))} {when}") from None
+        raise KeyboardInterrupt(f"in {whose(type(component))} {when}") from None
     except ExperimentError as error:
         if not field:
             raise blame(type(component), when, error) from error
@@ -37,15 +57,38 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
         raise blame(type(component), when, error) from error
 
 
-def _whose(component: type[Component]) -> str:
-    package = component.__module__.split(".")[0]
-    return f"{interface_of(component).__name__} '{component.type_name()}'{_origin(package)}"
+def worded(error: BaseException, package: str = "") -> str:
+    """``Type: message`` of whatever foreign code raised, on one line, without control characters,
+    cut where it is long; with `package`, the place in its code where the traceback has one."""
+    try:
+        message = str(error)
+    except Exception:  # a plugin's own error class can fail to say what it is
+        message = "(its message cannot be had)"
+    if isinstance(error, AnswerError):
+        return one_line(message)
+    told = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    places = [
+        (frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if package and str(frame.f_globals.get("__name__")).split(".")[0] == package
+    ]
+    place = ""
+    if places:
+        file, line = places[-1]
+        place = f" ({file.replace(chr(92), '/').rsplit('/', 1)[-1]}, line {line})"
+    return one_line(told) + remedy(error) + place
 
 
-def _origin(package: str) -> str:
-    """`` of pbdkit-x 0.3``, where a distribution's entry point leads to that package."""
-    if package != BUILTIN:
-        for point in installed_points():
-            if point.package == package:
-                return f" of {point.distribution} {point.version}".rstrip()
+def remedy(error: BaseException) -> str:
+    """What elementwise functions are to do instead, where the fault is a frequent one."""
+    if isinstance(error, ValueError) and "truth value of an array" in str(error):
+        return "; choose with `pbdkit.where` in the place of `if`, `and` and `or`"
+    if isinstance(error, AttributeError) and type(error.obj).__name__ == "Parameters":
+        return did_you_mean(str(error.name), getattr(error.obj, "_fields", ()))
     return ""
+
+
+def one_line(text: str) -> str:
+    """The words of the text, printable ones, cut where it is long."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cached_property
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.interfaces import Component
-from pbdkit.interfaces.naming import did_you_mean
-from pbdkit.registry.checking import check_component
-from pbdkit.registry.conflicts import judged, named
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.registry.blame import one_line
 from pbdkit.registry.discovery import (
     ALL,
     DISABLE,
     Point,
     canonical,
-    disabled,
     disabled_names,
     installed_points,
 )
-from pbdkit.registry.loading import Offer, Plugin, load_builtin, load_plugin, offer_of
-from pbdkit.registry.searching import declares
+from pbdkit.registry.plugin import (
+    Offer,
+    Plugin,
+    check_component,
+    load_builtin,
+    load_plugin,
+    offer_of,
+)
 
 GIVEN = "components"
 """How classes that were handed over in Python appear among the plugins."""
@@ -35,19 +40,19 @@ class Registry:
 
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
         self._builtin = load_builtin()
-        self._given = Plugin(GIVEN, "", "", "ok", offers=_given(components, self._builtin))
+        self._given = Plugin(GIVEN, "", "", offers=_given(components, self._builtin))
+        self._own = [self._builtin, self._given]
         self._loaded: dict[Point, Plugin] = {}
 
     @cached_property
     def installed(self) -> list[Plugin]:
         """The third-party plugins; the first look at them imports them."""
-        return judged([self._load(point) for point in self._points], self._builtin)
+        return self._judged(self._points)
 
     @property
     def plugins(self) -> list[Plugin]:
         """Every plugin, the built-in one first."""
-        given = [self._given] if self._given.offers else []
-        return [self._builtin, *given, *self.installed]
+        return [p for p in self._own if p.offers] + self.installed
 
     def find(self, interface: type[Component], name: str) -> type[Component]:
         """The class of that interface and type.
@@ -56,18 +61,32 @@ class Registry:
         that nobody offers or that several offer, PluginError where the distribution that it is
         asked of, or that it comes from, is missing, disabled, broken or incompatible.
         """
-        if ":" in name:
-            return self._find_in_distribution(interface, *name.split(":", 1))
-        own = named([self._builtin, self._given], interface, name)
-        offers = own or named(self.installed, interface, name)
+        distribution, _, kind = name.rpartition(":")
+        if distribution:
+            plugins = self._of(distribution, kind)
+        else:
+            plugins = self._own if _offers(self._own, interface, kind) else self.installed
+        offers, told = _offers(plugins, interface, kind), one_line(kind)
         classes = {p.distribution: o.component for p, o in offers if o.component is not None}
         if len(classes) > 1:
-            choice = ", ".join(f"'{distribution}:{name}'" for distribution in classes)
-            raise ExperimentError(f"'{name}' is offered by several distributions: write {choice}")
-        if classes:
-            return next(iter(classes.values()))
-        self._blame_its_plugin(interface, name)
-        raise ExperimentError(self._unknown(interface, name))
+            choice = ", ".join(f"'{one}:{kind}'" for one in classes)
+            raise ExperimentError(f"'{told}' is offered by several distributions: write {choice}")
+        for component in classes.values():
+            return component
+        if distribution:
+            for plugin in [p for p, _ in offers] or plugins:
+                if plugin.fault:
+                    raise PluginError(f"'{told}' is asked of {plugin}, which is {plugin.fault}")
+            offered = [o.name for p in plugins for o in p.offers if o.interface is interface]
+            hint = did_you_mean(kind, offered)
+            what = f"offers no {interface.__name__} '{told}'{hint}"
+            raise ExperimentError(f"{one_line(distribution)} {what}")
+        for plugin, offer in offers:
+            raise PluginError(f"'{told}' comes from {plugin}, which is broken: {offer.reason}")
+        installed = sorted(self.components(interface))
+        hint = f"{did_you_mean(kind, installed)} (installed: {', '.join(installed)})"
+        others = "".join(f"; {p} is {p.fault}" for p in self.installed if p.fault)
+        raise ExperimentError(f"unknown type '{told}'{hint}{others}")
 
     def components(
         self, interface: type[Component], *, installed: bool = True
@@ -82,13 +101,14 @@ class Registry:
     ) -> dict[type[Component], list[str]]:
         """The same by class, with all names that an experiment may give it, the shortest first."""
         found: dict[type[Component], list[str]] = {}
-        for plugin in self.plugins if installed else [self._builtin, self._given]:
+        for plugin in self.plugins if installed else self._own:
             for offer in plugin.offers:
                 if offer.component is not None and offer.interface is interface:
                     names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
-                    if plugin not in (self._builtin, self._given):
-                        names.append(f"{plugin.distribution}:{offer.name}")
-        return {component: list(dict.fromkeys(names)) for component, names in found.items()}
+                    full = f"{plugin.distribution}:{offer.name}"
+                    if plugin not in self._own and full not in names:
+                        names.append(full)
+        return found
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
         """The distributions that these components come from, with their versions; under GIVEN the
@@ -96,14 +116,14 @@ class Registry:
         classes = {type(component) for component in used}
         loaded = [self._builtin, *self._loaded.values()]
         found = {p.distribution: p.version for p in loaded if classes & set(p.components)}
-        offered = {c for p in loaded for c in p.components}
-        given = sorted({c.type_name() for c in classes - offered})
-        return found | ({GIVEN: ", ".join(given)} if given else {})
+        given = classes.difference(*(p.components for p in loaded))
+        types = ", ".join(sorted(c.type_name() for c in given))
+        return found | ({GIVEN: types} if given else {})
 
     def name_of(self, component: Component) -> str:
         """The type by which an experiment finds this component again: with its distribution unless
         nobody else is known to offer the type."""
-        for plugin in [self._builtin, self._given, *self._loaded.values()]:
+        for plugin in [*self._own, *self._loaded.values()]:
             for offer in plugin.offers:
                 if offer.component is type(component):
                     return self._name_in(plugin, offer)
@@ -122,71 +142,77 @@ class Registry:
     def _points(self) -> list[Point]:
         return installed_points()
 
-    @cached_property
-    def _disabled(self) -> dict[Point, str]:
-        return disabled(self._points)
+    def _of(self, distribution: str, name: str) -> list[Plugin]:
+        """The plugins of a distribution."""
+        if canonical(distribution) == canonical(self._builtin.distribution):
+            return [self._builtin]
+        known = {canonical(p.distribution): p.distribution for p in self._points}
+        if canonical(distribution) not in known:
+            hint = did_you_mean(distribution, known.values())
+            asked = f"'{one_line(name)}' is asked of {one_line(distribution)}"
+            raise PluginError(f"{asked}, which is not installed{hint}")
+        own = known[canonical(distribution)]
+        return self._judged([p for p in self._points if p.distribution == own])
 
-    def _load(self, point: Point) -> Plugin:
-        if point not in self._loaded:
-            why = self._disabled.get(point)
-            self._loaded[point] = (
-                Plugin(point.name, point.distribution, point.version, "disabled", why)
-                if why
-                else load_plugin(point)
-            )
-        return self._loaded[point]
+    def _judged(self, points: list[Point]) -> list[Plugin]:
+        """The plugins, with their clashes: among each other and with built-in names."""
+        for point in points:
+            if point not in self._loaded:
+                self._loaded[point] = load_plugin(point)
+        plugins, found = [self._loaded[point] for point in points], []
+        for plugin in plugins:
+            offers = tuple(_judged(plugin, o, plugins, self._builtin) for o in plugin.offers)
+            changed = [new for new, old in zip(offers, plugin.offers, strict=True) if new != old]
+            if changed:
+                states = {plugin.state, *(offer.state for offer in changed)}
+                reasons = dict.fromkeys([plugin.reason, *(offer.reason for offer in changed)])
+                state = "broken" if "broken" in states else "conflict"
+                reason = "; ".join(filter(None, reasons))
+                plugin = replace(plugin, state=state, reason=reason, offers=offers)
+            found.append(plugin)
+        return found
 
     def _name_in(self, plugin: Plugin, offer: Offer) -> str:
-        own = [self._builtin, self._given]
-        if plugin in own:
+        if plugin in self._own:
             return offer.name
-        alone = "installed" in self.__dict__ and not named(own, offer.interface, offer.name)
-        offers = named(self.installed, offer.interface, offer.name) if alone else []
+        alone = "installed" in self.__dict__ and not _offers(self._own, offer.interface, offer.name)
+        offers = _offers(self.installed, offer.interface, offer.name) if alone else []
         if len({p.distribution for p, o in offers if o.component}) == 1:
             return offer.name
         return f"{plugin.distribution}:{offer.name}"
 
-    def _find_in_distribution(
-        self, interface: type[Component], distribution: str, name: str
-    ) -> type[Component]:
-        if canonical(distribution) == canonical(self._builtin.distribution):
-            plugins = [self._builtin]
-        else:
-            points = [
-                p for p in self._points if canonical(p.distribution) == canonical(distribution)
-            ]
-            plugins = judged([self._load(point) for point in points], self._builtin)
-        if not plugins:
-            known = did_you_mean(distribution, {p.distribution for p in self._points})
-            raise PluginError(f"'{name}' is asked of {distribution}, which is not installed{known}")
-        offers = named(plugins, interface, name)
-        if usable := [offer.component for _, offer in offers if offer.component is not None]:
-            return usable[0]
-        for plugin in [p for p, _ in offers] or plugins:
-            if plugin.state not in ("ok", "conflict"):
-                raise PluginError(f"'{name}' is asked of {plugin}, which is {_why(plugin)}")
-        offered = [o.name for p in plugins for o in p.offers if o.interface is interface]
-        hint = did_you_mean(name, offered)
-        raise ExperimentError(f"{distribution} offers no {interface.__name__} '{name}'{hint}")
 
-    def _blame_its_plugin(self, interface: type[Component], name: str) -> None:
-        """PluginError where the type is that of a plugin which is not in order."""
-        for plugin, offer in named(self.installed, interface, name):
-            raise PluginError(f"'{name}' comes from {plugin}, which is broken: {offer.reason}")
-        for point, plugin in zip(self._points, self.installed, strict=True):
-            if not plugin.components and plugin.state != "ok" and declares(point, name):
-                raise PluginError(f"'{name}' comes from {plugin}, which is {_why(plugin)}")
-
-    def _unknown(self, interface: type[Component], name: str) -> str:
-        offered = sorted(self.components(interface))
-        hint = did_you_mean(name, offered)
-        missing = [p for p in self.installed if p.state not in ("ok", "conflict")]
-        others = "".join(f"; {plugin} is {_why(plugin)}" for plugin in missing)
-        return f"unknown type '{name}'{hint} (installed: {', '.join(offered)}){others}"
+def _offers(
+    plugins: Iterable[Plugin], interface: type[Component] | None, name: str
+) -> list[tuple[Plugin, Offer]]:
+    """The offers of that interface and type, the broken ones too."""
+    return [
+        (plugin, offer)
+        for plugin in plugins
+        for offer in plugin.offers
+        if offer.interface is interface and offer.name == name
+    ]
 
 
-def _why(plugin: Plugin) -> str:
-    return f"{plugin.state}: {plugin.reason}"
+def _judged(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
+    if offer.component is None or offer.interface is None:
+        return offer
+    name, chosen = offer.name, f"write '{plugin.distribution}:{offer.name}'"
+    twins = _offers(plugins, offer.interface, name)
+    if any(
+        p.distribution == plugin.distribution and o.component not in (None, offer.component)
+        for p, o in twins
+    ):
+        reason = f"it offers two classes with the type '{name}'; give one of them another"
+        return replace(offer, component=None, state="broken", reason=reason)
+    if _offers([builtin], offer.interface, name):
+        what = f"'{name}' is the name of a built-in {offer.interface.__name__}"
+        return replace(offer, state="conflict", reason=f"{what}; {chosen}, or give it another type")
+    others = [str(p) for p, o in twins if o.component and p.distribution != plugin.distribution]
+    if not others:
+        return offer
+    reason = f"'{name}' is offered by {', '.join(others)} too; {chosen}"
+    return replace(offer, state="conflict", reason=reason)
 
 
 def _given(components: Iterable[type[Component]], builtin: Plugin) -> tuple[Offer, ...]:
@@ -198,7 +224,7 @@ def _given(components: Iterable[type[Component]], builtin: Plugin) -> tuple[Offe
         except TypeError as error:
             raise ExperimentError(f"components: {error}") from None
         offer = offer_of(component)
-        if offer.interface and named([builtin], offer.interface, offer.name):
+        if offer.interface and _offers([builtin], offer.interface, offer.name):
             raise ExperimentError(
                 f"components: '{offer.name}' is the name of a built-in "
                 f"{offer.interface.__name__}; give {component.__name__} another type"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import xarray
 
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
-from pbdkit.registry.wording import one_line
+from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 

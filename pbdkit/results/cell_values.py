@@ -1,20 +1,92 @@
-"""What the cells of the body show at a moment, and whether some are inside out."""
+"""The gradient of the displacement at every particle, from the cells around it.
+
+A polygon's mean gradient is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area (Green), on a
+rectangle that of the bilinear displacement, on a triangle that of the linear one. A particle gets
+the mean over the cells that meet there, by share of area; that stands at the mean of their centres,
+which on an edge is not the particle, and is carried on from there with the gradient's own slope,
+found in the same way. Quadratic displacements of rectangular cells are exact, edges included.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces import Vector
 from pbdkit.interfaces.diagnostic import CellValues
-from pbdkit.interfaces.polygons import area_share, corner_share
-from pbdkit.results.gradient import displacement_gradient
+from pbdkit.interfaces.polygons import area_share, corner_share, signed_area
 from pbdkit.results.tables import Tables, broken_along, read_only
 from pbdkit.scene.cells import Patch
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
+
+Floats = NDArray[np.floating[Any]]
+FLAT = 0.1
+"""Where the centres around the corners of a cell span less than this of its area they lie in line,
+as in a body of one row of cells, and tell of no slope."""
+
+
+def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]) -> Floats:
+    """∂u_a/∂X_b as planes (2a + b, sublattice, cell, cell), from planes u and the cells with their
+    shares; 0 where no cell is."""
+    cells = list(cells)
+    shape = u.shape[1:]
+    area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((4, *shape))
+    for patch, share in cells:
+        rest = patch.polygon.rest
+        whole, slopes = _around(patch.differences(u), rest)
+        centre = [sum(r[axis] for r in rest) / len(rest) for axis in (0, 1)]
+        for corner, r in zip(patch.corners, rest, strict=True):
+            there = corner.slices()
+            area[there] += whole * share
+            for axis in (0, 1):
+                offset[(axis, *there)] += (centre[axis] - r[axis]) * whole * share
+            for n, slope in enumerate(slopes):
+                gradient[(n, *there)] += slope * share
+    some = np.where(area > 0.0, area, 1.0)
+    gradient /= some
+    offset /= some
+    return gradient - _beyond(gradient, offset, cells)
+
+
+def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
+    """What a gradient changes from the particles to the centres, (4, ...)."""
+    area, slope = np.zeros(gradient.shape[1:]), np.zeros((4, 2, *gradient.shape[1:]))
+    for patch, share in cells:
+        first, at = offset[(slice(None), *patch.corners[0].slices())], []
+        for corner, r in zip(patch.corners, patch.polygon.rest, strict=True):
+            x, y = offset[(slice(None), *corner.slices())] - first
+            at.append(Vector(r.x + x, r.y + y))
+        values = [gradient[(slice(None), *corner.slices())] for corner in patch.corners]
+        between = [_around([Vector(*(v[n : n + 2] - values[0][n : n + 2])) for v in values], at)
+                   for n in (0, 2)]  # fmt: skip
+        whole = between[0][0]
+        usable = np.where(whole > FLAT * signed_area(patch.polygon.rest), share, 0.0)
+        for corner in patch.corners:
+            there = corner.slices()
+            area[there] += whole * usable
+            for n, (_, slopes) in enumerate(between):
+                for k, part in enumerate(slopes):
+                    slope[(2 * n + k // 2, k % 2, *there)] += part * usable
+    slope /= np.where(area > 0.0, area, 1.0)
+    beyond: Floats = slope[:, 0] * offset[0] + slope[:, 1] * offset[1]
+    return beyond
+
+
+def _around(d: Any, r: Any) -> tuple[Any, list[Any]]:
+    """The area of a polygon with corners r, and area times the mean gradient of d: xx, xy, yx, yy
+    with the component first."""
+    slopes: list[Any] = [0.0, 0.0, 0.0, 0.0]
+    for k, value in enumerate(d):
+        ahead, behind = r[(k + 1) % len(r)], r[k - 1]
+        normal = (ahead.y - behind.y) / 2, (behind.x - ahead.x) / 2
+        for n in range(4):
+            slopes[n] = slopes[n] + value[n // 2] * normal[n % 2]
+    return signed_area(r), slopes
+
 
 TURNED = -1e-6
 """A share of the area at rest; nearer to zero it is rounding, of single precision too."""

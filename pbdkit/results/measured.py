@@ -13,7 +13,7 @@ from pbdkit.interfaces import Diagnostic, Moment, RenewsBonds, RenewsParticles, 
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 
 Numbered = tuple[int, Diagnostic]

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, length
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.naming import did_you_mean
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
 from pbdkit.results.tables import Tables, broken_along, read_only
-from pbdkit.scene.leading import Selecting, kinds_at
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
+from pbdkit.scene.leader_groups import Selecting, kinds_at
 from pbdkit.scene.raster import FOLLOWER
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.stepping.evaluator import summed
-from pbdkit.stepping.remembering import describe_bonds
+from pbdkit.stepping.remembered_values import describe_bonds
 from pbdkit.stepping.state import Floats, State
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces.naming import did_you_mean
-from pbdkit.registry.wording import one_line
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.registry.blame import one_line
 from pbdkit.scene.raster import FRAME
 
 if TYPE_CHECKING:

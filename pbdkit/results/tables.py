@@ -12,7 +12,7 @@ from pbdkit.interfaces import Slot
 from pbdkit.scene.places import Block
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.slots import SlotFollowers
+from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.surroundings import presence
 

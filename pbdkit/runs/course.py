@@ -13,9 +13,7 @@ from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.runs.driver import Driver
-from pbdkit.runs.stepwise import Stepwise
-from pbdkit.runs.straight import Straight
+from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice
 from pbdkit.stepping.state import State, initial_state

@@ -11,7 +11,7 @@ from pbdkit.errors import PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Setting, Slot
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 
 WHOLE_CELLS = {"left": 1.0, "right": 1.0}
 """The shares of the cells on both sides of a bond, where no frame weighs cells."""

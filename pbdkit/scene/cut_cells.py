@@ -16,9 +16,8 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
 from pbdkit.scene.cells import WeighedCells
-from pbdkit.scene.filling import rounding_of, window
 from pbdkit.scene.raster import Raster, cells_of_sites, positions
-from pbdkit.scene.rasterising import Mask
+from pbdkit.scene.sites import Mask, rounding_of, window
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from enum import Enum
 
 from pbdkit.interfaces import Remembered
 from pbdkit.scene.constants import WHOLE_CELLS
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 
 

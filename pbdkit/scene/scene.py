@@ -18,14 +18,13 @@ from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.constants import SceneConstants, ask_for_constants
 from pbdkit.scene.cut_cells import Filling, fill_with_cells
-from pbdkit.scene.filling import fill, has_narrow_slot, window
-from pbdkit.scene.framing import Frame, build_frame
-from pbdkit.scene.leading import Leading, build_leading, doubts
-from pbdkit.scene.measuring import check_diagnostics
+from pbdkit.scene.declarations import check_diagnostics
+from pbdkit.scene.frame_points import Frame, build_frame
+from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.nested import inner_experiment
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
-from pbdkit.scene.rasterising import Mask, build_raster
+from pbdkit.scene.sites import Mask, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
 
 FLAT = 0.05

@@ -13,8 +13,8 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.rule import material_of
+from pbdkit.scene.declarations import Declared, bond_numbers, particle_numbers
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.remembering import Declared, bond_numbers, particle_numbers
 
 MIB = 2**20
 LEAST = 6 * MIB

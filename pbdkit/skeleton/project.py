@@ -1,17 +1,27 @@
-"""The files of a plugin project, from templates."""
+"""The files of a plugin project, from templates, and the names in it, all made from that of its
+distribution."""
 
 from __future__ import annotations
 
+import keyword
+import re
 import shutil
+import sys
+from dataclasses import dataclass
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
 from pbdkit import __version__
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import INTERFACES
-from pbdkit.skeleton.names import Names
+from pbdkit.registry.discovery import BUILTIN, canonical
+from pbdkit.registry.registry import Registry
 
+PREFIX = f"{BUILTIN}-"
+TAKEN = {*keyword.kwlist, "Literal", "Field"}
+"""What a class in the module cannot be called."""
 DEFAULT_PARTS = {
     "lattice": "{type: square, a: 1.0}",
     "neighbours": "{type: coordination, shells: 1}",
@@ -21,62 +31,105 @@ DEFAULT_PARTS = {
     "diagnostics": "[{type: displacement}]",
 }
 """The parts of the example experiment, but for the one that the plugin offers."""
+TEMPLATES = {
+    "pyproject.toml": "pyproject.toml",
+    "README.md": "README.md",
+    "LICENSE": "LICENSE",
+    ".gitignore": "gitignore",
+    "example.yaml": "example.yaml",
+    "{module}.py": "{interface}.py",
+    "tests/test_example.py": "test_example.py",
+    "tests/test_conformance.py": "test_conformance.py",
+}
 
 
-def project_files(names: Names, interface: str) -> dict[str, str]:
-    """The text of each file, by its place in the project's folder."""
-    field = next(field for field, i in INTERFACES.items() if i.__name__ == interface)
-    own = f"{{type: {names.type}}}" if field != "diagnostics" else f"[{{type: {names.type}}}]"
-    parts = DEFAULT_PARTS | {field: own}
-    known = {
-        **vars(names),
-        "variable": names.type.replace("-", "_"),
-        "interface": interface,
-        "field": field,
-        "own": own,
-        "pbdkit_version": ".".join(__version__.split(".")[:2]),
-        "parts": "\n".join(f"{field}: {part}" for field, part in parts.items()),
-    }
-    templates = {
-        "pyproject.toml": "pyproject.toml",
-        "README.md": "README.md",
-        "LICENSE": "LICENSE",
-        ".gitignore": "gitignore",
-        "example.yaml": "example.yaml",
-        f"{names.module}.py": f"{interface}.py",
-        "tests/test_example.py": "test_example.py",
-        "tests/test_conformance.py": "test_conformance.py",
-    }
-    return {file: _filled(template, known) for file, template in templates.items()}
+@dataclass(frozen=True)
+class Project:
+    """``pbdkit-my-rule``: the module ``pbdkit_my_rule``, the type ``my-rule``, the class
+    ``MyRule``, with a component of that interface."""
+
+    distribution: str
+    module: str
+    type: str
+    class_name: str
+    interface: str
+
+    def files(self) -> dict[str, str]:
+        """The text of each file, by its place in the project's folder."""
+        field = _field_of(self.interface)
+        own = f"{{type: {self.type}}}" if field != "diagnostics" else f"[{{type: {self.type}}}]"
+        parts = DEFAULT_PARTS | {field: own}
+        known = {
+            **vars(self),
+            "variable": self.type.replace("-", "_"),
+            "field": field,
+            "own": own,
+            "pbdkit_version": ".".join(__version__.split(".")[:2]),
+            "parts": "\n".join(f"{field}: {part}" for field, part in parts.items()),
+        }
+        folder = files("pbdkit.skeleton").joinpath("templates")
+        return {
+            file.format(**known): Template(
+                folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
+            ).substitute(known)
+            for file, template in TEMPLATES.items()
+        }
+
+    def write(self, parent: Path) -> Path:
+        """Writes it into a new folder of `parent`, named as the distribution, and returns that.
+
+        Raises ExperimentError where there is something of that name, StorageError where it cannot
+        be written; then nothing of it stays.
+        """
+        folder = parent / self.distribution
+        texts = self.files()
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            raise ExperimentError(
+                f"{folder}: exists and is left as it is; take another name or --dir"
+            ) from None
+        except OSError as error:
+            raise StorageError(f"{folder}: cannot be made: {error.strerror}") from None
+        try:
+            for file, text in texts.items():
+                path = folder / file
+                path.parent.mkdir(exist_ok=True)
+                path.write_text(text, "utf-8")
+        except OSError as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise StorageError(f"{folder}: cannot be written: {error.strerror}") from None
+        return folder
 
 
-def write_project(names: Names, interface: str, parent: Path) -> Path:
-    """Writes the project into a new folder of `parent`, named as the distribution, and returns it.
+def project_of(name: str, interface: str) -> Project:
+    """The project of that name with a component of that interface.
 
-    Raises ExperimentError where there is something of that name, StorageError where it cannot be
-    written; then nothing of it stays.
+    Raises ExperimentError where a name in it cannot be had.
     """
-    folder = parent / names.distribution
-    texts = project_files(names, interface)
-    try:
-        folder.mkdir()
-    except FileExistsError:
+    if not re.fullmatch(r"[A-Za-z]([A-Za-z0-9._-]*[A-Za-z0-9])?", name):
         raise ExperimentError(
-            f"{folder}: exists and is left as it is; take another name or --dir"
-        ) from None
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be made: {error.strerror}") from None
-    try:
-        for file, text in texts.items():
-            path = folder / file
-            path.parent.mkdir(exist_ok=True)
-            path.write_text(text, "utf-8")
-    except OSError as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise StorageError(f"{folder}: cannot be written: {error.strerror}") from None
-    return folder
+            f"'{name}' is no name for a distribution: it begins with a letter, ends with a letter "
+            "or digit, and holds letters, digits, '.', '_' and '-', as pbdkit-my-rule does"
+        )
+    distribution = canonical(name)
+    kind = distribution.removeprefix(PREFIX)
+    class_name = "".join(word.capitalize() for word in kind.split("-"))
+    module, instead = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
+    if not class_name.isidentifier() or class_name in TAKEN:
+        raise ExperimentError(f"'{name}' makes no name for a class{instead}")
+    if module in keyword.kwlist or _is_module(module):
+        raise ExperimentError(f"there is a module {module} already{instead}")
+    if kind in Registry().components(INTERFACES[_field_of(interface)], installed=False):
+        raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
+    return Project(distribution, module, kind, class_name, interface)
 
 
-def _filled(template: str, known: dict[str, str]) -> str:
-    text = files("pbdkit.skeleton").joinpath("templates", f"{template}.txt").read_text("utf-8")
-    return Template(text).substitute(known)
+def _field_of(interface: str) -> str:
+    return next(field for field, i in INTERFACES.items() if i.__name__ == interface)
+
+
+def _is_module(name: str) -> bool:
+    """Whether Python finds a module of that name; a mere folder is none."""
+    spec = None if name in sys.stdlib_module_names else find_spec(name)
+    return name in sys.stdlib_module_names or (spec is not None and spec.origin is not None)

@@ -9,9 +9,8 @@ from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.engine import Engine
-from pbdkit.stepping.leaders import last_event
-from pbdkit.stepping.stepper import Stepper
+from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.prescription import last_event
 
 PATIENCE_S = 3.0
 """Compiling pays where the numpy engine would take longer than about this (measured: importing

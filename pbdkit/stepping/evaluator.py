@@ -29,9 +29,9 @@ from pbdkit.interfaces import (
 from pbdkit.interfaces.answers import as_values, as_vector, as_verdict
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembering import changing, renew, shown
+from pbdkit.stepping.remembered_values import changing, renew, shown
 
 Mask = NDArray[np.bool_]
 Contributions = tuple[Any, ...]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbdkit.scene.leading import Leading
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100

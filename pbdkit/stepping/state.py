@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Pair, StartsCracked
-from pbdkit.scene.bonds import bonds_in, plane_block
-from pbdkit.scene.cracks import crosses
-from pbdkit.scene.leading import kinds_at
+from pbdkit.scene.bonds import bonds_in, crosses, plane_block
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembering import Values, initial_bond_values, initial_particle_values
+from pbdkit.stepping.remembered_values import Values, initial_bond_values, initial_particle_values
 
 Floats = NDArray[np.floating[Any]]
 

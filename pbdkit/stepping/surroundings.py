@@ -15,7 +15,7 @@ from pbdkit.scene.places import Where
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Contributions, Mask, Neighbour, summed
-from pbdkit.stepping.remembering import shown
+from pbdkit.stepping.remembered_values import shown
 from pbdkit.stepping.state import State
 
 BLOCK_CELLS = 16384

@@ -10,13 +10,17 @@ In a plugin's tests one line is enough::
 components of a distribution. docs/extending/testing.md lists the properties.
 """
 
-from pbdkit.testing.conformance import conformance
-from pbdkit.testing.distributions import examine_all
-from pbdkit.testing.examining import Examination, examine
-from pbdkit.testing.examples import examples_of
+from pbdkit.testing.examination import (
+    Examination,
+    Outcome,
+    Report,
+    conformance,
+    examine,
+    examine_all,
+)
 from pbdkit.testing.properties import PROPERTIES, properties_of
 from pbdkit.testing.property import NotAskedError, Property, PropertyError
-from pbdkit.testing.report import Outcome, Report
+from pbdkit.testing.subject import examples_of
 
 __all__ = [
     "PROPERTIES",

@@ -22,15 +22,15 @@ from pbdkit.interfaces.answers import as_vector
 from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
-from pbdkit.testing.numbers import (
+from pbdkit.testing.property import Arrays, Question
+from pbdkit.testing.states import (
     SHAPE,
     draws,
     own_of,
     remembered_of_bonds,
     remembered_of_particles,
+    spacing,
 )
-from pbdkit.testing.question import Arrays, Question
-from pbdkit.testing.states import spacing
 
 
 def vector(arrays: Arrays, name: str) -> Vector:

@@ -1,4 +1,4 @@
-"""What a property is: a name, the interfaces it is asked of, and a check that raises."""
+"""What a property is, and a question: one call of a component with arrays that are kept."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from pbdkit.interfaces import Component
 
 if TYPE_CHECKING:
     from pbdkit.testing.subject import Subject
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 Check = Callable[["Subject"], None]
 
@@ -55,3 +59,32 @@ def asked_of(
         return Property(check.__name__.replace("_", "-"), interfaces, check, needs)
 
     return make
+
+
+Arrays = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One call: `what` is called, with which arrays, and how; answers are values by name.
+
+    An `elementwise` one is asked with arrays of one shape, a value a particle or bond.
+    """
+
+    what: str
+    inputs: Arrays
+    ask: Callable[[Arrays], Arrays]
+    elementwise: bool = False
+
+    def answer(self) -> Arrays:
+        """The answer to fresh copies of the inputs, as it was at that moment."""
+        with np.errstate(all="ignore"):
+            found = self.ask({name: np.array(value) for name, value in self.inputs.items()})
+        return {name: np.array(value) for name, value in found.items()}
+
+    def larger(self) -> Question:
+        """The same with all that is no index ten times as large."""
+        return replace(
+            self,
+            inputs={n: 10.0 * v if v.dtype.kind == "f" else v for n, v in self.inputs.items()},
+        )

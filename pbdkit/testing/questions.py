@@ -21,11 +21,11 @@ from pbdkit.interfaces import (
 )
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
-from pbdkit.scene.framing import sites_of_frame
+from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.stepper import Stepper
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.testing.calls import ask_fracture_model, ask_rule
-from pbdkit.testing.question import Arrays, Question
+from pbdkit.testing.property import Arrays, Question
 from pbdkit.testing.sight import SeenFrame, SeenMoment
 from pbdkit.testing.states import displacements, state_with
 

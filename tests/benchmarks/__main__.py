@@ -24,7 +24,7 @@ from engines import engines, limit, threads
 from goals import all_goals
 from peers import peers
 
-from pbdkit.benching.method import processors
+from pbdkit.bench.measurement import processors
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -13,7 +13,7 @@ from sheets import Running, moving, scene_of
 
 from pbdkit.results.netcdf import NetcdfSink
 from pbdkit.runs.course import Run, record
-from pbdkit.stepping.stepper import Stepper
+from pbdkit.stepping.numpy_engine import Stepper
 
 NEIGHBOURS = {
     4: {"type": "coordination", "shells": 1},

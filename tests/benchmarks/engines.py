@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,7 @@ from bare import copy_ns, sweeping
 from pairing import best, ratio, wait_for_quiet
 from sheets import DISTANCE, FRACTURE, Running, moving
 
-from pbdkit.benching.measuring import Bench
-from pbdkit.benching.method import methods
-from pbdkit.benching.report import as_dict
+from pbdkit.bench.measurement import measure
 
 STEPS = {10: 4000, 100: 400, 1000: 20}
 SHEETS = {
@@ -31,9 +30,9 @@ def engines() -> list[dict[str, Any]]:
             path = Path(folder) / "sheet.json"
             path.write_text(json.dumps(moving(10, **parts)))
             for size in sizes:
-                bench = Bench(str(path), (), STEPS[size])
-                rows = list(bench.measure(methods(), size, lambda _: None))
-                found += [{"rule": rule} | m for m in as_dict(bench, rows)["measurements"]]
+                steps = (f"steps={STEPS[size]}",)
+                rows = measure(str(path), steps, size, lambda _: None)
+                found += [{"rule": rule} | asdict(row) for row in rows if not row.reason]
     return found
 
 

@@ -12,7 +12,7 @@ from pairing import Ratio, ratio
 from sheets import Running, moving, scene_of
 
 from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.results.second_thread import OverlappingSink
+from pbdkit.results.sinks import OverlappingSink
 from pbdkit.runs.course import Run, record
 
 

@@ -35,6 +35,48 @@ class Flat(pbdkit.Lattice):
         return pbdkit.Cell((pbdkit.Vector(1.0, 0.0), pbdkit.Vector(2.0, 0.0)))
 
 
+class Rows(pbdkit.Lattice):
+    """A square lattice told by two rows a cell; no fault."""
+
+    type: Literal["rows"] = "rows"
+    across: ClassVar[float] = 0.0
+    primitive: ClassVar[tuple] = ((1, 0), (0, 2))
+
+    def cell(self):
+        second = pbdkit.BasisSite(pbdkit.Vector(self.across, 1.0), index=(0, 1), primitive=(0, 1))
+        return pbdkit.Cell(
+            (pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 2.0)),
+            (pbdkit.BasisSite(), second),
+            period=(1, 2),
+            primitive=self.primitive,
+        )
+
+
+class Astray(Rows):
+    """The second row lies a cell farther than its index says."""
+
+    type: Literal["astray"] = "astray"
+    across: ClassVar[float] = 1.0
+    primitive: ClassVar[tuple] = ((1, 0), (-1, 2))
+
+
+class Miscounts(Rows):
+    """Upwards from the first row is another step than from the second."""
+
+    type: Literal["miscounts"] = "miscounts"
+    primitive: ClassVar[tuple] = ((1, 0), (1, 2))
+
+
+class Skips(pbdkit.Lattice):
+    """Every other index along x is nobody's."""
+
+    type: Literal["skips"] = "skips"
+
+    def cell(self):
+        vectors = pbdkit.Vector(1.0, 0.0), pbdkit.Vector(0.0, 1.0)
+        return pbdkit.Cell(vectors, primitive=((2, 0), (0, 1)))
+
+
 class Rooted(pbdkit.Lattice):
     """A square lattice that grows with the distance of its origin."""
 

@@ -149,7 +149,18 @@ class DrawsOnItsOwn(Wearing):
     _seed: int = PrivateAttr(default_factory=lambda: random.randrange(10**9))
 
     def draw(self, bonds, generator):
-        return {"strength": np.random.default_rng(self._seed).uniform(0.4, 0.6, len(bonds))}
+        strength = np.random.default_rng(self._seed).uniform(0.4, 0.6)
+        return {"strength": np.full(len(bonds), strength)}
+
+
+class DrawsByRow(Wearing):
+    """Bonds are the stronger the later they stand in the table."""
+
+    type: Literal["draws-by-row"] = "draws-by-row"
+
+    def draw(self, bonds, generator):
+        first = 0.4 + 0.1 * generator.random()
+        return {"strength": first + 0.1 * np.arange(len(bonds)) / len(bonds)}
 
 
 class WritesBonds(Wearing):

@@ -127,6 +127,17 @@ class Throws(Sound):
         return random.random() * total[0]
 
 
+class Seeds(Sound):
+    """Seeds the generator that all share."""
+
+    type: Literal["seeds"] = "seeds"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        np.random.seed(0)
+        return d, 1.0
+
+
 class Drifts(Sound):
     """Moves to the right, at rest too."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.arguments import bits_for, constant_arrays, lost_bits
 from pbdkit.stepping.compiled.emitter import write_kernel
@@ -19,11 +19,10 @@ from pbdkit.stepping.compiled.levels import levels_of, load_blamed, sample_value
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
-from pbdkit.stepping.compiled.runs import find_runs
-from pbdkit.stepping.engine import Engine
-from pbdkit.stepping.leaders import prescribe, steady_steps
+from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.prescription import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
-from pbdkit.stepping.stepper import Stepper
 
 BAND = 16384
 """Places that bonds are judged on before they are swept, on one thread: what they take stays in the

@@ -19,13 +19,13 @@ from pbdkit.interfaces import (
 )
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.kernel_cache import load_kernel
 from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.stepping.following import target
-from pbdkit.stepping.remembering import changing, renew
+from pbdkit.stepping.followers import target
+from pbdkit.stepping.remembered_values import changing, renew
 
 Function = Callable[..., Any]
 

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.scene.declarations import particle_numbers
 from pbdkit.scene.raster import positions
-from pbdkit.scene.remembering import particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.arguments import rule_arrays
 from pbdkit.stepping.compiled.emitter import write_tuples
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed, sample_values
 from pbdkit.stepping.compiled.particle import contributions, named_tuples, target_lines
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
-from pbdkit.stepping.following import Followers
-from pbdkit.stepping.gathering import GatheringFollowers
+from pbdkit.stepping.followers import Followers
+from pbdkit.stepping.moving_neighbours import GatheringFollowers
 from pbdkit.stepping.state import Floats, State
 
 PAIRS = ("begin", "other", "rests", "place", "body", "local", "solver")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import RenewsBonds, RenewsParticles, StartsCracked
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.raster import FOLLOWER
-from pbdkit.scene.remembering import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.stepping.leaders import Led
+from pbdkit.stepping.prescription import Led
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.surroundings import presence
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import FollowerRule, FractureModel
+from pbdkit.interfaces import Draws, FollowerRule, FractureModel
+from pbdkit.scene.scene import Scene
 from pbdkit.testing.calls import applied, differences, gathered, here
-from pbdkit.testing.numbers import SHAPE
-from pbdkit.testing.properties.answers import REPEATABLE
-from pbdkit.testing.property import PropertyError, asked_of
-from pbdkit.testing.question import Arrays, Question
+from pbdkit.testing.properties.repetition import REPEATABLE
+from pbdkit.testing.property import Arrays, PropertyError, Question, asked_of
+from pbdkit.testing.states import SEED, SHAPE, owners
 from pbdkit.testing.subject import Subject
 
 ROUNDING = 1e-12
@@ -74,12 +74,45 @@ def takes_particles_in_any_order(subject: Subject) -> None:
                     f"`{question.what}` gives a particle another answer where it stands in another "
                     f"order ({name}: {value[place]} and {expected[place]})"
                 )
+    _refuse_an_order_of_rows(subject)
     if isinstance(subject.component, FollowerRule):
-        _refuse_an_order_of_slots(subject.component, subject)
+        _refuse_an_order_of_slots(subject.scene())
 
 
-def _refuse_an_order_of_slots(rule: FollowerRule, subject: Subject) -> None:
-    scene = subject.scene()
+class Alike(np.random.Generator):
+    """Draws the same for everybody: what then differs differs by what the part was shown."""
+
+    def __getattribute__(self, name: str) -> Any:
+        """Every method draws anew, and the first draw counts for all."""
+        if name.startswith("_") or not callable(getattr(np.random.Generator, name)):
+            return super().__getattribute__(name)
+
+        def draw(*given: Any, **named: Any) -> Any:
+            found = getattr(np.random.default_rng(SEED), name)(*given, **named)
+            if name == "shuffle":
+                given[0][...] = given[0][0]
+            return np.full_like(found, found.flat[0]) if np.size(found) > 1 else found
+
+        return draw
+
+
+def _refuse_an_order_of_rows(subject: Subject) -> None:
+    part, scene = subject.component, subject.scene()
+    if not isinstance(part, Draws):
+        return
+    shown = owners(subject.component, scene)
+    order = np.random.default_rng(0).permutation(len(shown))
+    mixed = type(shown)(**{name: table[order] for name, table in vars(shown).items()})
+    one, other = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (shown, mixed))
+    for name, values in one.items():
+        if not np.array_equal(np.asarray(values)[order], other[name]):
+            raise PropertyError(
+                f"`draw` gives '{name}' by the row: take it from what a row holds, or from the "
+                "generator"
+            )
+
+
+def _refuse_an_order_of_slots(scene: Scene) -> None:
     arrays = differences(scene, 0) | here(scene, 0)
     contributions = gathered(scene, arrays)
     one = applied(scene, contributions, arrays)

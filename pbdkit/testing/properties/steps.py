@@ -23,15 +23,13 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
-from pbdkit.stepping.engine import Engine
+from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.stepping.stepper import Stepper
-from pbdkit.testing.properties.answers import differing
 from pbdkit.testing.properties.elementwise import ORDERLY
+from pbdkit.testing.properties.repetition import differing
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
-from pbdkit.testing.scenes import place_of
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
-from pbdkit.testing.subject import Subject, scenes_with
+from pbdkit.testing.subject import Subject, place_of, scenes_with
 
 ALL = tuple(INTERFACES.values())
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)

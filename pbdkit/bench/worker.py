@@ -1,0 +1,192 @@
+"""What a fresh process does for one measurement: ``python -m pbdkit.bench.worker ANSWER``, with the
+job as JSON on its input."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.api import load
+from pbdkit.bench.decay import decay_of, followers_of
+from pbdkit.equilibrium.certificate import Certificate, scale_of
+from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.newton import UnconvergedError
+from pbdkit.errors import ExperimentError, PbdkitError
+from pbdkit.experiment.model import Experiment
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.state import State, initial_state
+
+Floats = NDArray[np.float64]
+Job = dict[str, Any]
+REPEATS, PATIENCE_S = 7, 2.0
+"""A way is gone so often, unless that takes longer; the best counts."""
+LONGEST_S = 60.0
+"""After a tolerance that took longer, tighter ones are left out."""
+COMPILED = "pbdkit.stepping.compiled.stepper"
+SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "pyamg")
+
+
+def main(answer: Path) -> None:
+    """Does the job; what is wrong with it goes into the answer."""
+    job = json.load(sys.stdin)
+    try:
+        found = {"step": _step, "settle": _settle, "exact": _find_exact}[job["what"]](job)
+    except PbdkitError as error:
+        found = {"fault": type(error).__name__, "message": str(error)}
+    answer.write_text(json.dumps(found), encoding="utf-8")
+
+
+def peak_memory() -> int:
+    """Bytes at most resident in this process.
+
+    Linux counts what the process that started this one had resident into ru_maxrss, so the
+    figure of this program's own memory is taken where there is one.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    from resource import RUSAGE_SELF, getrusage
+
+    return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _import(*modules: str) -> int:
+    """Imports are no part of what is measured; peak memory after them."""
+    for module in modules:
+        if find_spec(module.split(".")[0]):
+            import_module(module)
+    return peak_memory()
+
+
+def _clock() -> Floats:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _step(job: Job) -> Job:
+    """Set-up, and for each number of steps `at`: the seconds to there, the best of several runs;
+    the largest distance from the truth in `sizes`, the largest displacements."""
+    experiment = load(job["experiment"], settings=job["settings"])
+    imports = _import(*[COMPILED] * (experiment.stepping.engine == "compiled"))
+    begun = _clock()
+    scene = build_scene(experiment)
+    built = _clock() - begun
+    engine, _ = make_engine(scene, choose(scene))
+    setup_s, _ = _clock() - begun
+    best, there, total, memory = np.full((len(job["at"]), 2), np.inf), [], 0.0, imports
+    for turn in range(REPEATS if job["at"] else 0):
+        state, spent = initial_state(scene), np.zeros(2)
+        for n, step in enumerate(job["at"]):
+            begun = _clock()
+            state = engine.advance(state, step - state.step)
+            spent += _clock() - begun
+            best[n] = np.minimum(best[n], spent)
+            if turn == 0:
+                there.append(_compared(scene, state, Path(job["truth"])))
+                memory = peak_memory()
+        total += spent[0]
+        if total + spent[0] > PATIENCE_S:
+            break
+    seconds, cpu = best.T.tolist()
+    distances, sizes = np.array(there).reshape(-1, 2).T.tolist()
+    return {
+        "particles": scene.raster.count,
+        "built": built.tolist(),
+        "setup_s": setup_s,
+        "seconds": seconds,
+        "cpu_s": cpu,
+        "distances": distances,
+        "sizes": sizes,
+        "peak_memory_mib": (memory - imports) / 2**20,
+    }
+
+
+def _compared(scene: Scene, state: State, truth: Path) -> tuple[float, float]:
+    """(largest distance, largest displacement of the truth): of followers where the exact answer is
+    known; else of what the first who comes to a step leaves for the others."""
+    exact, u = truth / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
+    if exact.exists():
+        u = u[:, followers_of(scene)]
+    file = exact if exact.exists() else truth / f"{state.step}.npy"
+    if not file.exists():
+        np.save(file, u)
+    known = np.load(file)
+    with np.errstate(all="ignore"):
+        return _longest(u - known), _longest(known)
+
+
+def _longest(u: Floats) -> float:
+    return float(np.sqrt((u * u).sum(axis=0)).max(initial=0.0))
+
+
+def _settle(job: Job) -> Job:
+    """A row for each tolerance, the loosest first, until one takes too long."""
+    imports, rows = _import(*SOLVERS), []
+    for tolerance in job["tolerances"]:
+        settings = [*job["settings"], f"solver.tolerance={tolerance:g}"]
+        experiment = load(job["experiment"], settings=settings)
+        best, total = np.full(2, np.inf), 0.0
+        for _ in range(REPEATS):
+            begun = _clock()
+            scene, state, certificate = _settled(experiment)
+            spent = _clock() - begun
+            best, total = np.minimum(best, spent), total + spent[0]
+            if total + spent[0] > PATIENCE_S:
+                break
+        rows.append(
+            {
+                "steps": certificate.inner_iterations,
+                "seconds": best[0],
+                "cpu_s": best[1],
+                "certified": certificate.share,
+                "distance": _compared(scene, state, Path(job["truth"]))[0],
+            }
+        )
+        if best[0] > LONGEST_S:
+            break
+    return {"rows": rows, "peak_memory_mib": (peak_memory() - imports) / 2**20}
+
+
+def _settled(experiment: Experiment) -> tuple[Scene, State, Certificate]:
+    scene = build_scene(experiment)
+    state = initial_state(scene)
+    try:
+        return scene, state, settle(scene, state)
+    except UnconvergedError as error:
+        return scene, state, error.certificate
+
+
+def _find_exact(job: Job) -> Job:
+    """The solver's own answer, as good as it gets, for the others to be compared with, and how many
+    steps lead to the tolerances."""
+    _import(*SOLVERS)
+    experiment = load(job["experiment"], settings=job["settings"])
+    if experiment.fracture.type != "none":
+        why = "speed against error is measured where no bond can break; set fracture={type: none}"
+        raise experiment.located(ExperimentError(why, ("fracture",)))
+    scene, state, certificate = _settled(experiment)
+    exact = state.u.reshape(len(state.u), -1)[:, followers_of(scene)].astype(float)
+    np.save(Path(job["truth"]) / "exact.npy", exact)
+    decay = decay_of(scene, exact)
+    return {
+        "particles": scene.raster.count,
+        "how": certificate.method,
+        "within": certificate.share,
+        "scale": scale_of(scene, initial_state(scene)),
+        "rate": decay.rate,
+        "steps": [decay.steps_to(tolerance) for tolerance in job["tolerances"]],
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,194 @@
+"""Finds the configuration at which no follower moves, leaders and bonds being what they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.equilibrium.certificate import Certificate, Moves, owed_by, rounding
+from pbdkit.equilibrium.krylov import product
+from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.watch import Watch
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State
+
+Vectors = NDArray[np.float64]
+MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
+LINEAR = 1e-9
+"""A correction that leaves less than this share of the moves came from the right linearisation."""
+SHORTEST = 2.0**-14
+"""The shortest share of a correction that is tried."""
+FIRST_ORDER = 2.0
+"""What a bound is multiplied with that holds to first order only."""
+
+
+class UnconvergedError(Exception):
+    """The best state found is no equilibrium; its certificate comes along."""
+
+    def __init__(self, reason: str, certificate: Certificate) -> None:
+        super().__init__(reason)
+        self.certificate = certificate
+
+
+class Finder:
+    """Looks for the equilibria of a scene, to a tolerance that is a length, by one of the solver's
+    methods. `scale` is the length that shares are of."""
+
+    def __init__(
+        self, scene: Scene, tolerance: float, scale: float, method: str, watch: Watch
+    ) -> None:
+        self.scene, self.method, self.watch = scene, method, watch
+        self.tolerance, self.scale = tolerance, scale
+        self.moves = Moves(scene)
+
+    def find(self, state: State, step: int) -> Certificate:
+        """Moves the followers of `state`, in place, to where they rest, with the roles of `step`.
+
+        The first linearisation is that of the scene at rest, exact for linear rules. Others are
+        linearised anew where they have come to (Newton's iteration, with shorter corrections where
+        the moves would grow). Raises ExperimentError where a part of the body has no equilibrium,
+        UnconvergedError, and StoppedError.
+        """
+        return _Search(self, state, step).run()
+
+
+class _Search:
+    def __init__(self, finder: Finder, state: State, step: int) -> None:
+        self._finder, self._state, self._step = finder, state, step
+        self._linearisations = self._inner = 0
+        self._linear = False
+        at_rest = replace(state, u=np.zeros_like(state.u))
+        finder.watch.begin("assembling")
+        operator = step_operator(finder.scene, at_rest, step)
+        self._place = finder.scene.raster.place_of(operator.followers)
+        self._X = finder.scene.raster.reference(operator.followers)
+        self._system = self._systematised(operator)
+        self._owed = owed_by(operator, state, self._place)
+        self._left = self._moves()
+
+    def run(self) -> Certificate:
+        if not self._left.any() and self._owed is None and not self._state.u.any():
+            self._linear = True  # nothing is prescribed but rest
+            return self._certified()
+        start, moves = self._state.u.copy(), self._left
+        if self._correct_linearly():
+            return self._certified()
+        if not self._linear:
+            if not self._is_better_than(moves):
+                self._state.u[...], self._left = start, moves
+            self._correct_anew()
+        return self._certified()
+
+    def _correct_linearly(self) -> bool:
+        """Corrections by the first system; whether the tolerance is reached, or the rule is known
+        not to be linear."""
+        for n in range(MOST_CORRECTIONS):
+            before, accuracy = _size(self._left), self._accuracy()
+            self._shift(self._system.solve(self._left, accuracy, self._owed), 1.0)
+            self._owed = None
+            after, floor = _size(self._left), self._floor()
+            if n == 0:
+                self._linear = before > 1e3 * floor and after <= self._expected(before, accuracy)
+            if not self._linear or not math.isfinite(after):
+                return False
+            if self._distance() <= self._finder.tolerance:
+                return True
+            if after > 0.5 * before:
+                return False
+        return False
+
+    def _correct_anew(self) -> None:
+        """Newton's iteration."""
+        while self._linearisations < MOST_LINEARISATIONS:
+            self._finder.watch.begin(f"linearising for the {self._linearisations + 1}. time")
+            operator = step_operator(self._finder.scene, self._state, self._step)
+            self._system = self._systematised(operator)
+            self._system.refuse_moving_floats(self._left, self._rounding())
+            if self._distance() <= self._finder.tolerance or not self._search_along(
+                self._system.solve(self._left, self._accuracy())
+            ):
+                return
+
+    def _search_along(self, correction: Vectors) -> bool:
+        """Whether some share of the correction makes the moves smaller; takes it."""
+        start, moves, share = self._state.u.copy(), self._left, 1.0
+        while share >= SHORTEST:
+            self._shift(correction, share)
+            if _size(self._left) < (1.0 - 1e-4 * share) * _size(moves):
+                return True
+            self._state.u[...], self._left = start, moves
+            share /= 2.0
+        return False
+
+    def _certified(self) -> Certificate:
+        distance = self._distance()
+        certificate = Certificate(
+            method=self._system.methods,
+            iterations=self._linearisations,
+            inner_iterations=self._inner + self._system.iterations,
+            residual=float(np.abs(self._left).max(initial=0.0)),
+            distance=distance,
+            share=distance / self._finder.scale,
+            bound=self._system.how,
+            linearised=not self._linear,
+        )
+        if not distance <= self._finder.tolerance:
+            raise UnconvergedError(self._why(), certificate)
+        return certificate
+
+    def _why(self) -> str:
+        if not np.isfinite(self._left).all():
+            return "it left the finite numbers"
+        if self._left.size and np.abs(self._left).max() <= 8 * self._rounding():
+            return "rounding alone allows no better"
+        if self._linearisations >= MOST_LINEARISATIONS:
+            return f"{MOST_LINEARISATIONS} linearisations did not get there"
+        return "no correction makes the moves smaller"
+
+    def _systematised(self, operator: StepOperator) -> System:
+        if self._linearisations:
+            self._inner += self._system.iterations
+        self._linearisations += 1
+        return System(operator, self._finder.method, self._X, self._finder.watch)
+
+    def _shift(self, correction: Vectors, share: float) -> None:
+        self._state.u.reshape(len(self._state.u), -1)[:, self._place] += share * correction.T
+        self._left = self._moves()
+
+    def _moves(self) -> Vectors:
+        return self._finder.moves.at(self._state, self._place)
+
+    def _is_better_than(self, moves: Vectors) -> bool:
+        return _size(self._left) < _size(moves)
+
+    def _distance(self) -> float:
+        bound = self._system.distance(self._left, self._rounding())
+        bound = bound if self._linear else FIRST_ORDER * bound
+        return bound if math.isfinite(bound) else math.inf
+
+    def _accuracy(self) -> float:
+        """How well a linear system must be solved for the tolerance."""
+        distance = self._distance()
+        wanted = self._finder.tolerance / distance if distance > 0.0 else 1.0
+        return min(1e-6, max(1e-13, wanted))
+
+    def _expected(self, before: float, accuracy: float) -> float:
+        return max(LINEAR, 10 * accuracy) * before + self._floor()
+
+    def _rounding(self) -> float:
+        return self._system.amplification * rounding(self._state.u)
+
+    def _floor(self) -> float:
+        return self._rounding() * math.sqrt(max(1, self._left.size))
+
+
+def _size(moves: Vectors) -> float:
+    with np.errstate(over="ignore"):
+        return math.sqrt(product(moves.ravel(), moves.ravel()))
+
+
+Floats = NDArray[np.float64]

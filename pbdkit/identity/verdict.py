@@ -1,0 +1,217 @@
+"""An identity in words: a verdict, notes, and a table to read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pbdkit.analysis.spectrum import NEUTRAL
+from pbdkit.identity.dispersion import Gradient, Range
+from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
+from pbdkit.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from pbdkit.identity.dispersion import LongWaves
+    from pbdkit.identity.identity import Identity
+
+SYMMETRIES = {
+    "isotropic": "isotropic {}",
+    "anisotropic": "anisotropic {}",
+    "square": "{} with the symmetry of a square",
+    "orthotropic": "orthotropic {}",
+    "general": "{} with no axis of symmetry",
+}
+Row = tuple[str, str]
+
+
+def verdict(found: Identity) -> str:
+    """What it is, in a few words."""
+    if found.kind == NEITHER:
+        return "neither diffusion nor elasticity"
+    return SYMMETRIES[found.symmetry or "general"].format(found.kind)
+
+
+def table(found: Identity) -> Table:
+    """A row a property; h is the spacing."""
+    from rich import box
+    from rich.table import Table
+
+    rows = Table(box=box.SIMPLE, show_header=False, pad_edge=False)
+    rows.add_column(no_wrap=True)
+    rows.add_column()
+    for name, value in (*_what(found), *_waves(found), *_character(found)):
+        rows.add_row(name, value)
+    return rows
+
+
+def _what(found: Identity) -> Iterator[Row]:
+    yield "it is", verdict(found)
+    for n, reason in enumerate(found.reasons):
+        yield "because" if n == 0 else "and", reason
+    yield "spacing h", f"{_number(found.spacing)} lattice unit{'s' if found.spacing != 1 else ''}"
+    if found.diffusivity is not None:
+        yield "diffusivity D", f"{_number(found.diffusivity)} h²/step"
+    if found.kind != DIFFUSION and found.body is not None:
+        yield from _elastic(found, found.body)
+
+
+def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
+    (_, c12, c16), (_, c22, c26), (*_, c66) = body.stiffness / body.stiffness[0, 0]
+    ratios = {"C22": c22, "C12": c12, "C66": c66}
+    ratios |= {name: c for name, c in (("C16", c16), ("C26", c26)) if abs(c) > SAME}
+    text = ", ".join(f"{name} {_number(c)}" for name, c in ratios.items())
+    yield "elastic constants", f"{text} in units of C11 = {_number(body.stiffness[0, 0])} h²/step"
+    if (ratio := found.poisson_ratio) is not None:
+        strain = f", {_number(ratio / (1 + ratio))} in plane strain" if ratio > -0.999 else ""
+        yield "Poisson's ratio", f"{_number(ratio)} in plane stress{strain}"
+        return
+    along = [body.poisson_ratio(angle) for angle in (0.0, 90.0)]
+    texts = ["none" if r is None else _number(r) for r in along]
+    yield "Poisson's ratio", f"{texts[0]} pulled along x, {texts[1]} along y (plane stress)"
+    yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {_number(body.zener)}, isotropic 1"
+    if body.axis is not None:
+        yield "axis of symmetry", f"at {_number(body.axis)}°"
+
+
+def _waves(found: Identity) -> Iterator[Row]:
+    if found.long is None:
+        return
+    one = found.kind == DIFFUSION
+    for name, waves in (("fast", found.long.fast), ("slow", found.long.slow)):
+        if not one or (name == "fast" and not found.isotropic):
+            label = "diffusivity D" if one else f"{name} long waves"
+            yield label, _range_text(waves, one=one)
+    speeds = [found.speed(d) for d in _ends(found.long)]
+    if found.memory == 0.0:
+        yield "wave speed", f"none without memory; as memory goes to 1, {_speeds(found.long)}"
+    elif None in speeds:
+        yield "wave speed", f"none with memory {found.memory:g}"
+    else:
+        text = _span(*(speed or 0.0 for speed in speeds))
+        yield "wave speed", f"{text} h/step with memory {found.memory:g}"
+    for gradient in found.long.gradients:
+        yield "gradient length²", _gradient_text(gradient)
+
+
+def _ends(long: LongWaves) -> tuple[float, float]:
+    return long.slow.smallest, long.fast.largest
+
+
+def _speeds(long: LongWaves) -> str:
+    return f"{_span(*(float(np.sqrt(max(d, 0.0))) for d in _ends(long)))} h/step"
+
+
+def _range_text(waves: Range, *, one: bool) -> str:
+    unit = "h²/step" if one else "h²/step diffusivity"
+    if waves.largest - waves.smallest < 1e-8 * abs(waves.largest):
+        return f"{_number(waves.largest)} {unit} in every direction"
+    return (
+        f"{_number(waves.largest)} {unit} along {_number(waves.at_largest)}°, "
+        f"{_number(waves.smallest)} along {_number(waves.at_smallest)}°"
+    )
+
+
+def _gradient_text(gradient: Gradient) -> str:
+    where = (
+        f"along {_number(gradient.direction)}°, across rows {_number(gradient.rows_apart)} h apart"
+    )
+    fast, slow = gradient.material
+    values = _number(fast) if abs(fast - slow) < 1e-9 else f"{_number(fast)} and {_number(slow)}"
+    return f"{values} h² {where}"
+
+
+def _span(low: float, high: float) -> str:
+    return _number(low) if high - low < 1e-9 * high else f"{_number(low)} to {_number(high)}"
+
+
+def _character(found: Identity) -> Iterator[Row]:
+    spectrum, yes = found.spectrum, {True: "yes", False: "no"}
+    turning = f", imaginary parts up to {_number(spectrum.imaginary)}"
+    yield (
+        "eigenvalues",
+        f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
+        + turning * (spectrum.imaginary > NEUTRAL),
+    )
+    yield "relaxation", _relaxation_text(found)
+    yield "linear", yes[found.linear]
+    yield "symmetric", "yes, k weighs for j as j for k" if found.symmetric else "no"
+    yield "turns with the body", yes[found.turns]
+    yield "rests at free edges", yes[found.rests_at_edges]
+
+
+def _relaxation_text(found: Identity) -> str:
+    with_memory = f" with memory {found.memory:g}" if found.memory else ""
+    bound = found.spectrum.largest_stable_relaxation
+    if bound is not None:
+        return f"stable below {_number(bound)}{with_memory}"
+    grows = found.spectrum.largest > 1.0 + NEUTRAL or abs(found.memory) >= 1.0
+    return f"diverges at any{with_memory}" if grows else "no bound"
+
+
+def _number(value: float) -> str:
+    """Six digits; what is rounding, in units of the spacing, is 0."""
+    return f"{round(value, 11) + 0.0:.6g}"
+
+
+def notes_on(found: Identity, scene: Scene) -> tuple[str, ...]:
+    """A line each."""
+    notes = []
+    if not found.linear:
+        notes.append("the rule is not linear: this is what it is for small displacements from rest")
+    if scene.experiment.rule.uses_reference:
+        notes.append("it asks for the place: the figures are those in the middle of the body")
+    if scene.experiment.neighbours.nearness():
+        notes.append("neighbours are found anew: the figures hold while they are those at rest")
+    if found.stencil.sites > 1:
+        notes.append(f"{found.stencil.sites} sites a cell: shifts of them are eliminated")
+    if found.long is not None:
+        notes += _notes_of_long_waves(found, found.long)
+    bound = found.spectrum.largest_stable_relaxation
+    if bound is None and found.spectrum.largest > 1 + NEUTRAL:
+        notes.append("some waves grow at any relaxation")
+    elif bound is not None and found.relaxation > bound * (1 + NEUTRAL):
+        notes.append(f"relaxation {found.relaxation:g} diverges; it is stable below {bound:.6g}")
+    return tuple(notes)
+
+
+def _notes_of_long_waves(found: Identity, long: LongWaves) -> list[str]:
+    notes = []
+    if abs(long.slow.smallest) <= SAME * abs(long.fast.largest):
+        notes.append(f"some long waves along {long.slow.at_smallest:.4g}° do not decay at all")
+    if found.kind == DIFFUSION and found.body:
+        notes.append("away from free edges it is plane-stress elasticity with Poisson's ratio -1")
+    if found.kind == ELASTICITY and long.elasticity:
+        notes += _notes_of_body(long.elasticity)
+        if not found.rests_at_edges:
+            notes.append("away from free edges it is elastic; at them it pulls inwards")
+    return [*notes, *_notes_of_gradients(long)]
+
+
+def _notes_of_gradients(long: LongWaves) -> list[str]:
+    attracting = [f"{g.direction:.4g}°" for g in long.gradients if min(g.material) < -SAME]
+    if attracting:
+        return [
+            f"rows beyond the next attract along {', '.join(attracting)}: the wrong sign for "
+            "gradient elasticity, and an effect that vanishes with the spacing"
+        ]
+    squares = [l2 for gradient in long.gradients for l2 in gradient.material]
+    if not squares or min(squares) <= SAME:
+        return []
+    low, high = float(np.sqrt(min(squares))), float(np.sqrt(max(squares)))
+    span = f"{low:.6g}" if high - low < SAME else f"{low:.6g} to {high:.6g}"
+    return [f"it is gradient elasticity, with a length of {span} h"]
+
+
+def _notes_of_body(body: Elasticity) -> list[str]:
+    notes = []
+    if body.least_stiffness < -SAME:
+        notes.append("some uniform strain lowers the energy: only held edges keep it in shape")
+    elif body.least_stiffness < SAME:
+        notes.append("some uniform strain costs no energy")
+    if np.abs(body.mobility - np.eye(2)).max() > SAME:
+        notes.append("x and y go to equilibrium at different rates; the equilibrium is elastic")
+    return notes

@@ -1,0 +1,226 @@
+"""How far bonds are, or were, from breaking: from a dataset and the scene of its experiment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.interfaces import Bonds, BreaksAtStrain
+from pbdkit.interfaces.fracture_model import breaking_order
+from pbdkit.scene.declarations import bond_numbers
+from pbdkit.scene.raster import FRAME
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.remembered_values import describe_bonds
+
+if TYPE_CHECKING:
+    import xarray
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One bond: the numbers of its particles, its shell and rest length, and how it stands.
+
+    `state` is "intact", "broken", "broken from the start" or "cannot break". `step`, `order` (among
+    the broken ones, from 1) and `strain_at_break` are None unless they are known; `breaks_above` is
+    the strain that it bears, None where the model does not say. `strain` is that of the recorded
+    step `at_step`.
+    """
+
+    bond: tuple[int, int]
+    shell: int
+    rest_length: float
+    state: str
+    step: int | None
+    order: int | None
+    strain_at_break: float | None
+    breaks_above: float | None
+    strain: float
+    at_step: int
+
+    @property
+    def share(self) -> float | None:
+        """How far it is on its way to breaking at that step, 1 where it breaks."""
+        return self.strain / self.breaks_above if self.breaks_above else None
+
+
+class Explained:
+    """What a dataset tells of its bonds. Raises ExperimentError where it has no table of them."""
+
+    def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
+        if "bond" not in dataset.variables:
+            raise ExperimentError(
+                "has no table of bonds: nothing could break in this run; run the experiment with "
+                "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
+            )
+        self._dataset, self._scene = dataset, scene
+        self.bonds: Bonds = describe_bonds(scene)
+        if not np.array_equal(self.bonds.ends - 1, dataset["bond"].values):
+            raise ExperimentError(
+                "its bonds are not those of the experiment that it carries: the file was changed, "
+                "or another version of a part made it"
+            )
+
+    @property
+    def fracture(self) -> str:
+        """The type of the fracture model."""
+        return self._scene.experiment.fracture.type
+
+    @cached_property
+    def steps(self) -> NDArray[np.int32]:
+        """(bond,): when each broke, -1 where it has not."""
+        if "broken_step" not in self._dataset:
+            return np.full(len(self.bonds), -1, np.int32)
+        steps: NDArray[np.int32] = self._dataset["broken_step"].values
+        return steps
+
+    @cached_property
+    def strains_at_break(self) -> Floats:
+        """(bond,): NaN where it is not known."""
+        if "broken_strain" not in self._dataset:
+            return np.full(len(self.bonds), np.nan)
+        strains: Floats = self._dataset["broken_strain"].values
+        return strains
+
+    @cached_property
+    def order(self) -> Rows:
+        """The rows of the broken bonds, in the order in which they broke."""
+        return breaking_order(self.steps, self.strains_at_break)
+
+    @cached_property
+    def limits(self) -> Floats:
+        """(bond,): the strain above which each breaks, NaN where the model does not say."""
+        limits, constants = np.full(len(self.bonds), np.nan), self._scene.constants
+        model = self._scene.experiment.fracture
+        numbers = [number.name for number in bond_numbers(self._scene.experiment)]
+        if not isinstance(model, BreaksAtStrain) or not model.can_break:
+            return limits
+        if any(name not in self._dataset for name in numbers):
+            return limits
+        own = [_last(self._dataset[name]).astype(float) for name in numbers]
+        for n, plane in enumerate(self._scene.neighbourhood.planes):
+            rows = np.flatnonzero(self._scene.bonds.plane == n)
+            c = constants.of_bond(*constants.limits[plane.slot], *(values[rows] for values in own))
+            limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
+        return limits
+
+    @cached_property
+    def spared(self) -> NDArray[np.bool_]:
+        """(bond,): those that cannot break."""
+        model = self._scene.experiment.fracture
+        if not model.can_break:
+            return np.ones(len(self.bonds), np.bool_)
+        frame = self._dataset["kind"].isel(time=0).values == FRAME
+        touches: NDArray[np.bool_] = frame[self.bonds.ends - 1].any(axis=1)
+        return touches & (not model.breaks_frame_bonds())
+
+    def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
+        """(..., bond): of some bonds at recorded times, by their places along `time`."""
+        particles = np.unique(self.bonds.ends[rows] - 1)
+        at = {"time": time, "particle": particles}
+        if "u" in self._dataset:
+            u = self._dataset["u"].isel(at).values
+        else:
+            reference = self._dataset["reference"].isel(particle=particles).values
+            u = self._dataset["position"].isel(at).values - reference
+        if not np.isfinite(u).all():
+            raise StorageError("is damaged, or was changed: it has positions that are not finite")
+        a, b = (np.searchsorted(particles, self.bonds.ends[rows, end] - 1) for end in (0, 1))
+        rest = self.bonds.rest[rows]
+        now = rest + (u[..., b, :] - u[..., a, :])
+        strains: Floats = np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0
+        return strains
+
+    def standings(self, rows: Rows, until: int | None = None) -> list[Standing]:
+        """How some bonds stand, strained as at the last recorded step, or the last one until a
+        step."""
+        place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
+        times = self._dataset["time"].values
+        time = len(times) - 1 if until is None else int(np.searchsorted(times, until, "right")) - 1
+        strains, at = self.strains(rows, time).tolist(), int(times[time])
+        return [
+            self._standing(row, place.get(row), strain, at)
+            for row, strain in zip(rows.tolist(), strains, strict=True)
+        ]
+
+    def _standing(self, row: int, order: int | None, strain: float, at: int) -> Standing:
+        step, bonds = int(self.steps[row]), self.bonds
+        state = "broken" if step > 0 else "broken from the start" if step == 0 else "intact"
+        if step < 0 and self.spared[row]:
+            state = "cannot break"
+        a, b = bonds.ends[row].tolist()
+        return Standing(
+            bond=(a, b),
+            shell=int(bonds.shell[row]),
+            rest_length=float(np.hypot(*bonds.rest[row])),
+            state=state,
+            step=step if step >= 0 else None,
+            order=order,
+            strain_at_break=_known(self.strains_at_break[row]),
+            breaks_above=None if self.spared[row] else _known(self.limits[row]),
+            strain=strain,
+            at_step=at,
+        )
+
+    def nearest(self) -> Standing | None:
+        """The bond that is nearest to breaking at the last recorded step, if that is known."""
+        rows = np.flatnonzero((self.steps < 0) & ~self.spared & np.isfinite(self.limits))
+        if not len(rows):
+            return None
+        share = self.strains(rows) / self.limits[rows]
+        return self.standings(rows[[np.argmax(share)]])[0]
+
+    def row(self, a: int, b: int) -> int:
+        """The row of the bond between two numbers. Raises ExperimentError where there is none."""
+        count = int(self._dataset.sizes["particle"])
+        for number in (a, b):
+            if not 1 <= number <= count:
+                raise ExperimentError(
+                    f"there is no particle {number}; they are numbered 1 to {count}"
+                )
+        found = np.flatnonzero((self.bonds.ends == sorted((a, b))).all(axis=1))
+        if len(found):
+            return int(found[0])
+        mine = self.bonds.ends[(self.bonds.ends == a).any(axis=1)]
+        others = ", ".join(map(str, sorted(mine[mine != a].tolist()))) or "nobody"
+        raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {others}")
+
+    def around(self, row: int) -> Rows:
+        """The other bonds at the ends of a bond, the broken ones first and in their order."""
+        a, b = self.bonds.ends[row]
+        ends = self.bonds.ends
+        rows = np.flatnonzero(((ends == a) | (ends == b)).any(axis=1))
+        place = np.full(len(self.bonds), len(self.order))
+        place[self.order] = np.arange(len(self.order))
+        rows = rows[rows != row]
+        in_order: Rows = rows[np.argsort(place[rows], kind="stable")]
+        return in_order
+
+    def most_strained(self, row: int) -> tuple[int, float]:
+        """The recorded step at which a bond was the longest, and its strain then."""
+        history = self.strains(np.array([row]), slice(None))[:, 0]
+        most = int(np.argmax(history))
+        return int(self._dataset["time"].values[most]), float(history[most])
+
+    def remembered(self, row: int) -> dict[str, float]:
+        """What the model remembers of a bond, at the last recorded step."""
+        names = [number.name for number in bond_numbers(self._scene.experiment)]
+        known = [name for name in names if name in self._dataset]
+        return {name: float(_last(self._dataset[name])[row]) for name in known}
+
+
+def _last(variable: xarray.DataArray) -> NDArray[Any]:
+    at = variable.isel(time=-1) if "time" in variable.dims else variable
+    values: NDArray[Any] = at.values
+    return values
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,179 @@
+"""What a solver does to a scene: one interface, with two implementations."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Generator
+from typing import TYPE_CHECKING
+
+from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.newton import UnconvergedError
+from pbdkit.equilibrium.watch import StoppedError, Watch
+from pbdkit.results.recorder import Outcome
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import Choice, choose, make_engine
+from pbdkit.stepping.guard import Guard
+from pbdkit.stepping.state import State
+
+if TYPE_CHECKING:
+    from pbdkit.equilibrium.settlement import Settling
+
+States = Generator[State, None, Outcome]
+
+
+class Driver(ABC):
+    """Takes one scene from a state to its end, once.
+
+    `state` is where it stands, `choice` what steps it. `ending` says of a state just given out that
+    it is the last of a run that ends before its last step, to be kept whatever the plan.
+    """
+
+    choice: Choice
+
+    def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
+        self.scene, self.state, self.watch = scene, state, watch
+        self.ending = False
+        self.rejection: FloatingPointError | None = None
+        """Why whoever looked at the last state could not use it; its next move is up to the
+        driver."""
+
+    @abstractmethod
+    def states(self) -> States:
+        """The states on the way, the first included, each valid until the next is asked for; then
+        how it ended. Raises ExperimentError where there is no way."""
+
+
+LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
+"""An engine is called for so long at most, so that progress shows and interruptions are heard."""
+
+
+class Stepwise(Driver):
+    """The driver of the solver `stepping`: gives out a state at every step of which something is
+    wanted, and some between.
+
+    What decides how it goes on, besides the state: `guard`, `settling.pace` and `kept`.
+    """
+
+    def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
+        super().__init__(scene, state, watch)
+        self._engine, self.choice = make_engine(scene, choose(scene))
+        self._patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
+        self.guard = Guard.of(scene, state)
+        self.settling = _settling(scene, state, watch)
+        self.kept = -1
+        """The last step that was given out to be recorded, and was not rejected."""
+
+    def states(self) -> States:
+        """A run that diverges gives out the last good state at its end, where that is later than
+        what was recorded."""
+        try:
+            return (yield from self._stepped())
+        except FloatingPointError as error:
+            return (yield from self._diverged(error))
+
+    def _stepped(self) -> States:
+        steps = self.scene.experiment.steps
+        try:
+            yield self.state
+            self._heed()
+            while not (outcome := self._settled()) and (step := self.state.step) < steps:
+                self.watch.look(step / steps, f"step {step} of {steps}")
+                self._advance()
+                yield self.state
+                self._heed()
+        except StoppedError:
+            step = self.state.step
+            stopped = Outcome("interrupted", f"stopped after step {step}", step)
+            outcome = stopped if step < steps else None
+        if self.kept < self.state.step:
+            self.ending = True
+            yield self.state
+            self._heed()
+        if outcome:
+            return outcome
+        unsettled = f", not settled: {self.settling.obstacle}" if self.settling else ""
+        return Outcome("complete", f"all steps done{unsettled}", steps)
+
+    def _advance(self) -> None:
+        """To the next step at which to look. Raises FloatingPointError."""
+        experiment, state = self.scene.experiment, self.state
+        reached = min(
+            experiment.next_wanted(state.step), self.guard.next_look, state.step + self._patience
+        )
+        if self.settling:
+            reached = min(reached, self.settling.pace.next_look)
+        looks = reached == self.guard.next_look or self._records(reached)
+        self.state = self._engine.advance(state, reached - state.step)
+        if looks:
+            self.guard.look(self.scene, self.state)
+
+    def _heed(self) -> None:
+        """Raises what whoever looked at the state has against it."""
+        if self.rejection:
+            raise self.rejection
+        if self._records(self.state.step):
+            self.kept = self.state.step
+
+    def _records(self, step: int) -> bool:
+        experiment = self.scene.experiment
+        return experiment.recording.keeps(step, experiment.steps)
+
+    def _settled(self) -> Outcome | None:
+        state = self.state
+        if self.settling is None or state.step != self.settling.pace.next_look:
+            return None
+        found = self.settling.look(state)
+        return Outcome("settled", str(found), state.step, found.as_dict()) if found else None
+
+    def _diverged(self, error: FloatingPointError) -> States:
+        step, rule = self.state.step, self.scene.experiment.rule.type
+        reason, self.rejection = f"{error} left all bounds under rule '{rule}'", None
+        if self.kept < step - 1:
+            good = self.guard.last_good(
+                self.scene, self._engine, step, self._patience, self.watch.stopping
+            )
+            if good is not None and good.step > self.kept:
+                self.ending = True
+                yield good
+                if not self.rejection:  # else a diagnostic of it is not finite
+                    reason += (
+                        f"; kept is step {good.step}, the last no larger than the body and its "
+                        "leaders' ways"
+                    )
+        return Outcome("diverged", reason, step)
+
+
+def _settling(scene: Scene, start: State, watch: Watch) -> Settling | None:
+    asked = scene.experiment.stepping.settle
+    if asked is None:
+        return None
+    from pbdkit.equilibrium.settlement import Settling  # only where it is asked for
+
+    return Settling(scene, asked, start, watch)
+
+
+class Straight(Driver):
+    """The driver of the solver `equilibrium`: gives out the start and the equilibrium."""
+
+    choice = Choice("equilibrium", 1, "asked for")
+
+    def states(self) -> States:
+        """Interrupted, it gives out how far it had come."""
+        state, steps = self.state, self.scene.experiment.steps
+        yield state
+        try:
+            certificate = settle(self.scene, state, self.watch)
+            outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
+        except UnconvergedError as error:
+            found = error.certificate
+            outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+        except StoppedError:
+            self.ending = True
+            yield state
+            reason = f"stopped on the way to equilibrium, after step {state.step}"
+            return Outcome("interrupted", reason, state.step)
+        state.step = steps
+        yield state
+        if self.rejection:
+            return Outcome("unconverged", f"{self.rejection} left all bounds", steps)
+        return outcome

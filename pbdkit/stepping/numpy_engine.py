@@ -1,0 +1,71 @@
+"""The engine interface: what takes a state some steps further."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+
+import numpy as np
+
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.followers import Followers, SlotFollowers
+from pbdkit.stepping.moving_neighbours import GatheringFollowers
+from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.stepping.state import Floats, State
+
+
+class Engine(ABC):
+    """Steps the states of one scene. All engines give the same numbers, to the last bit where
+    rules keep to + - × ÷ and square roots."""
+
+    name: str
+    threads: int = 1
+
+    @abstractmethod
+    def advance(self, state: State, steps: int = 1) -> State:
+        """The state so many steps on. It takes over the arrays of `state`, which is void
+        afterwards."""
+
+
+class Stepper(Engine):
+    """The numpy engine: the oracle of every faster one. It holds what is constant and no state."""
+
+    name = "numpy"
+
+    def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
+        self._scene = scene
+        self._rule = scene.experiment.rule
+        self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        near = scene.experiment.neighbours.nearness()
+        self._followers: Followers = followers or (
+            GatheringFollowers(scene, near) if near else SlotFollowers(scene)
+        )
+
+    def advance(self, state: State, steps: int = 1) -> State:
+        """One step after the other."""
+        for _ in range(steps):
+            state = self._step(state)
+        return state
+
+    def _step(self, state: State) -> State:
+        step, u, new = state.step + 1, state.u, state.previous
+        led, starts = prescribe(self._scene, state, step)
+        before = [(places, u.reshape(len(u), -1)[:, places].copy()) for places, _ in led]
+        place(u, led)
+        if self._fracturing:
+            self._fracturing.break_bonds(u, state, step)
+        # What leaves the finite numbers is found at recording.
+        with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
+            self._followers.move(u, new, state)
+        place(new, led)
+        place(u, before)
+        self._move_frame(u, new)
+        return replace(state, step=step, u=new, previous=u, starts=starts)
+
+    def _move_frame(self, old: Floats, new: Floats) -> None:
+        """u of every frame point from the body's, of this step or, with lag, of the last."""
+        if self._scene.frame:
+            body = old if self._scene.frame.map.lag else new
+            self._scene.frame.follow(body.reshape(len(body), -1), new.reshape(len(new), -1))

@@ -1,0 +1,212 @@
+"""What is asked of the answers of every component: that they follow from the question alone."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import random
+import types
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pbdkit.interfaces import (
+    INTERFACES,
+    Component,
+    Diagnostic,
+    FollowerRule,
+    FractureModel,
+    FramePolicy,
+)
+from pbdkit.testing.calls import applied, differences, gathered, here
+from pbdkit.testing.property import Arrays, PropertyError, Question, asked_of
+from pbdkit.testing.subject import Subject
+
+ALL = tuple(INTERFACES.values())
+NEEDS = (
+    "has-a-sound-cell",
+    "is-mutual",
+    "takes-part",
+    "declares-what-it-remembers",
+    "draws-what-it-remembers",
+)
+UNUSUAL = 918273645
+"""A seed that nobody else takes."""
+REPEATABLE = (*NEEDS, "changes-no-input", "remembers-nothing", "answers-the-same")
+"""What must hold before any comparison of two answers means something."""
+
+
+def differing(one: Arrays, other: Arrays) -> list[str]:
+    """The names of the answers that are not the same to the last bit."""
+    names = [name for name in one if name not in other or not _same(one[name], other[name])]
+    return names + [name for name in other if name not in one]
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    numbers = a.dtype.kind in "fc"
+    return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=numbers)
+
+
+@asked_of(*ALL, needs=("has-a-sound-cell", "is-mutual"))
+def takes_part(subject: Subject) -> None:
+    """A scene can be built with it: at least one of those tried takes it, and none makes it fail
+    with anything but an ExperimentError."""
+    subject.scene()
+
+
+@asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, needs=NEEDS)
+def changes_no_input(subject: Subject) -> None:
+    """What it is given it leaves as it is: the arrays belong to the state of the run."""
+    for question in subject.questions():
+        given = {name: np.array(value) for name, value in question.inputs.items()}
+        try:
+            with np.errstate(all="ignore"):
+                question.ask(given)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise PropertyError(_written(question.what, "what it is given")) from error
+        if names := differing(dict(question.inputs), given):
+            raise PropertyError(_written(question.what, _listed(names)))
+
+
+def _written(function: str, where: str) -> str:
+    return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
+
+
+@asked_of(*ALL, needs=(*NEEDS, "changes-no-input"))
+def remembers_nothing(subject: Subject) -> None:
+    """What it was asked before does not matter: whatever must be remembered belongs to the state of
+    the run, or a run that is continued would differ from one that was never interrupted."""
+    for question, other in zip(subject.questions(0), subject.questions(-1), strict=False):
+        before = remembered(subject.component)
+        answers = [question.answer() for _ in range(3)]
+        other.answer()
+        question.larger().answer()
+        later = question.answer()
+        kept = changed(before, remembered(subject.component))
+        steady = not differing(answers[1], answers[2])
+        if differing(answers[2], later) and (steady or kept):
+            what = f", and keeps {_listed(kept)} from call to call" if kept else ""
+            raise PropertyError(
+                f"`{question.what}` answers the same question otherwise after another one{what}"
+            )
+
+
+@asked_of(*ALL, needs=(*NEEDS, "changes-no-input", "remembers-nothing"))
+def answers_the_same(subject: Subject) -> None:
+    """The same question gets the same answer to the last bit, and the generators of random numbers
+    that all share stay as they are, so that every run can be repeated."""
+    for question in subject.questions():
+        kept = random.getstate(), np.random.get_state()
+        random.seed(UNUSUAL)
+        np.random.seed(UNUSUAL)
+        before = pickle.dumps((random.getstate(), np.random.get_state()))
+        names = differing(question.answer(), question.answer())
+        after = pickle.dumps((random.getstate(), np.random.get_state()))
+        random.setstate(kept[0])
+        np.random.set_state(kept[1])
+        if not names and after != before:
+            raise PropertyError(
+                f"`{question.what}` seeds or uses the generator of random numbers that all share"
+            )
+        if names:
+            raise PropertyError(
+                f"`{question.what}` answers the same question otherwise the second time "
+                f"({_listed(names)}): it draws numbers at random that nobody gave "
+                "it, or looks at a clock"
+            )
+
+
+@asked_of(*ALL, needs=(*REPEATABLE, "returns-a-value-a-particle"))
+def is_finite(subject: Subject) -> None:
+    """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
+    one NaN spreads over the body within a few steps."""
+    for question in [*subject.questions(), *_meeting(subject)]:
+        for name, value in question.answer().items():
+            if value.dtype.kind in "fc" and not np.isfinite(value).all():
+                worst = value[~np.isfinite(value)].flat[0]
+                raise PropertyError(
+                    f"`{question.what}` answers {worst} ({name}): guard the division, as in "
+                    "`a / where(b > 0.0, b, 1.0)`"
+                )
+
+
+def _meeting(subject: Subject) -> list[Question]:
+    """A rule asked where r + d = 0 along every slot."""
+    rule = subject.component
+    if not isinstance(rule, FollowerRule):
+        return []
+    scene = subject.scene()
+    arrays = differences(scene, 0) | here(scene, 0)
+    for k, slot in enumerate(scene.neighbourhood.slots[0]):
+        for c, r in zip("xy", slot.rest, strict=True):
+            arrays[f"d{k}.{c}"] = np.full_like(arrays[f"d{k}.{c}"], -r)
+
+    def ask(given: Arrays) -> Arrays:
+        return applied(scene, gathered(scene, given), given)
+
+    return [Question("apply, where all neighbours meet in the particle,", arrays, ask)]
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(f"`{name}`" for name in names[:3])
+    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+Kept = dict[str, bytes]
+
+
+def remembered(component: Component) -> Kept:
+    """Every value that the component's functions can reach and change, by name, as bytes."""
+    return {name: _content(value) for name, value in _reached(component)}
+
+
+def changed(before: Kept, after: Kept) -> list[str]:
+    """The names of the values that differ."""
+    return sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
+
+
+def _reached(component: Component) -> Iterator[tuple[str, Any]]:
+    yield "private attributes", dict(component.__pydantic_private__ or {})
+    cached = {n for k in type(component).__mro__ for n, v in vars(k).items()
+              if isinstance(v, cached_property)}  # fmt: skip
+    for name, value in vars(component).items():
+        if name not in cached:
+            yield name, value
+    for owner in type(component).__mro__:
+        if owner.__module__.startswith(("pbdkit.interfaces", "pydantic", "builtins", "abc")):
+            continue
+        for name, value in list(vars(owner).items()):
+            if name.startswith(("__", "_abc_", "model_")):
+                continue
+            function = inspect.unwrap(getattr(value, "__func__", value))
+            if isinstance(function, types.FunctionType):
+                yield from _of_function(function)
+            elif not isinstance(value, types.FunctionType):
+                yield f"{owner.__name__}.{name}", value
+
+
+def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+    """Globals, closures, defaults and attributes of a function; helpers one call away."""
+    yield f"defaults of {function.__name__}", (function.__defaults__, function.__kwdefaults__)
+    yield f"attributes of {function.__name__}", vars(function)
+    reached = inspect.getclosurevars(function)
+    for name, value in {**reached.globals, **reached.nonlocals}.items():
+        if isinstance(value, types.FunctionType):
+            if not value.__module__.startswith(("pbdkit.", "numpy")):
+                yield f"attributes of {value.__name__}", vars(value)
+                yield from inspect.getclosurevars(value).globals.items()
+        else:
+            yield name, value
+
+
+def _content(value: Any) -> bytes:
+    if isinstance(value, (types.FunctionType, type, types.ModuleType)):
+        return b""
+    try:
+        return pickle.dumps(value)
+    except Exception:
+        return repr(value).encode()
