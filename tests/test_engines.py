@@ -15,7 +15,7 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import choice
 from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.compiled import compiled_stepper, runs
+from pbdkit.stepping.compiled import compiled_stepper, stretches
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.compiled.functions import source_key
 from pbdkit.stepping.numpy_engine import Stepper
@@ -204,7 +204,7 @@ def test_kinds_of_rows_are_a_matter_of_speed_alone(parts, monkeypatch):
     """Everything in the loop over slots, or as much as can be without."""
     scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
     for short in (0, 5, 100):
-        monkeypatch.setattr(runs, "SHORT", short)
+        monkeypatch.setattr(stretches, "SHORT", short)
         assert_bitwise_equal(scene, CompiledStepper(scene))
 
 

@@ -12,7 +12,7 @@ from pbdkit.stepping.compiled.plan import Function, Plan, values
 def write_bond_pass(plan: Plan) -> Function:
     """The function that renews the bonds of some rows, and breaks them."""
     out = Function(plan.shared, "judge_bonds", "first_row", "last_row")
-    axes, seen, model = range(len(plan.axes)), plan.levels[-1].seen, plan.model
+    axes, seen = range(len(plan.axes)), plan.levels[-1].seen
     bonds = [number for number in seen.bond if number.home is Home.BOND]
     literal = [plan.number(value) for value in plan.scene.constants.fracture]
     out.add(0, f"q = Fracture({values(seen.fracture, {}, literal)})")
@@ -33,6 +33,13 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(depth, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
     out.add(depth, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
     out.add(depth, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(len(bonds))))
+    _write_judging(out, plan, depth, [number.changes for number in bonds])
+    return out
+
+
+def _write_judging(out: Function, plan: Plan, depth: int, changes: list[bool]) -> None:
+    """One row of bonds; of the numbers that they remember some change."""
+    model, seen = plan.model, plan.levels[-1].seen
     c = values(seen.bond, {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]"})
     can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
     if model.breaks_frame_bonds():
@@ -42,7 +49,7 @@ def write_bond_pass(plan: Plan) -> Function:
         )
     d = f"d = {plan.vector(f'n{c}[j] - h{c}[j]' for c in plan.axes)}"
     news: list[str] = []
-    changing = [m for m, number in enumerate(bonds) if number.changes]
+    changing = [m for m, changing in enumerate(changes) if changing]
     if isinstance(model, RenewsBonds):
         news = [f"new = update(d, r, Constants({c}), q)"]
         news += [f"new{m} = new[{position}]" for position, m in enumerate(changing)]
@@ -59,7 +66,6 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(depth + 2, f"if (since[j] < 0) & {can}:")
     out.add(depth + 3, d, *news, *(f"b{m}[j] = new{m}" for m in changing))
     out.add(depth + 3, f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)")
-    return out
 
 
 def write_events(plan: Plan) -> Function:

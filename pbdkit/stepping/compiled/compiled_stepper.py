@@ -19,7 +19,7 @@ from pbdkit.stepping.compiled.levels import levels_of, load_blamed, sample_value
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
-from pbdkit.stepping.compiled.runs import find_runs
+from pbdkit.stepping.compiled.stretches import find_runs
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State
