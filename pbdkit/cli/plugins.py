@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from pbdkit.registry.plugin import Plugin
     from pbdkit.testing import Report
 
-UNLIMITED = 10_000
 INTERFACES = (
     "FollowerRule",
     "Lattice",
@@ -67,7 +65,7 @@ def list_(as_json: bool) -> None:
 )
 def new(name: str, interface: str, parent: Path) -> None:
     """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
-    from pbdkit.skeleton.project import project_of
+    from pbdkit.cli.project import project_of
 
     project = project_of(name, interface)
     folder = project.write(parent)
@@ -125,17 +123,17 @@ def _rows(plugin: Plugin) -> list[dict[str, str]]:
 
 
 def _print(rows: list[dict[str, str]]) -> None:
-    """A table; a line a row where it goes to a file or another program."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from pbdkit.cli.output import show_table
 
     table = Table(box=None, pad_edge=False)
     for column in rows[0]:
         table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
     for row in rows:
         table.add_row(*(Text(value) for value in row.values()))  # no markup: [x] is what it says
-    Console(width=None if sys.stdout.isatty() else UNLIMITED).print(table)
+    show_table(table)
 
 
 def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:

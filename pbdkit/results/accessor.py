@@ -79,7 +79,7 @@ def _fault(version: Any) -> str | None:
     if version is None:
         return "is no dataset of pbdkit: it has no attribute schema_version"
     try:
-        newer = _parts(version) > _parts(SCHEMA_VERSION)
+        newer = [int(part) for part in str(version).split(".")] > [int(SCHEMA_VERSION)]
     except ValueError:
         return f"has the schema_version '{version}', which no pbdkit writes"
     if newer:
@@ -88,10 +88,6 @@ def _fault(version: Any) -> str | None:
             "install a newer pbdkit"
         )
     return None
-
-
-def _parts(version: Any) -> tuple[int, ...]:
-    return tuple(int(part) for part in str(version).split("."))
 
 
 @xarray.register_dataset_accessor("pbd")  # type: ignore[no-untyped-call]  # xarray's is untyped
@@ -117,5 +113,7 @@ class PbdAccessor:
         """
         look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
         if isinstance(time, Iterable):
-            return picture.figure(self._dataset, time, **look)
-        return picture.draw(self._dataset, time, ax=ax, **look)
+            whole = picture.draw(self._dataset, time, **look)[0].get_figure(root=True)
+            assert whole is not None
+            return whole
+        return picture.draw(self._dataset, [time], ax=ax, **look)[0]

@@ -150,10 +150,10 @@ class StateMoment(Moment):
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""
         experiment, state = self._scene.experiment, self._state
-        own = [number.name for number in bond_numbers(experiment)]
-        of_bonds = dict(zip(own, state.bond_values, strict=True))
-        own = [number.name for number in particle_numbers(experiment)]
-        of_particles = dict(zip(own, state.particle_values, strict=True))
+        names = [number.name for number in bond_numbers(experiment)]
+        of_bonds = dict(zip(names, state.bond_values, strict=True))
+        names = [number.name for number in particle_numbers(experiment)]
+        of_particles = dict(zip(names, state.particle_values, strict=True))
         if name in of_bonds:
             return read_only(self._of_bonds(of_bonds[name]))
         if name in of_particles:
@@ -164,8 +164,7 @@ class StateMoment(Moment):
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
         """Values on the planes of bonds, (bond,)."""
         bonds = self._scene.bonds
-        found: NDArray[Any] = planes.reshape(len(planes), -1)[bonds.plane, bonds.place]
-        return found
+        return np.asarray(planes.reshape(len(planes), -1)[bonds.plane, bonds.place])
 
 
 class StateForces(ForceValues):

@@ -23,8 +23,7 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
         nonlocal bar, due
         if not wanted or time.perf_counter() < due:
             return
-        if bar is None:
-            bar = _new_bar()
+        bar = bar or _new_bar()
         due = time.perf_counter() + REFRESH_S
         bar.update(bar.task_ids[0], description=what, completed=done)
 
