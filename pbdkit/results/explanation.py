@@ -126,7 +126,7 @@ class Explained:
         step."""
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
         times = self._dataset["time"].values
-        time = len(times) - 1 if until is None else int(np.searchsorted(times, until, "right")) - 1
+        time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
         strains, at = self.strains(rows, time).tolist(), int(times[time])
         return [
             self._standing(row, place.get(row), strain, at)

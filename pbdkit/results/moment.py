@@ -35,22 +35,21 @@ class StateMoment(Moment):
         self._no_later_than = state.step if no_later_than is None else no_later_than
         self._state, self._tables = state, tables
         self._scene, self._raster = tables.scene, tables.raster
-        self._cells, self._forces = StateCells(state, tables), StateForces(state, tables)
 
     @property
     def body(self) -> NDArray[np.bool_]:
         """The same at every moment."""
         return self._tables.body
 
-    @property
+    @cached_property
     def cells(self) -> StateCells:
         """Made where somebody asks."""
-        return self._cells
+        return StateCells(self._state, self._tables)
 
-    @property
+    @cached_property
     def forces(self) -> ForceValues:
         """Made where somebody asks."""
-        return self._forces
+        return StateForces(self._state, self._tables)
 
     def rows(self, numbers: tuple[int, ...]) -> Indices:
         """Numbers count from 1 in the order of the rows."""

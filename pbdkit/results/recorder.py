@@ -64,10 +64,9 @@ class Recorder:
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
-        columns, experiment = self._columns(), self._scene.experiment
-        records = experiment.recording.count(experiment.steps)
-        planned = {"time": records, "step": experiment.steps + 1}
-        self._sink.begin(columns, self._measured.sizes, planned)
+        steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
+        planned = {"time": recording.count(steps), "step": steps + 1}
+        self._sink.begin(self._columns(), self._measured.sizes, planned)
         for name, values in self._known().items():
             self._sink.put({name: values()})
 
