@@ -66,10 +66,10 @@ UNFIT = {
         "rule",
         "works on cells of equal sides, and these are 1 by 1.3",
     ),
-    "gradient with frame points": (
-        {"rule": GRADIENT, "frame": MEAN},
+    "gradient with a frame that lags": (
+        {"rule": GRADIENT, "frame": {"type": "mean", "lag": 1}},
         "frame",
-        "does not go with this frame; take frame: {type: natural}",
+        "does not go with this frame; take frame: lag: 0",
     ),
     "gradient with fracture": (
         {"rule": GRADIENT, "fracture": {"type": "threshold", "thresholds": [2.0]}},

@@ -1,19 +1,23 @@
 """Every engine gives the numbers of the numpy engine, to the last bit."""
 
+import time
+
 import numba
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
+from remembering_parts import Tiring, Weakest
 from scene_strategies import calibrated_experiments, experiments, pulled_apart
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import choice
 from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.compiled import compiled_stepper, runs
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.compiled.functions import source_key
-from pbdkit.stepping.compiled.stepper import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -50,7 +54,14 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
             states[n] = engine.advance(states[n], steps)
             for name in ("u", "previous", "broken_step", "broken_length"):
                 np.testing.assert_array_equal(getattr(states[n], name), getattr(reference, name))
+            for name in ("bond_values", "particle_values"):
+                for one, other in zip(
+                    getattr(states[n], name), getattr(reference, name), strict=True
+                ):
+                    assert one.dtype == other.dtype
+                    np.testing.assert_array_equal(one, other)
             assert states[n].step == reference.step
+    return reference
 
 
 thoroughly = settings(
@@ -82,8 +93,6 @@ def compare_interpreted(experiment):
     """The kernel's source run by Python itself: compiling each scene would take seconds."""
     try:
         scene = build_scene(pbdkit.Experiment(**experiment | {"steps": 10}))
-        assume(not experiment["neighbours"].get("reevaluate"))
-        assume(max(map(len, scene.neighbourhood.slots)) <= 31 and scene.inner is None)
         with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
             patch.setattr(numba.config, "DISABLE_JIT", 1)
             assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 2, 3, 4))
@@ -104,6 +113,16 @@ CUT = {
     }
     for lattice, kind in (("square", "chebyshev"), ("hexagonal", "coordination"))
 }
+SCATTERED = {"type": "strain", "failure": 0.25, "scatter": 0.2}
+DAMAGE = {"type": "damage", "onset": 0.05, "failure": 0.35}
+MANY = {"type": "chebyshev", "shells": 3}
+ANEW = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
+TWICE = {
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "rule": {"type": "strain-gradient", "length": 0.5, "poisson_ratio": 0.3},
+    "frame": {"type": "natural"},
+    "solver": {"type": "stepping", "relaxation": 0.05},
+}
 COMPONENTS = {
     **{f"rule {name}": {"rule": rule} for name, rule in RULES.items()},
     **{f"lattice {name}": {"lattice": part} for name, part in LATTICES.items()},
@@ -123,22 +142,79 @@ COMPONENTS = {
     "noise": {"initial": {"type": "noise", "amplitude": 0.1}},
     **{f"natural frame, {name}": parts for name, parts in CUT.items()},
     "disc": {"body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]}, "leaders": []},
+    "strength by bond": {"fracture": SCATTERED},
+    "strength by bond, no frame": {"fracture": SCATTERED, "frame": {"type": "none"}},
+    "damage": {"fracture": DAMAGE},
+    "damage by bond, frame spared": {"fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False}},
+    "numbers of bonds, drawn and counted": {"fracture": Weakest(spread=0.3, weak=0.7)},
+    "numbers of particles": {"rule": Tiring(spread=0.1)},
+    "48 neighbours": {"neighbours": MANY},
+    "48 neighbours, torn": {"neighbours": MANY, "fracture": SCATTERED, "frame": {"type": "none"}},
+    "48 neighbours, numbers of particles": {"neighbours": MANY, "rule": Tiring()},
+    "found anew": {"neighbours": ANEW},
+    "found anew, by place": {"neighbours": ANEW, "rule": RULES["mixed-coordinate"]},
+    "found anew, numbers of particles": {"neighbours": ANEW, "rule": Tiring(spread=0.1)},
+    "moves of another": TWICE,
+    "moves of another, with a frame": TWICE | {"frame": {"type": "mean"}},
+    "moves of another, cut": TWICE | {"body": CUT["square"]["body"], "leaders": []},
 }
 
 
 @pytest.mark.parametrize("parts", COMPONENTS.values(), ids=COMPONENTS)
-def test_compiled_equals_numpy(parts):
+def test_compiled_equals_numpy(parts, monkeypatch):
     if isinstance(parts.get("rule"), str):
         parts = {"rule": {"type": parts["rule"]}}
     scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
     assert_bitwise_equal(scene, CompiledStepper(scene))
+    monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
+    assert choose(scene).engine == "compiled"
 
 
-@pytest.mark.parametrize("parts", [{}, {"fracture": TORN}], ids=["whole", "torn"])
-def test_any_number_of_threads_gives_the_same(parts):
+THREADED = {
+    "whole": {},
+    "torn": {"fracture": TORN},
+    "damaged": {"fracture": DAMAGE},
+    "found anew": {"neighbours": ANEW},
+    "moves of another": TWICE | {"frame": {"type": "mean"}},
+}
+
+
+@pytest.mark.parametrize("parts", THREADED.values(), ids=THREADED)
+def test_any_number_of_threads_gives_the_same(parts, monkeypatch):
+    monkeypatch.setattr(compiled_stepper, "BAND", 200)  # several bands of rows
     body = {"type": "grid", "columns": 60, "rows": 50}
     scene = build_scene(pbdkit.Experiment(**sheet(body=body, **parts)))
     assert_bitwise_equal(scene, CompiledStepper(scene, 1), CompiledStepper(scene, 2))
+
+
+@pytest.mark.parametrize("kind", ["whole", "torn"])
+def test_a_stiffness_of_its_own_in_every_cell(kind):
+    parts = TWICE | {"rule": ELASTIC, "initial": {"type": "noise", "amplitude": 0.1}}
+    if kind == "torn":
+        parts |= {"fracture": SCATTERED}
+    scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
+    share = scene.cells.share
+    share *= np.random.default_rng(0).uniform(0.02, 1.0, share.shape)
+    reference = assert_bitwise_equal(scene, CompiledStepper(scene))
+    assert kind == "whole" or (reference.broken_step > 0).any()
+
+
+@pytest.mark.parametrize("parts", [{"fracture": TORN}, CUT["hexagonal"]], ids=["torn", "cut"])
+def test_kinds_of_rows_are_a_matter_of_speed_alone(parts, monkeypatch):
+    """Everything in the loop over slots, or as much as can be without."""
+    scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
+    for short in (0, 5, 100):
+        monkeypatch.setattr(runs, "SHORT", short)
+        assert_bitwise_equal(scene, CompiledStepper(scene))
+
+
+def test_thousands_of_neighbours_compile_in_seconds():
+    scene = build_scene(pbdkit.Experiment(**sheet(neighbours=MANY | {"shells": 32})))
+    assert max(map(len, scene.neighbourhood.slots)) == 4224
+    began = time.process_time()
+    engine = CompiledStepper(scene)
+    assert time.process_time() - began < 10.0
+    assert_bitwise_equal(scene, engine, calls=(1, 2))
 
 
 @pytest.mark.parametrize("name", ["paper/d2", "paper/f2"])
@@ -212,13 +288,6 @@ def test_large_scenes_are_compiled_unless_something_stands_in_the_way(monkeypatc
     asked = experiment | {"solver": {"type": "stepping", "engine": "compiled"}}
     with pytest.raises(pbdkit.ExperimentError, match=r"solver.engine: .* numba is not installed"):
         choose(build_scene(pbdkit.Experiment(**asked)))
-
-
-def test_reevaluated_neighbours_cannot_be_compiled():
-    near = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
-    solver = {"type": "stepping", "engine": "compiled"}
-    with pytest.raises(pbdkit.ExperimentError, match="found anew at every step"):
-        pbdkit.run(sheet(neighbours=near, solver=solver), progress=False)
 
 
 def test_nothing_beyond_the_reach_of_the_leaders_is_touched():

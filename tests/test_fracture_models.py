@@ -6,8 +6,7 @@ from property_cases import pull_right
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import choose
-from pbdkit.stepping.compiled.stepper import CompiledStepper
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -170,22 +169,6 @@ def test_the_compiled_engine_breaks_by_strain_to_the_last_bit(lattice, precision
     for name in ("u", "previous", "broken_step", "broken_length"):
         np.testing.assert_array_equal(*(getattr(state, name) for state in states))
     assert (states[0].broken_step > 1).any()
-
-
-@pytest.mark.parametrize("fracture", [DAMAGE, STRAIN | {"scatter": 0.1}])
-def test_bonds_with_a_state_are_stepped_by_numpy_and_it_says_why(fracture, monkeypatch):
-    monkeypatch.setattr("pbdkit.stepping.choice.PATIENCE_S", 0.0)
-    given = bar(9, pulled(0.1), fracture)
-    reason = f"fracture '{fracture['type']}' keeps a state of each bond"
-    choice = choose(build_scene(pbdkit.Experiment(**given)))
-    assert (choice.engine, choice.reason) == ("numpy", f"slower than it could be: {reason}")
-    scene = build_scene(
-        pbdkit.Experiment(**given | {"solver": {"type": "stepping", "engine": "compiled"}})
-    )
-    with pytest.raises(
-        pbdkit.ExperimentError, match=f"the compiled engine cannot be had: {reason}"
-    ):
-        choose(scene)
 
 
 def test_an_onset_beyond_failure_is_refused():

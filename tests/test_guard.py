@@ -177,3 +177,15 @@ def test_a_state_whose_diagnostic_is_not_finite_is_not_kept():
     ds = diverged(diagnostics=[Vanishing()], solver=solver, record={"every": 5000})
     assert ds.time.values.tolist() == [0]
     assert "kept is" not in ds.stop_reason
+
+
+def test_a_divergence_with_neighbours_found_anew_keeps_its_records():
+    neighbours = {"type": "euclidean", "radius": 1.5, "reevaluate": True}
+    solver = {"type": "stepping", "relaxation": 50.0, "memory": 3.0}
+    given = BLOWN | {"neighbours": neighbours, "solver": solver, "record": {"every": 1}}
+    with pytest.raises(pbdkit.DivergedError, match=r"particle \d+, found at step \d+") as caught:
+        pbdkit.run(given, progress=False)
+    kept = caught.value.dataset
+    assert kept.attrs["status"] == "diverged"
+    assert len(kept.time) > 2
+    assert np.isfinite(kept.position).all()

@@ -10,7 +10,6 @@ from remembering_parts import Tiring, Weakest
 import pbdkit
 from pbdkit import Remembered
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import choose
 from pbdkit.stepping.state import initial_state
 
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -233,13 +232,6 @@ def test_a_rule_that_remembers_has_no_equilibrium():
     message = "the rule 'tiring' remembers, so that where the steps lead depends on all of them"
     with pytest.raises(pbdkit.ExperimentError, match=message):
         pbdkit.run(given, components=[Tiring], progress=False)
-
-
-def test_a_rule_that_remembers_is_stepped_by_numpy_and_it_says_why(monkeypatch):
-    monkeypatch.setattr("pbdkit.stepping.choice.PATIENCE_S", 0.0)
-    choice = choose(build_scene(pbdkit.Experiment(**SHEET | {"rule": Tiring()})))
-    reason = "slower than it could be: rule 'tiring' keeps a state of each particle"
-    assert (choice.engine, choice.reason) == ("numpy", reason)
 
 
 def test_nothing_is_kept_where_nothing_is_remembered():

@@ -208,5 +208,5 @@ def test_a_damaged_attribute_is_said_to_be_one(
 ) -> None:
     ds = pbdkit.run(tensile, progress=False)
     ds.attrs[name] = value
-    with pytest.raises(pbdkit.ExperimentError, match=f"attribute '{name}' is damaged"):
+    with pytest.raises(pbdkit.StorageError, match=f"attribute '{name}' is damaged"):
         pbdkit.rerun(ds, progress=False)

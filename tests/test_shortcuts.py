@@ -161,7 +161,7 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
 
 def test_a_process_reads_a_kernel_once():
     pytest.importorskip("numba")
-    from pbdkit.stepping.compiled.stepper import CompiledStepper
+    from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
     given = experiment(HEXAGONAL_BAR, 20, solver={"type": "stepping"})
     scene = build_scene(pbdkit.Experiment(**given))

@@ -230,16 +230,14 @@ class Analysis:
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"
             )
         elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
-            found.append(
-                "solver.relaxation: a mode that changes its sign in every step never decays; take "
-                "a relaxation below 1"
-            )
+            what = "a mode that changes its sign in every step never decays"
+            found.append(f"solver.relaxation: {what}; take a relaxation below 1")
         return found + self._late() + self.left_out
 
     def _late(self) -> list[str]:
         """Whether the body is left behind its equilibrium by more than a bond."""
         trailing, shells = self.trailing, self.scene.neighbourhood.shells()
-        bond = min(min(lengths) for lengths in shells)
+        bond = min(map(min, shells))
         if trailing is None or trailing.size <= bond:
             return []
         return [

@@ -13,6 +13,7 @@ import numpy as np
 
 from pbdkit.analysis.composition import linearised
 from pbdkit.analysis.spectrum import Complex, modes
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 
 WAVES = 48
@@ -56,7 +57,8 @@ def wave_bound(scene: Scene) -> Bound | None:
     if lags or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
         return None
     try:
-        eigenvalues = _eigenvalues(_symbols(scene)).ravel()
+        with blaming(scene.experiment.rule, "when asked about plane waves"):
+            eigenvalues = _eigenvalues(_symbols(scene)).ravel()
     except (Exception, SystemExit):  # a prediction stops no run; the run names the rule at fault
         return None
     if not np.isfinite(eigenvalues).all():

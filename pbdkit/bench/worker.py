@@ -31,7 +31,7 @@ REPEATS, PATIENCE_S = 7, 2.0
 """A way is gone so often, unless that takes longer; the best counts."""
 LONGEST_S = 60.0
 """After a tolerance that took longer, tighter ones are left out."""
-COMPILED = "pbdkit.stepping.compiled.stepper"
+COMPILED = "pbdkit.stepping.compiled.compiled_stepper"
 SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "pyamg")
 
 

@@ -65,38 +65,41 @@ class CellElastic(Calibrated, FollowerRule):
         return {"modulus": self.modulus()}
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """xx, xy, yy, t: the weight of the cell to the left is [[xx, xy + t], [xy - t, yy]], of
-        that to the right the transpose; a cell on both sides counts half on each."""
+        """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
+        to the right the transpose; a cell on both sides counts half on each."""
         if setting.cells.rectangle:
             left, right = in_rectangles(slot, self.ratios(), setting.cells)
         else:
             left, right = in_triangles(slot, self.ratios())
-        symmetric, skew = (left + right) / 2, (left - right) / 2
-        return {
-            "xx": symmetric[0, 0], "xy": symmetric[0, 1], "yy": symmetric[1, 1], "t": skew[0, 1]
-        }  # fmt: skip
+        mean = (left + right.T) / 2
+        return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
-        """W d, and the symmetric part of W."""
-        whole, turn = w.left + w.right, (w.left - w.right) * w.t
-        xx, xy, yy = w.xx * whole, w.xy * whole, w.yy * whole
-        pull = Vector(xx * d.x + (xy + turn) * d.y, (xy - turn) * d.x + yy * d.y)
-        return pull, xx, xy, yy
+        """W d, and entries of W, of which the sum is symmetric."""
+        whole = w.left + w.right
+        xx, yy = w.xx * whole, w.yy * whole
+        xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
+        return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Vector:
         """(Σ W)⁻¹ Σ W d; no move where there is no cell."""
-        pull, xx, xy, yy = total
-        det = xx * yy - xy * xy
-        some = det > 0.0
-        move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
-        return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
+        return mean_move(total)
 
     @staticmethod
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · Σ W d."""
         return p.modulus * total[0]
+
+
+def mean_move(total: Any) -> Vector:
+    """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
+    pull, xx, xy, yy = total
+    det = xx * yy - xy * xy
+    some = det > 0.0
+    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
+    return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
 
 
 class IsotropicElastic(CellElastic):

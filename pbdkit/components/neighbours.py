@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from pbdkit.errors import ExperimentError
@@ -14,6 +15,8 @@ from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset, Vector
 
 MOST_NEIGHBOURS = 4224
 """As many as 32 shells of chebyshev neighbours."""
+BALL = {2: math.pi, 3: 4 * math.pi / 3}
+"""Area or volume of the unit ball, by the number of axes."""
 Shells = Annotated[int, Field(ge=1, le=32)]
 Weight = Annotated[float, Field(gt=0.0)]
 
@@ -43,7 +46,8 @@ class Coordination(LatticeNeighbours):
         """The `shells` smallest distances between any two sites. A sublattice may have no neighbour
         in some of them."""
         ranks: list[list[Offset]] = []
-        radius = math.sqrt(8 * self.shells / math.pi * area_of(cell) / len(cell.sites))
+        room = 8 * self.shells * size_of(cell) / len(cell.sites)
+        radius = (room / BALL[cell.axes]) ** (1 / cell.axes)
         while len(ranks) <= self.shells:  # with one more, the shells before it are complete
             around = [cell.offsets(s, radius) for s in range(len(cell.sites))]
             everywhere = sorted((o for own in around for o in own), key=lambda o: o.length)
@@ -130,18 +134,17 @@ class Euclidean(NeighbourMetric):
         return Nearness(self.radius, self.weights) if self.reevaluate else None
 
 
-def area_of(cell: Cell) -> float:
-    """Of the repeat cell."""
-    a, b = cell.vectors
-    area: float = abs(a.x * b.y - a.y * b.x)
-    return area
+def size_of(cell: Cell) -> float:
+    """The area of the repeat cell, in space its volume."""
+    return abs(float(np.linalg.det(np.array(cell.vectors))))
 
 
 def cells_within(cell: Cell, radius: float) -> float:
     """About how many repeat cells lie within a radius, or in lines across it where these are
     more."""
-    longest = max(math.hypot(*v) for v in cell.vectors)
-    return max(math.pi * radius, 2 * longest) * radius / max(area_of(cell), 5e-324)
+    longest, ball = max(math.hypot(*v) for v in cell.vectors), BALL[cell.axes]
+    around = max(ball * radius, 2 * longest) * radius ** (cell.axes - 1)
+    return around / max(size_of(cell), 5e-324)
 
 
 def _ranked(offsets: Sequence[Offset], distances: Sequence[float]) -> list[list[Offset]]:

@@ -105,8 +105,8 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
         return self
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`rest` = |r|, and `onset_strain` and `failure_strain` unless each bond has its own."""
-        rest = {"rest": length(slot.rest)}
+        """`per_rest` = 1/|r|; `onset_strain` and `failure_strain` unless each bond has its own."""
+        rest = {"per_rest": 1.0 / length(slot.rest)}
         own = {} if self.scatter else {"onset_strain": self.onset, "failure_strain": self.failure}
         return rest | own
 
@@ -125,7 +125,7 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
     def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
         """The damage, where there is more than before."""
         onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
-        strain = length(r + d) / c.rest - 1.0
+        strain = length(r + d) * c.per_rest - 1.0
         softens = strain > onset
         law = failure / (failure - onset) * (1.0 - onset / where(softens, strain, 1.0))
         law = where(strain < failure, law, 1.0)

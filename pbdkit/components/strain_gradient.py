@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from pbdkit.components.elasticity import CellElastic, Elastic, IsotropicElastic
+from pbdkit.components.elasticity import Elastic, IsotropicElastic, mean_move
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import AppliesTwice, Here, Setting, Vector
 
@@ -48,7 +48,7 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Any:
         """z - c (Σ W)⁻¹ Σ W (z_k - z_j)."""
-        return here.u - p.c * CellElastic.apply(total, here, p)
+        return here.u - p.c * mean_move(total)
 
     @staticmethod
     def force(total: Any, here: Here, p: Any) -> Any:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.interfaces import Softens
-from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import last_event
@@ -38,7 +36,7 @@ def choose(scene: Scene) -> Choice:
     Raises ExperimentError where the compiled engine is asked for and cannot be had.
     """
     solver = scene.experiment.stepping
-    hindrance = obstacle(scene)
+    hindrance = obstacle()
     if solver.engine == "compiled" and hindrance:
         raise scene.experiment.located(
             ExperimentError(f"the compiled engine cannot be had: {hindrance}", ("solver", "engine"))
@@ -61,7 +59,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
     """The engine, and what it came to: where `auto` meets a rule that does not compile, numpy."""
     if choice.engine == "numpy":
         return Stepper(scene), choice
-    from pbdkit.stepping.compiled.stepper import CompiledStepper
+    from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
     try:
         return CompiledStepper(scene, choice.threads), choice
@@ -72,21 +70,10 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
         return Stepper(scene), Choice("numpy", 1, reason)
 
 
-def obstacle(scene: Scene) -> str:
-    """Why the compiled engine cannot step this scene; empty where it can."""
+def obstacle() -> str:
+    """Why the compiled engine cannot be had; empty where it can."""
     if find_spec("numba") is None:
         return "numba is not installed: pip install 'pbdkit[fast]'"
-    if scene.experiment.neighbours.nearness():
-        return "neighbours are found anew at every step"
-    if scene.inner:
-        return "the rule works on the moves of another"
-    fracture = scene.experiment.fracture
-    if bond_numbers(scene.experiment) or isinstance(fracture, Softens):
-        return f"fracture '{scene.experiment.fracture.type}' keeps a state of each bond"
-    if particle_numbers(scene.experiment):
-        return f"rule '{scene.experiment.rule.type}' keeps a state of each particle"
-    if max(map(len, scene.neighbourhood.slots)) > 31:
-        return "more than 31 neighbours"
     return ""
 
 

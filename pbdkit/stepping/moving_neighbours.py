@@ -48,7 +48,7 @@ class GatheringFollowers(Followers):
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Bonds do not last here, so that none can be broken."""
         u = m.reshape(len(m), -1)[:, self._place]
-        j, k, rest = self._pairs(self._X + u)
+        j, k, rest = self.pairs(self._X + u)
         count = len(self._place)
         to = Neighbour(vector(rest), self._none)
         d = vector(u[:, k] - u[:, j])
@@ -75,7 +75,7 @@ class GatheringFollowers(Followers):
         for plane, values in zip(changing(numbers, state.particle_values), fresh, strict=True):
             plane.reshape(-1)[place] = values[movable]
 
-    def _pairs(self, x: Floats) -> tuple[Indices, Indices, Floats]:
+    def pairs(self, x: Floats) -> tuple[Indices, Indices, Floats]:
         """(j, k, rest): every body particle j with each of its neighbours k and the rest offset,
         (axis, pair), sorted by j, by slot and by k."""
         from scipy.spatial import cKDTree

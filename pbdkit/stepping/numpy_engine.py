@@ -34,12 +34,12 @@ class Stepper(Engine):
 
     name = "numpy"
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         near = scene.experiment.neighbours.nearness()
-        self._followers: Followers = (
+        self._followers: Followers = followers or (
             GatheringFollowers(scene, near) if near else SlotFollowers(scene)
         )
 

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 IMPORTS = """
-import pbdkit.api, pbdkit.results.netcdf, pbdkit.stepping.compiled.stepper, pbdkit.cli.run
+import pbdkit.api, pbdkit.results.netcdf, pbdkit.stepping.compiled.compiled_stepper, pbdkit.cli.run
 """
 PEAK = """
 from pbdkit.bench.worker import peak_memory

@@ -11,19 +11,25 @@ from pathlib import Path
 
 from bare import sweeping
 from fresh import bytes_a_particle
-from pairing import Ratio, ratio, wait_for_quiet
+from pairing import Ratio, of_times, ratio, wait_for_quiet
 from recording import recording
 from sheets import (
+    CELLS,
+    DAMAGE,
     DISTANCE,
     ELASTIC,
     FRACTURE,
+    NATURAL,
     OWN,
+    SCATTERED,
     Afresh,
     Everywhere,
+    Moved,
     Running,
     Sharing,
     moving,
     pulled,
+    stiffened,
 )
 
 BUSY = "measured while other programs computed: the second processor was not free"
@@ -56,7 +62,16 @@ def at_least(name: str, goal: float, found: Ratio, note: str = "") -> Goal:
 
 
 def all_goals() -> Iterator[Goal]:
-    for rows in (against_bare, threads, reach, third_party, record, memory, start_up):
+    for rows in (
+        against_bare,
+        against_plain,
+        threads,
+        reach,
+        third_party,
+        record,
+        memory,
+        start_up,
+    ):
         yield from rows()
 
 
@@ -72,6 +87,25 @@ def against_bare() -> Iterator[Goal]:
         found = ratio(Running(moving(size, **parts), steps), bare, 11)
         note = f"{found.first_s / steps / size**2 * 1e9:.2f} ns a particle and step against "
         yield at_most(name, goal, found, note + f"{found.second_s / steps / size**2 * 1e9:.2f}")
+
+
+def against_plain() -> Iterator[Goal]:
+    """What a scene holds besides, against the same scene without."""
+    steps, size, turns = 4, 1000, 60
+    for name, goal, parts, plain, changed in (
+        ("elastic under the natural frame against elastic", 1.7, NATURAL, CELLS, None),
+        ("elastic, every cell with its own stiffness", 1.5, NATURAL, CELLS, stiffened),
+        ("strain with scatter against threshold", 2.0, SCATTERED, FRACTURE, None),
+        ("damage against threshold", 2.5, DAMAGE, FRACTURE, None),
+    ):
+        first = Moved(moving(size, **parts), steps, changed=changed)
+        sheets = (first, Moved(moving(size, **plain), steps))
+        times: list[list[float]] = [[], []]
+        for _ in range(turns):
+            for mine, sheet in zip(times, sheets, strict=True):
+                sheet()
+                mine.append(sheet.seconds)
+        yield at_most(f"{name}, 1000²", goal, of_times(*times))
 
 
 def threads() -> Iterator[Goal]:

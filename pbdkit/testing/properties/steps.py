@@ -176,9 +176,9 @@ def is_the_same_compiled(subject: Subject) -> None:
     """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
     compile is stepped by numpy, and says so."""
     scene = subject.scene()
-    if reason := obstacle(scene):
+    if reason := obstacle():
         raise NotAskedError(reason)
-    from pbdkit.stepping.compiled.stepper import CompiledStepper
+    from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
     try:
         compiled: Engine = CompiledStepper(scene)

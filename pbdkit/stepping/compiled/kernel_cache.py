@@ -1,0 +1,161 @@
+"""Loads kernels, kept in a cache folder under a key of everything that they were made of.
+
+A kernel has a folder of its own with its source, what numba keeps beside it, and the digests of
+both. What does not agree with its digests is never loaded but made anew; where nothing can be kept,
+or others could write there, a kernel is made in memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import sys
+import tempfile
+from collections import namedtuple
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core.registry import cpu_target
+
+from pbdkit.interfaces import Here, length
+from pbdkit.interfaces.vector import KINDS
+from pbdkit.stepping.compiled.functions import compiled, source_key
+
+Function = Callable[..., Any]
+SOURCE, DIGESTS = "kernel.py", "digests.json"
+_loaded: dict[tuple[Path, str], Any] = {}
+"""Kernels of this process, by folder and key: reading one again takes several milliseconds."""
+
+
+def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> Any:
+    """The function `run` of a kernel with this source, made before or now, ready for arguments of
+    these types; it is called with them once.
+
+    The key covers the source of every function that rule and fracture model reach, so that an
+    edited rule never runs an old kernel.
+    """
+    parts = [source, source_key(*functions.values(), length), repr(_types(arguments))]
+    parts += [numba.__version__, np.__version__, sys.version, repr(_processor())]
+    parts.append(str(_interpreted()))
+    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+    if (known := (_asked_folder(), key)) not in _loaded:
+        names = {name: compiled(function) for name, function in functions.items()}
+        kept = None if _interpreted() else _kept(source, key, names, arguments)
+        _loaded[known] = kept or _ready(source, names, arguments)
+    return _loaded[known]
+
+
+def cache_folder() -> Path | None:
+    """PBDKIT_CACHE_DIR, or `pbdkit` in the user's cache folder; None where it cannot be written, or
+    others can write there too, whose code would be run."""
+    folder = _asked_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        alone = not hasattr(os, "getuid") or (
+            status.st_uid == os.getuid() and not status.st_mode & 0o022
+        )
+        return folder if alone and os.access(folder, os.W_OK | os.X_OK) else None
+    except OSError:
+        return None
+
+
+def _asked_folder() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get("PBDKIT_CACHE_DIR") or Path(home) / "pbdkit")
+
+
+def _processor() -> Any:
+    """What machine code is made for."""
+    return cpu_target.target_context.codegen().magic_tuple()
+
+
+def _types(arguments: tuple[Any, ...]) -> Any:
+    return vars(numba)["typeof"](arguments)
+
+
+def _interpreted() -> bool:
+    return bool(vars(numba.config)["DISABLE_JIT"])
+
+
+def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
+    """The kernel as it lies in the cache, or as it is made and laid there; None where neither can
+    be done."""
+    if (cache := cache_folder()) is None:
+        return None
+    folder = cache / f"kernel_{key}"
+    if _is_whole(folder):
+        try:
+            return _ready(source, names, arguments, folder)
+        except Exception:  # what lies there is of no use, whatever it says: it is made anew
+            pass
+    try:
+        with tempfile.TemporaryDirectory(dir=cache, prefix=".making-") as name:
+            made = Path(name) / folder.name
+            made.mkdir()
+            (made / SOURCE).write_text(source, encoding="utf-8")
+            run = _ready(source, names, arguments, made)
+            (made / DIGESTS).write_text(json.dumps(_digests(made)), encoding="utf-8")
+            if not _is_whole(folder):  # nobody else has been quicker
+                shutil.rmtree(folder, ignore_errors=True)
+                made.replace(folder)
+            return run
+    except (OSError, pickle.PicklingError):
+        return None
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether every file is as it was when the kernel was made."""
+    try:
+        digests = json.loads((folder / DIGESTS).read_text(encoding="utf-8"))
+        return bool(digests == _digests(folder))
+    except (OSError, ValueError):
+        return False
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    files = (file for file in sorted(folder.rglob("*")) if file.is_file() and file.name != DIGESTS)
+    return {
+        file.relative_to(folder).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+    }
+
+
+def _ready(
+    source: str, names: dict[str, Any], arguments: tuple[Any, ...], folder: Path | None = None
+) -> Any:
+    """The kernel after its first call: compiled, or read from its folder."""
+    run = _module(source, names, folder).run
+    run(*arguments)
+    return run
+
+
+def _module(source: str, names: dict[str, Any], folder: Path | None) -> ModuleType:
+    given = {
+        **{kind.__name__: kind for kind in KINDS.values()},
+        "Here": Here,
+        "namedtuple": namedtuple,
+        "njit": numba.njit,
+        "prange": numba.prange,
+        "np": np,
+        "int64": np.int64,
+        "real": np.float32,
+        "double": np.float64,
+        "length": compiled(length),
+        "KEPT": folder is not None,
+    }
+    file = folder / SOURCE if folder else None
+    module = ModuleType(folder.name if folder else "kernel")
+    vars(module).update(given | names)
+    if file:
+        module.__file__ = str(file)
+        sys.modules[module.__name__] = module  # numba looks for what it has kept by this name
+    exec(compile(source, str(file or "<kernel>"), "exec"), vars(module))
+    return module

@@ -1,0 +1,111 @@
+"""The rules of a scene as the levels of its kernel, tried out on single numbers first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pbdkit.interfaces import (
+    Components,
+    FollowerRule,
+    FractureModel,
+    Here,
+    Remembered,
+    RenewsBonds,
+    RenewsParticles,
+    Softens,
+)
+from pbdkit.interfaces.vector import vector
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compiled.kernel_cache import load_kernel
+from pbdkit.stepping.compiled.plan import Level
+from pbdkit.stepping.evaluator import Evaluator
+from pbdkit.stepping.followers import target
+from pbdkit.stepping.remembered_values import changing, renew
+
+Function = Callable[..., Any]
+
+
+def levels_of(scene: Scene) -> tuple[Level, ...]:
+    """The innermost rule first."""
+    scenes = [scene]
+    while inner := scenes[0].inner:
+        scenes.insert(0, inner)
+    return tuple(Level(n, of, _parts(of), last=of is scene) for n, of in enumerate(scenes))
+
+
+def functions_of(levels: Sequence[Level]) -> dict[str, Function]:
+    """The elementwise functions by their names in the kernel."""
+    found: dict[str, Function] = {}
+    for level in levels:
+        rule = level.scene.experiment.rule
+        named: dict[str, Function] = {"gather": rule.gather, "apply": rule.apply}
+        if isinstance(rule, RenewsParticles):
+            named["remember"] = rule.remember
+        found |= {f"{name}{level.number}": function for name, function in named.items()}
+    if levels[-1].scene.has_fracture:
+        model = levels[-1].scene.experiment.fracture
+        found |= {"breaks": model.breaks, "fictitious": model.fictitious}
+        if isinstance(model, Softens):
+            found["seen"] = model.seen
+        if isinstance(model, RenewsBonds):
+            found["update"] = model.update
+    return found
+
+
+def load_blamed(levels: Sequence[Level], source: str, arguments: tuple[Any, ...]) -> Any:
+    """The kernel; what does not compile is named as the part's whose it is."""
+    try:
+        return load_kernel(source, functions_of(levels), arguments)
+    except Exception as error:
+        with blaming(_culprit(levels, error), "to compile"):
+            raise
+
+
+def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | FractureModel:
+    """The part whose function an error of the compiler names, else the rule."""
+    experiment, text = levels[-1].scene.experiment, str(error)
+    model, rules = experiment.fracture, [level.scene.experiment.rule for level in levels]
+    names = {f.__qualname__ for name, f in functions_of(levels).items() if not name[-1].isdigit()}
+    if any(f"function {name} " in text for name in names):
+        return model
+    return next((r for r in rules if f"function {r.apply.__qualname__} " in text), rules[-1])
+
+
+def sample_values(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Any:
+    """Arrays of one place as remembered numbers are kept in."""
+    precision = scene.experiment.stepping.precision
+    return tuple(
+        np.full(shape, number.initial, precision if number.dtype == "f8" else number.dtype)
+        for number in numbers
+    )
+
+
+def _parts(scene: Scene) -> tuple[int, ...]:
+    """The components of each contribution. What functions return by mistake is refused as numpy
+    refuses it: a kernel would take some of it for numbers."""
+    experiment, evaluator = scene.experiment, Evaluator(scene)
+    ones = np.ones(1, experiment.stepping.precision)
+    one: Components = vector([ones] * scene.axes)
+    own = sample_values(scene, particle_numbers(experiment), (1,))
+    slot = scene.neighbourhood.slots[0][0]
+    with np.errstate(all="ignore"):
+        if scene.has_fracture:
+            with blaming(experiment.fracture, "to compile"):
+                limits = scene.constants.limits[slot]
+                bond = sample_values(scene, bond_numbers(experiment), (1,))
+                evaluator.renew_bonds(one, slot.rest, limits, bond, np.ones(1, bool))
+                evaluator.breaks(one, slot.rest, limits, bond)
+        with blaming(experiment.rule, "to compile"):
+            total = evaluator.contribution(one, one, evaluator.everywhere([slot])[0])
+            here = Here(one, one, one, scene.constants.of_particle(*own))
+            for component in evaluator.move(total, here):
+                target(ones, component, ones, experiment.stepping)
+            if isinstance(experiment.rule, RenewsParticles):
+                fresh = changing(particle_numbers(experiment), own)
+                renew(fresh, evaluator.remember(total, here), None)
+    return tuple(len(part) if isinstance(part, Components) else 1 for part in total)

@@ -1,0 +1,156 @@
+"""Kernels that are kept: what lies damaged or is not ours alone is never run, and never a fault of
+the rule."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.compiled import kernel_cache
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.state import initial_state
+
+SHEET = {
+    "name": "sheet",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 5, "rows": 5},
+    "rule": {"type": "mean-displacement"},
+    "initial": {"type": "noise", "amplitude": 0.1},
+    "steps": 10,
+}
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A cache folder of its own, as a new process meets it."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("PBDKIT_CACHE_DIR", str(folder))
+    monkeypatch.setattr(kernel_cache, "_loaded", {})
+    return folder
+
+
+def steps_as_numpy_does():
+    """Whether a kernel that this process has not loaded yet gives what numpy gives."""
+    kernel_cache._loaded.clear()
+    scene = build_scene(pbdkit.Experiment(**SHEET))
+    states = [e.advance(initial_state(scene), 5) for e in (CompiledStepper(scene), Stepper(scene))]
+    return np.array_equal(states[0].u, states[1].u)
+
+
+def kept(folder):
+    """Every file that is kept, by what it is."""
+    (kernel,) = folder.iterdir()
+    files = [file for file in kernel.rglob("*") if file.is_file()]
+    return {file.suffix: file for file in files}
+
+
+def test_damaged_files_are_made_anew(cache):
+    assert steps_as_numpy_does()
+    assert set(kept(cache)) == {".py", ".json", ".nbi", ".nbc"}
+    for suffix in (".py", ".json", ".nbi", ".nbc"):
+        file = kept(cache)[suffix]
+        whole = file.read_bytes()
+        flipped = whole[: len(whole) // 2] + bytes([whole[len(whole) // 2] ^ 4])
+        file.write_bytes(flipped + whole[len(flipped) :] if suffix == ".nbc" else whole[:100])
+        assert steps_as_numpy_does()
+        assert kernel_cache._is_whole(file.parents[1] if suffix[1] == "n" else file.parent)
+    assert len(list(cache.iterdir())) == 1
+
+
+def test_a_whole_kernel_is_read_and_not_made(cache, monkeypatch):
+    assert steps_as_numpy_does()
+    before = {file: file.stat().st_mtime_ns for file in kept(cache).values()}
+    monkeypatch.setattr(kernel_cache, "_digests", counted := Counted(kernel_cache._digests))
+    assert steps_as_numpy_does()
+    assert counted.calls == 1
+    assert before == {file: file.stat().st_mtime_ns for file in kept(cache).values()}
+
+
+class Counted:
+    def __init__(self, function):
+        self.function, self.calls = function, 0
+
+    def __call__(self, *arguments):
+        self.calls += 1
+        return self.function(*arguments)
+
+
+def test_a_full_disk_is_no_fault_of_the_rule_and_leaves_nothing(cache, monkeypatch):
+    def full(*arguments, **words):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    before = set(Path(tempfile.gettempdir()).glob("pbdkit*"))
+    assert steps_as_numpy_does()
+    assert list(cache.iterdir()) == []
+    assert set(Path(tempfile.gettempdir()).glob("pbdkit*")) == before
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX systems")
+def test_a_folder_that_others_can_write_is_not_run(cache):
+    assert steps_as_numpy_does()
+    kept(cache)[".py"].write_text("raise SystemExit('planted')")
+    cache.chmod(0o777)
+    assert kernel_cache.cache_folder() is None
+    before = kept(cache)[".json"].read_bytes()
+    assert steps_as_numpy_does()
+    assert kept(cache)[".json"].read_bytes() == before
+
+
+def test_where_no_folder_can_be_made_kernels_are_made_in_memory(cache):
+    cache.write_text("a file")
+    assert kernel_cache.cache_folder() is None
+    assert steps_as_numpy_does()
+    assert cache.read_text() == "a file"
+
+
+class Odd(pbdkit.FractureModel):
+    type: Literal["odd"] = "odd"
+
+    def constants(self, slot):
+        return {}
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return np.asarray(d.x).astype(str) == "never"
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return 0.0 * r
+
+
+class Raises(pbdkit.FollowerRule):
+    type: Literal["raises"] = "raises"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        raise OverflowError("too much")
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0]
+
+
+def test_a_fracture_model_that_does_not_compile_is_named(cache, monkeypatch):
+    monkeypatch.setattr("pbdkit.stepping.choice.PATIENCE_S", 0.0)
+    scene = build_scene(pbdkit.Experiment(**SHEET | {"fracture": Odd()}))
+    with pytest.raises(pbdkit.PluginError, match="FractureModel 'odd' failed to compile"):
+        CompiledStepper(scene)
+    engine, made = make_engine(scene, choose(scene))
+    assert engine.name == "numpy"
+    assert "FractureModel 'odd'" in made.reason
+
+
+@pytest.mark.parametrize("initial", ["reference", "noise"])
+def test_what_a_rule_raises_while_kernels_are_made_is_the_rules(initial):
+    start = {"type": initial} | ({"amplitude": 0.1} if initial == "noise" else {})
+    scene = build_scene(pbdkit.Experiment(**SHEET | {"rule": Raises(), "initial": start}))
+    with pytest.raises(pbdkit.PluginError, match=r"FollowerRule 'raises' failed .*too much"):
+        CompiledStepper(scene)
