@@ -12,7 +12,7 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.plugin import Plugin
+    from pbdkit.registry.plugin import Offer, Plugin
     from pbdkit.testing import Report
 
 INTERFACES = (
@@ -112,14 +112,13 @@ def check(
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
     """One of the plugin and one of each of its components."""
     origin = {"distribution": plugin.distribution, "version": plugin.version}
-    offers = [
-        {"interface": offer.interface.__name__ if offer.interface else "", "type": offer.name}
-        | origin
-        | {"state": offer.state, "reason": offer.reason}
-        for offer in plugin.offers
-    ]
-    own = {"interface": "plugin", "type": plugin.name} | origin
-    return [own | {"state": plugin.state, "reason": plugin.reason}, *offers]
+
+    def row(interface: str, each: Plugin | Offer) -> dict[str, str]:
+        judged = {"state": each.state, "reason": each.reason}
+        return {"interface": interface, "type": each.name} | origin | judged
+
+    named = ((o.interface.__name__ if o.interface else "", o) for o in plugin.offers)
+    return [row("plugin", plugin), *(row(*each) for each in named)]
 
 
 def _print(rows: list[dict[str, str]]) -> None:
