@@ -48,6 +48,11 @@ def _disable_plugins(context: click.Context, option: click.Parameter, given: boo
         return
     from pbdkit.registry.discovery import ALL, DISABLE
 
-    before = {DISABLE: os.environ.pop(DISABLE, "")}  # an empty list disables nothing
+    before = {name: value for name, value in os.environ.items() if name == DISABLE}
+
+    def restore() -> None:
+        os.environ.pop(DISABLE, None)
+        os.environ.update(before)
+
     os.environ[DISABLE] = ALL
-    context.call_on_close(lambda: os.environ.update(before))
+    context.call_on_close(restore)
