@@ -72,7 +72,7 @@ if TYPE_CHECKING:
         squared_length as squared_length,
         where as where,
     )
-    from pbdkit.registry.hooks import hookimpl as hookimpl
+    from pbdkit.registry.discovery import hookimpl as hookimpl
     from pbdkit.results.accessor import open as open
 
 _HOME = {
@@ -90,7 +90,7 @@ _HOME = {
         "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length",
         "squared_length", "where",
     ),
-    "pbdkit.registry.hooks": ("hookimpl",),
+    "pbdkit.registry.discovery": ("hookimpl",),
     "pbdkit.results.accessor": ("open",),
     "pbdkit.api": ("analyse", "identify", "load", "rerun", "run"),
 }  # fmt: skip

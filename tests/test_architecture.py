@@ -11,7 +11,6 @@ ORDER = [
     "interfaces",
     "registry",
     "components",
-    "skeleton",
     "experiment",
     "scene",
     "stepping",

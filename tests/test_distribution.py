@@ -30,7 +30,7 @@ def test_a_distribution_carries_the_licence(folder: Path) -> None:
 
 
 def test_a_new_plugin_has_the_text_of_the_licence() -> None:
-    template = (ROOT / "pbdkit/skeleton/templates/LICENSE.txt").read_text()
+    template = (ROOT / "pbdkit/cli/templates/LICENSE.txt").read_text()
     own = "(c) the $distribution authors"
     assert template.replace(own, "(c) 2026, the pbdkit authors") == (ROOT / "LICENSE").read_text()
 

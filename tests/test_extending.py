@@ -16,7 +16,7 @@ import pytest
 import pbdkit
 import pbdkit.testing
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.registry.hooks import Hooks
+from pbdkit.registry.discovery import Hooks
 from pbdkit.testing import PROPERTIES, examine, examples_of
 
 PAGES = Path(__file__).parent.parent / "docs" / "extending"

@@ -18,7 +18,7 @@ from pbdkit import Experiment
 from pbdkit.analysis.forecast import forecast
 from pbdkit.errors import LONGEST, PbdkitError, printable
 from pbdkit.experiment.source import Source, read_text
-from pbdkit.results.rehearsal import rehearse
+from pbdkit.runs.course import rehearse
 from pbdkit.scene.scene import build_scene
 
 Call = Callable[..., Any]

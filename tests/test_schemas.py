@@ -10,7 +10,7 @@ import pbdkit
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.shipped import read_experiment, shipped_names
 from pbdkit.registry.registry import Registry
-from pbdkit.results.dataset_schema import dataset_schema
+from pbdkit.results.layout import dataset_schema
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 EXPERIMENT = experiment_schema(Registry(), installed=False)

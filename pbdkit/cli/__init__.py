@@ -10,17 +10,18 @@ from typing import Any
 
 import click
 
+from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 
 COMMANDS = {
     "run": "run",
-    "check": "check",
-    "identify": "identify",
+    "check": "studies",
+    "identify": "studies",
     "experiments": "experiments",
     "init": "experiments",
-    "plot": "plot",
-    "explain": "explain",
-    "bench": "bench",
+    "plot": "result",
+    "explain": "result",
+    "bench": "studies",
     "plugins": "plugins",
     "schema": "experiments",
 }
@@ -98,8 +99,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(error: BaseException) -> int:
-    from pbdkit import errors
-
     codes = {
         errors.ExperimentError: 2,
         errors.PluginError: 3,
@@ -118,8 +117,6 @@ def _report(error: BaseException) -> int:
 
 
 def _failed(message: str, code: int) -> int:
-    from pbdkit.errors import printable
-
-    message = printable(message)
+    message = errors.printable(message)
     click.echo(f"pbdkit: {message}" if "\n" not in message else f"pbdkit:\n{message}", err=True)
     return code

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 if TYPE_CHECKING:
-    import click
     from click.shell_completion import CompletionItem
 
 
@@ -29,16 +29,14 @@ def experiments() -> None:
 @click.argument("file", default="experiment.yaml", type=click.Path(path_type=Path))
 def init(file: Path) -> None:
     """Write a commented experiment to start from."""
-    from pbdkit.errors import ExperimentError, StorageError
+    from pbdkit.cli.output import storing
+    from pbdkit.errors import ExperimentError
     from pbdkit.experiment.shipped import shipped_text
 
-    try:
-        with file.open("x", encoding="utf-8") as written:
-            written.write(shipped_text("start"))
-    except FileExistsError:
-        raise ExperimentError(f"{file}: exists and is left as it is; name another file") from None
-    except OSError as error:
-        raise StorageError(f"{file}: cannot be written: {error.strerror}") from None
+    if os.path.lexists(file):
+        raise ExperimentError(f"{file}: exists and is left as it is; name another file")
+    with storing(file), file.open("x", encoding="utf-8") as written:
+        written.write(shipped_text("start"))
     click.echo(f"{file} written; next: pbdkit check {file}, then pbdkit run {file}")
 
 
@@ -49,7 +47,7 @@ def schema(what: str, builtin: bool) -> None:
     """Print the JSON Schema of experiments or datasets, closed over what is installed."""
     from pbdkit.experiment.schema import experiment_schema
     from pbdkit.registry.registry import Registry
-    from pbdkit.results.dataset_schema import dataset_schema
+    from pbdkit.results.layout import dataset_schema
 
     make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
     click.echo(json.dumps(make(Registry(), installed=not builtin), indent=2))
@@ -70,9 +68,6 @@ def complete_experiments(
     names = [name for name in shipped_names() if name.startswith(begun)]
     if not names:
         return [CompletionItem(begun, type="file")]
-    return [CompletionItem(name) for name in [*names, *_experiment_files(begun)]]
-
-
-def _experiment_files(begun: str) -> list[str]:
-    files = [path for path in Path().glob("*") if path.suffix in SUFFIXES]
-    return sorted(path.name for path in files if path.name.startswith(begun))
+    here = (path.name for path in Path().iterdir() if path.suffix in SUFFIXES)
+    files = sorted(name for name in here if name.startswith(begun))
+    return [CompletionItem(name) for name in [*names, *files]]

@@ -48,13 +48,11 @@ def _disable_plugins(context: click.Context, option: click.Parameter, given: boo
         return
     from pbdkit.registry.discovery import ALL, DISABLE
 
-    before = os.environ.get(DISABLE)
+    before = {name: value for name, value in os.environ.items() if name == DISABLE}
+
+    def restore() -> None:
+        os.environ.pop(DISABLE, None)
+        os.environ.update(before)
+
     os.environ[DISABLE] = ALL
-    context.call_on_close(lambda: _restore(DISABLE, before))
-
-
-def _restore(name: str, value: str | None) -> None:
-    if value is None:
-        os.environ.pop(name, None)
-    else:
-        os.environ[name] = value
+    context.call_on_close(restore)

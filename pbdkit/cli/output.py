@@ -1,10 +1,11 @@
-"""The file that a command is to write: looked at before the work, not after."""
+"""The file that a command is to write, looked at before the work and not after; and tables."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -19,6 +20,7 @@ from pbdkit.scene.sizes import MIB, sizes_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.table import Table
 
 KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
 """What may be at a path and no plain file, by the type that the system gives it."""
@@ -83,12 +85,28 @@ def disk_warnings(path: Path, scene: Scene) -> tuple[str, ...]:
 
 
 FORMATS = (".png", ".svg", ".pdf")
+UNLIMITED = 10_000
+
+
+@contextmanager
+def storing(path: Path) -> Iterator[None]:
+    """StorageError where the system refuses to write the file in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def show_table(table: Table) -> None:
+    """Prints it; a line a row where it goes to a file or another program."""
+    from rich.console import Console
+
+    width = None if sys.stdout.isatty() else UNLIMITED
+    Console(width=width, highlight=False).print(table)
 
 
 def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
     """ExperimentError or StorageError where a picture or another file cannot be written there."""
-    from pbdkit.errors import ExperimentError, StorageError
-
     if picture and picture.suffix not in FORMATS:
         raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
     if picture and find_spec("matplotlib") is None:
@@ -102,11 +120,7 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
 
 def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
     """Writes a figure and says so; StorageError where the system refuses."""
-    from pbdkit.errors import StorageError
-
-    try:
+    with storing(picture):
         drawn.savefig(picture)
-    except OSError as error:
-        raise StorageError(f"{picture}: cannot be written: {error.strerror}") from None
     if not quiet:
         click.echo(f"{picture} written")

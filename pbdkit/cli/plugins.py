@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,10 +12,9 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.plugin import Plugin
+    from pbdkit.registry.plugin import Offer, Plugin
     from pbdkit.testing import Report
 
-UNLIMITED = 10_000
 INTERFACES = (
     "FollowerRule",
     "Lattice",
@@ -67,7 +65,7 @@ def list_(as_json: bool) -> None:
 )
 def new(name: str, interface: str, parent: Path) -> None:
     """Write a plugin project NAME, e.g. pbdkit-my-rule, that installs and runs as it stands."""
-    from pbdkit.skeleton.project import project_of
+    from pbdkit.cli.project import project_of
 
     project = project_of(name, interface)
     folder = project.write(parent)
@@ -114,28 +112,27 @@ def check(
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
     """One of the plugin and one of each of its components."""
     origin = {"distribution": plugin.distribution, "version": plugin.version}
-    offers = [
-        {"interface": offer.interface.__name__ if offer.interface else "", "type": offer.name}
-        | origin
-        | {"state": offer.state, "reason": offer.reason}
-        for offer in plugin.offers
-    ]
-    own = {"interface": "plugin", "type": plugin.name} | origin
-    return [own | {"state": plugin.state, "reason": plugin.reason}, *offers]
+
+    def row(interface: str, each: Plugin | Offer) -> dict[str, str]:
+        judged = {"state": each.state, "reason": each.reason}
+        return {"interface": interface, "type": each.name} | origin | judged
+
+    named = ((o.interface.__name__ if o.interface else "", o) for o in plugin.offers)
+    return [row("plugin", plugin), *(row(*each) for each in named)]
 
 
 def _print(rows: list[dict[str, str]]) -> None:
-    """A table; a line a row where it goes to a file or another program."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from pbdkit.cli.output import show_table
 
     table = Table(box=None, pad_edge=False)
     for column in rows[0]:
         table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
     for row in rows:
         table.add_row(*(Text(value) for value in row.values()))  # no markup: [x] is what it says
-    Console(width=None if sys.stdout.isatty() else UNLIMITED).print(table)
+    show_table(table)
 
 
 def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:

@@ -1,10 +1,13 @@
-"""``pbdkit run``."""
+"""``pbdkit run``, which Ctrl-C and SIGTERM end between two steps: what is kept is whole."""
 
 from __future__ import annotations
 
 import json
+import signal
 import sys
-from collections.abc import Iterable
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +37,6 @@ def run(
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
-    from pbdkit.cli.signals import asked_to_stop
     from pbdkit.equilibrium.watch import Watch
     from pbdkit.results.netcdf import NetcdfSink
     from pbdkit.results.progress import progress_bar
@@ -60,6 +62,31 @@ def run(
     elif not quiet and report.outcome.status in ("complete", "settled"):
         _say(report, path, settling=loaded.stepping.settle is not None)
     return _exit_code(report, path, file.written)
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Yields a function that tells whether the process has been asked to stop.
+
+    A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
+    """
+    asked = False
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _warn(texts: Iterable[str], quiet: bool) -> None:

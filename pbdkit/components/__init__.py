@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from pbdkit.interfaces import Component
-from pbdkit.registry.hooks import hookimpl
+from pbdkit.registry.discovery import hookimpl
 
 COMPONENTS = {
     "lattices": "Square Rectangular CentredRectangular Hexagonal Oblique",

@@ -11,7 +11,7 @@ from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.answers import AnswerError
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.registry.hooks import GROUP
+from pbdkit.registry.discovery import GROUP
 
 LONGEST = 400
 

@@ -1,20 +1,40 @@
-"""Finds the entry points of plugins in the metadata of what is installed, and imports nothing."""
+"""The hook of pbdkit and its marker; where installed plugins declare it, with nothing imported."""
 
 from __future__ import annotations
 
 import os
 import re
 from dataclasses import dataclass
-from importlib.metadata import Distribution, EntryPoint, distribution, distributions
+from importlib.metadata import EntryPoint, distribution, distributions
 from pathlib import PurePath
+from typing import TYPE_CHECKING
 
-from pbdkit.registry.blame import worded
-from pbdkit.registry.hooks import GROUP
+import pluggy
 
-BUILTIN = "pbdkit"
+if TYPE_CHECKING:
+    from pbdkit.interfaces import Component
+
+BUILTIN = GROUP = "pbdkit"
+"""The distribution of the built-in components, and the entry-point group of plugins, which is the
+project name of their hook markers too."""
+
+API = 1
+"""The version of the hook and the six interfaces. A plugin may declare the one that it was written
+for as `pbdkit_api`, in the module or on the object that its entry point names."""
+
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
 DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
 """The variable that lists what is not to be loaded, distributions or entry points, and its value
 for: nothing at all."""
+
+
+class Hooks:
+    """What a plugin may implement, as functions of the module that its entry point names."""
+
+    @hookspec
+    def pbdkit_components(self) -> list[type[Component]]:  # type: ignore[empty-body]  # a specification only
+        """The component classes that the distribution offers."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +45,7 @@ class Point:
     distribution: str
     version: str
     entry: EntryPoint | None = None
-    fault: str = ""
+    fault: Exception | None = None
 
     def answers_to(self, name: str) -> bool:
         """Whether the name is that of the distribution or of the entry point."""
@@ -37,13 +57,6 @@ class Point:
         if ALL in (names := disabled_names()):
             return f"no plugin is wanted (--no-plugins or {DISABLE}={ALL})"
         return f"{DISABLE} names it" if any(map(self.answers_to, names)) else ""
-
-
-def points_of(found: Distribution) -> list[Point]:
-    """The entry points of a distribution."""
-    name, version = found.metadata["Name"], found.metadata["Version"] or ""
-    entries = found.entry_points.select(group=GROUP)
-    return [Point(entry.name, name, version, entry) for entry in entries]
 
 
 def installed_points() -> list[Point]:
@@ -60,12 +73,14 @@ def installed_points() -> list[Point]:
                 names.add(canonical(found.metadata["Name"] or ""))
         except Exception as error:
             folder = PurePath(str(getattr(found, "_path", "(no name)"))).name
-            points.append(_unreadable(folder, error))
+            points.append(Point("", folder, "", fault=error))
     for name in sorted(names - {BUILTIN}):
         try:
-            points += points_of(distribution(name))
+            own = distribution(name)
+            what = own.metadata["Name"], own.metadata["Version"] or ""
+            points += [Point(e.name, *what, e) for e in own.entry_points.select(group=GROUP)]
         except Exception as error:
-            points.append(_unreadable(name or "(no name)", error))
+            points.append(Point("", name or "(no name)", "", fault=error))
     return sorted(points, key=lambda point: (point.distribution, point.name))
 
 
@@ -77,7 +92,3 @@ def disabled_names() -> list[str]:
 def canonical(name: str) -> str:
     """The name of a distribution in the one spelling that installers compare."""
     return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _unreadable(distribution: str, error: Exception) -> Point:
-    return Point("", distribution, "", fault=f"its metadata cannot be read: {worded(error)}")

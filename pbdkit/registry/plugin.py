@@ -16,8 +16,7 @@ from pydantic import ValidationError
 
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.registry.blame import interface_of, one_line, worded
-from pbdkit.registry.discovery import BUILTIN, Point, points_of
-from pbdkit.registry.hooks import API, GROUP, Hooks
+from pbdkit.registry.discovery import API, BUILTIN, GROUP, Hooks, Point
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 REFUSALS = ("missing", "value_error", "assertion_error")
@@ -75,10 +74,9 @@ class IncompatibleError(Exception):
 def load_builtin() -> Plugin:
     """The components of pbdkit itself, by its own entry point, with no other looked at; they are
     not checked, for that is what the tests do."""
-    (point,) = points_of(distribution(BUILTIN))
-    assert point.entry is not None
-    offers = tuple(map(offer_of, _offered(point.entry)))
-    return Plugin(point.name, point.distribution, point.version, offers=offers)
+    own = distribution(BUILTIN)
+    (entry,) = own.entry_points.select(group=GROUP)
+    return Plugin(entry.name, BUILTIN, own.version, offers=tuple(map(offer_of, _offered(entry))))
 
 
 def load_plugin(point: Point) -> Plugin:
@@ -90,9 +88,9 @@ def load_plugin(point: Point) -> Plugin:
     """
     offers: tuple[Offer, ...] = ()
     state, reason = "disabled", point.disabled
-    if point.entry is None:
-        state, reason = "broken", point.fault
-    elif not reason:
+    if point.fault:
+        state, reason = "broken", f"its metadata cannot be read: {worded(point.fault)}"
+    elif point.entry and not reason:
         package = point.entry.value.split(":")[0].split(".")[0].strip()
         try:
             with chdir("."), redirect_stdout(sys.stderr), warnings.catch_warnings():
@@ -118,7 +116,7 @@ def _offered(entry: EntryPoint) -> list[Any]:
     manager.add_hookspecs(Hooks)
     module = entry.load()
     declared = getattr(module, "pbdkit_api", None)
-    if declared is None:
+    if declared is None:  # the entry point may name an object in the module
         declared = getattr(sys.modules.get(entry.module), "pbdkit_api", API)
     if type(declared) is not int:
         raise TypeError(f"its `pbdkit_api` should be a whole number, got {declared!r}")

@@ -40,8 +40,7 @@ class Registry:
 
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
         self._builtin = load_builtin()
-        self._given = Plugin(GIVEN, "", "", offers=_given(components, self._builtin))
-        self._own = [self._builtin, self._given]
+        self._own = [self._builtin, _given(components, self._builtin)]
         self._loaded: dict[Point, Plugin] = {}
 
     @cached_property
@@ -207,7 +206,8 @@ def _judged(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin
         return replace(offer, component=None, state="broken", reason=reason)
     if _offers([builtin], offer.interface, name):
         what = f"'{name}' is the name of a built-in {offer.interface.__name__}"
-        return replace(offer, state="conflict", reason=f"{what}; {chosen}, or give it another type")
+        remedy = f"{chosen}, or give it another type" if plugin.distribution else "give it another"
+        return replace(offer, state="conflict", reason=f"{what}; {remedy}")
     others = [str(p) for p, o in twins if o.component and p.distribution != plugin.distribution]
     if not others:
         return offer
@@ -215,22 +215,17 @@ def _judged(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin
     return replace(offer, state="conflict", reason=reason)
 
 
-def _given(components: Iterable[type[Component]], builtin: Plugin) -> tuple[Offer, ...]:
-    """The offers of classes from Python; ExperimentError for what cannot be used."""
-    offers: list[Offer] = []
+def _given(components: Iterable[type[Component]], builtin: Plugin) -> Plugin:
+    """Classes from Python as a plugin; ExperimentError for what cannot be used."""
+    offers: dict[Offer, None] = {}  # each once, in their order
     for component in components:
         try:
             check_component(component)
         except TypeError as error:
             raise ExperimentError(f"components: {error}") from None
-        offer = offer_of(component)
-        if offer.interface and _offers([builtin], offer.interface, offer.name):
-            raise ExperimentError(
-                f"components: '{offer.name}' is the name of a built-in "
-                f"{offer.interface.__name__}; give {component.__name__} another type"
-            )
-        twins = [o for o in offers if (o.interface, o.name) == (offer.interface, offer.name)]
-        if any(o.component is not component for o in twins):
-            raise ExperimentError(f"components: two classes have the type '{offer.name}'")
-        offers += [] if twins else [offer]
-    return tuple(offers)
+        offers[offer_of(component)] = None
+    given = Plugin(GIVEN, "", "", offers=tuple(offers))
+    for offer in offers:
+        if reason := _judged(given, offer, [given], builtin).reason:
+            raise ExperimentError(f"components: {reason}")
+    return given

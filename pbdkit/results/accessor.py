@@ -39,8 +39,7 @@ def open(path: str | Path) -> xarray.Dataset:
     except Exception as error:  # whatever the libraries below make of a damaged file
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
-    fault = _fault(dataset.attrs.get("schema_version")) or _missing(dataset)
-    if fault:
+    if fault := _fault(dataset):
         dataset.close()
         raise StorageError(f"{file}: {fault}")
     return dataset
@@ -65,21 +64,13 @@ def reading(path: str | Path) -> Iterator[xarray.Dataset]:
             raise StorageError(f"{path}: is damaged, or was changed: {one_line(told)}") from error
 
 
-def _missing(dataset: xarray.Dataset) -> str | None:
-    """What a dataset of pbdkit has, and this one has not."""
-    for column in base_columns():
-        dims = dataset[column.name].dims if column.name in dataset.variables else None
-        if dims != column.dims:
-            what = "has no" if dims is None else f"has other dimensions, {dims}, of"
-            return f"{what} variable '{column.name}': it is damaged, or was changed"
-    return None
-
-
-def _fault(version: Any) -> str | None:
+def _fault(dataset: xarray.Dataset) -> str | None:
+    """Why this pbdkit cannot read it, if it cannot."""
+    version = dataset.attrs.get("schema_version")
     if version is None:
         return "is no dataset of pbdkit: it has no attribute schema_version"
     try:
-        newer = _parts(version) > _parts(SCHEMA_VERSION)
+        newer = [int(part) for part in str(version).split(".")] > [int(SCHEMA_VERSION)]
     except ValueError:
         return f"has the schema_version '{version}', which no pbdkit writes"
     if newer:
@@ -87,11 +78,12 @@ def _fault(version: Any) -> str | None:
             f"has schema_version {version}, and this pbdkit reads up to {SCHEMA_VERSION}; "
             "install a newer pbdkit"
         )
+    for column in base_columns():
+        dims = dataset[column.name].dims if column.name in dataset.variables else None
+        if dims != column.dims:
+            what = "has no" if dims is None else f"has other dimensions, {dims}, of"
+            return f"{what} variable '{column.name}': it is damaged, or was changed"
     return None
-
-
-def _parts(version: Any) -> tuple[int, ...]:
-    return tuple(int(part) for part in str(version).split("."))
 
 
 @xarray.register_dataset_accessor("pbd")  # type: ignore[no-untyped-call]  # xarray's is untyped
@@ -117,5 +109,7 @@ class PbdAccessor:
         """
         look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
         if isinstance(time, Iterable):
-            return picture.figure(self._dataset, time, **look)
-        return picture.draw(self._dataset, time, ax=ax, **look)
+            whole = picture.draw(self._dataset, time, **look)[0].get_figure(root=True)
+            assert whole is not None
+            return whole
+        return picture.draw(self._dataset, [time], ax=ax, **look)[0]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, StorageError
-from pbdkit.interfaces import Bonds, BreaksAtStrain
+from pbdkit.interfaces import Bonds, BreaksAtStrain, FractureModel
 from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.raster import FRAME
@@ -60,51 +60,36 @@ class Explained:
                 "has no table of bonds: nothing could break in this run; run the experiment with "
                 "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
             )
-        self._dataset, self._scene = dataset, scene
+        self._dataset, self._scene, experiment = dataset, scene, scene.experiment
+        self.model: FractureModel = experiment.fracture
+        self._remembered = [number.name for number in bond_numbers(experiment)]
         self.bonds: Bonds = describe_bonds(scene)
+        self.steps = self._of_bonds("broken_step", np.int32(-1))
+        """(bond,): when each broke, -1 where it has not."""
+        self.strains_at_break: Floats = self._of_bonds("broken_strain", np.nan)
+        """(bond,): NaN where it is not known."""
+        self.order: Rows = breaking_order(self.steps, self.strains_at_break)
+        """The rows of the broken bonds, in the order in which they broke."""
         if not np.array_equal(self.bonds.ends - 1, dataset["bond"].values):
             raise ExperimentError(
                 "its bonds are not those of the experiment that it carries: the file was changed, "
                 "or another version of a part made it"
             )
 
-    @property
-    def fracture(self) -> str:
-        """The type of the fracture model."""
-        return self._scene.experiment.fracture.type
-
-    @cached_property
-    def steps(self) -> NDArray[np.int32]:
-        """(bond,): when each broke, -1 where it has not."""
-        if "broken_step" not in self._dataset:
-            return np.full(len(self.bonds), -1, np.int32)
-        steps: NDArray[np.int32] = self._dataset["broken_step"].values
-        return steps
-
-    @cached_property
-    def strains_at_break(self) -> Floats:
-        """(bond,): NaN where it is not known."""
-        if "broken_strain" not in self._dataset:
-            return np.full(len(self.bonds), np.nan)
-        strains: Floats = self._dataset["broken_strain"].values
-        return strains
-
-    @cached_property
-    def order(self) -> Rows:
-        """The rows of the broken bonds, in the order in which they broke."""
-        return breaking_order(self.steps, self.strains_at_break)
+    def _of_bonds(self, name: str, unknown: Any) -> NDArray[Any]:
+        known = self._dataset.variables.get(name)
+        return np.full(len(self.bonds), unknown) if known is None else np.asarray(known.values)
 
     @cached_property
     def limits(self) -> Floats:
         """(bond,): the strain above which each breaks, NaN where the model does not say."""
         limits, constants = np.full(len(self.bonds), np.nan), self._scene.constants
-        model = self._scene.experiment.fracture
-        numbers = [number.name for number in bond_numbers(self._scene.experiment)]
+        model = self.model
         if not isinstance(model, BreaksAtStrain) or not model.can_break:
             return limits
-        if any(name not in self._dataset for name in numbers):
+        if any(name not in self._dataset for name in self._remembered):
             return limits
-        own = [_last(self._dataset[name]).astype(float) for name in numbers]
+        own = [_last(self._dataset[name]).astype(float) for name in self._remembered]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
             rows = np.flatnonzero(self._scene.bonds.plane == n)
             c = constants.of_bond(*constants.limits[plane.slot], *(values[rows] for values in own))
@@ -114,12 +99,11 @@ class Explained:
     @cached_property
     def spared(self) -> NDArray[np.bool_]:
         """(bond,): those that cannot break."""
-        model = self._scene.experiment.fracture
-        if not model.can_break:
+        if not self.model.can_break:
             return np.ones(len(self.bonds), np.bool_)
         frame = self._dataset["kind"].isel(time=0).values == FRAME
-        touches: NDArray[np.bool_] = frame[self.bonds.ends - 1].any(axis=1)
-        return touches & (not model.breaks_frame_bonds())
+        touches = frame[self.bonds.ends - 1].any(axis=1)
+        return np.asarray(touches & (not self.model.breaks_frame_bonds()))
 
     def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
         """(..., bond): of some bonds at recorded times, by their places along `time`."""
@@ -135,15 +119,14 @@ class Explained:
         a, b = (np.searchsorted(particles, self.bonds.ends[rows, end] - 1) for end in (0, 1))
         rest = self.bonds.rest[rows]
         now = rest + (u[..., b, :] - u[..., a, :])
-        strains: Floats = np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0
-        return strains
+        return np.asarray(np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0)
 
     def standings(self, rows: Rows, until: int | None = None) -> list[Standing]:
         """How some bonds stand, strained as at the last recorded step, or the last one until a
         step."""
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
         times = self._dataset["time"].values
-        time = len(times) - 1 if until is None else int(np.searchsorted(times, until, "right")) - 1
+        time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
         strains, at = self.strains(rows, time).tolist(), int(times[time])
         return [
             self._standing(row, place.get(row), strain, at)
@@ -194,14 +177,11 @@ class Explained:
 
     def around(self, row: int) -> Rows:
         """The other bonds at the ends of a bond, the broken ones first and in their order."""
-        a, b = self.bonds.ends[row]
-        ends = self.bonds.ends
-        rows = np.flatnonzero(((ends == a) | (ends == b)).any(axis=1))
-        place = np.full(len(self.bonds), len(self.order))
-        place[self.order] = np.arange(len(self.order))
-        rows = rows[rows != row]
-        in_order: Rows = rows[np.argsort(place[rows], kind="stable")]
-        return in_order
+        touches = np.asarray(np.isin(self.bonds.ends, self.bonds.ends[row]).any(axis=1))
+        touches[row] = False
+        broken = self.order[touches[self.order]]
+        touches[broken] = False
+        return np.append(broken, np.flatnonzero(touches))
 
     def most_strained(self, row: int) -> tuple[int, float]:
         """The recorded step at which a bond was the longest, and its strain then."""
@@ -211,15 +191,12 @@ class Explained:
 
     def remembered(self, row: int) -> dict[str, float]:
         """What the model remembers of a bond, at the last recorded step."""
-        names = [number.name for number in bond_numbers(self._scene.experiment)]
-        known = [name for name in names if name in self._dataset]
+        known = [name for name in self._remembered if name in self._dataset]
         return {name: float(_last(self._dataset[name])[row]) for name in known}
 
 
 def _last(variable: xarray.DataArray) -> NDArray[Any]:
-    at = variable.isel(time=-1) if "time" in variable.dims else variable
-    values: NDArray[Any] = at.values
-    return values
+    return np.asarray(variable.isel(time=-1, missing_dims="ignore").values)
 
 
 def _known(value: float) -> float | None:

@@ -1,19 +1,26 @@
-"""The dataset's variables: one description that the file, xarray and the schema share."""
+"""The dataset's variables: one description that the file, xarray and the JSON Schema share."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from pbdkit.interfaces import Diagnostic, Remembered, Variable
+from pbdkit.experiment.schema import DIALECT
+from pbdkit.interfaces import Component, Diagnostic, Remembered, Variable
+from pbdkit.registry.registry import Registry
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 CONVENTIONS = "CF-1.11"
 SCHEMA_VERSION = "2"
 STATUSES = ("complete", "settled", "diverged", "unconverged", "interrupted")
+ATTRIBUTES = (
+    "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
+    "prediction", "status", "stop_reason", "created",
+)  # fmt: skip
 LENGTH = "lattice unit"
 
 
@@ -99,20 +106,6 @@ def broken_columns() -> list[Column]:
     ]
 
 
-def reserved_names() -> set[str]:
-    """The names that nobody else can give to a variable or a dimension."""
-    ours = [*base_columns(), *bond_columns(), *broken_columns(), step_column(), leader_column()]
-    return {name for column in ours for name in (column.name, *column.dims)}
-
-
-def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:
-    """A number that a part remembers of each `owner`, bond or particle."""
-    grows = number.changes and part_renews
-    dims, when = (("time", owner), When.RECORD) if grows else ((owner,), When.START)
-    attributes = _described(number.long_name, number.units)
-    return Column(number.name, dims, number.dtype, when, attributes)
-
-
 def step_column() -> Column:
     """The coordinate of what is measured at every step."""
     return Column("step", ("step",), "i8", When.STEP, _described("step", "step"), True)
@@ -124,16 +117,95 @@ def leader_column() -> Column:
     return Column("leader_group", ("leader_group",), "i8", When.START, _described(meaning), True)
 
 
+def optional_columns() -> list[Column]:
+    """What only some datasets have, whatever their diagnostics."""
+    return [*bond_columns(), *broken_columns(), step_column(), leader_column()]
+
+
+def reserved_names() -> set[str]:
+    """The names that nobody else can give to a variable or a dimension."""
+    ours = base_columns() + optional_columns()
+    return {name for column in ours for name in (column.name, *column.dims)}
+
+
+def remembered_column(number: Remembered, owner: str, part_renews: bool) -> Column:
+    """A number that a part remembers of each `owner`, bond or particle."""
+    grows = number.changes and part_renews
+    dims, when = (("time", owner), When.RECORD) if grows else ((owner,), When.START)
+    attributes = _described(number.long_name, number.units)
+    return Column(number.name, dims, number.dtype, when, attributes)
+
+
 def own_coordinate(name: str, dtype: str) -> Column:
     """The coordinate of a dimension that a diagnostic brings along."""
     return Column(name, (name,), dtype, When.START, _described(name), True)
 
 
+def when_measured(diagnostic: Diagnostic | type[Diagnostic]) -> When:
+    """At what time a diagnostic is asked."""
+    if diagnostic.at_end:
+        return When.END
+    return When.STEP if diagnostic.every_step else When.RECORD
+
+
 def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnostic]) -> Column:
     """A diagnostic's variable with its leading dimension."""
-    leading, when = ("step", When.STEP) if diagnostic.every_step else ("time", When.RECORD)
-    dims = (leading, *variable.dims)
-    if diagnostic.at_end:
-        dims, when = variable.dims, When.END
+    when = when_measured(diagnostic)
+    dims = (*{When.STEP: ["step"], When.RECORD: ["time"]}.get(when, []), *variable.dims)
     attributes = _described(variable.long_name, variable.units, **variable.attributes)
     return Column(variable.name, dims, variable.dtype, when, attributes)
+
+
+def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:
+    """The JSON Schema of datasets, in the form of ``xarray.Dataset.to_dict(data=False)``; without
+    `installed`, of those of the built-in diagnostics alone."""
+    base = base_columns()
+    columns = base + optional_columns()
+    for diagnostic in registry.components(Diagnostic, installed=installed).values():
+        columns += _columns_of(diagnostic)
+    strings: dict[str, Any] = {name: {"type": "string"} for name in ATTRIBUTES}
+    strings |= {"status": {"enum": list(STATUSES)}, "schema_version": {"const": SCHEMA_VERSION}}
+
+    def group(coordinate: bool) -> dict[str, Any]:
+        return _object(
+            {c.name: _schema_of(c) for c in columns if c.coordinate == coordinate},
+            [c.name for c in base if c.coordinate == coordinate],
+        )
+
+    parts = {
+        "attrs": _object(strings, list(ATTRIBUTES)),
+        "dims": {"type": "object", "additionalProperties": {"type": "integer"}},
+        "coords": group(coordinate=True),
+        "data_vars": group(coordinate=False),
+    }
+    return {"$schema": DIALECT, "title": "pbdkit dataset"} | _object(parts, sorted(parts))
+
+
+def _columns_of(diagnostic: type[Component]) -> list[Column]:
+    """The columns of a diagnostic, asked of one whose parameters are not set; where variables
+    depend on parameters, or cannot be had, the schema leaves them open."""
+    assert issubclass(diagnostic, Diagnostic)
+    try:
+        variables = diagnostic.model_construct(type="").variables()
+        columns = [diagnostic_column(v, diagnostic) for v in variables]
+        json.dumps([_schema_of(column) for column in columns])
+    except Exception:  # it is somebody's code, which nobody asked to run
+        return []
+    return columns
+
+
+def _schema_of(column: Column) -> dict[str, Any]:
+    attributes = {
+        name: {"const": value}
+        for name, value in column.attributes.items()
+        if not isinstance(value, np.ndarray)
+    }
+    parts = {"dims": {"const": list(column.dims)}, "attrs": _object(attributes, sorted(attributes))}
+    if column.dtype != "str":
+        parts["dtype"] = {"const": np.dtype(column.dtype).name}
+    said = f"{column.attributes['long_name']}; written {column.when.value}"
+    return {"description": said} | _object(parts, ["dims", "attrs", "dtype"])
+
+
+def _object(properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
+    return {"type": "object", "required": required, "properties": properties}

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
+from pbdkit.interfaces import Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
-from pbdkit.results.layout import Column, Values
+from pbdkit.results.layout import Column, Values, When
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-
-Numbered = tuple[int, Diagnostic]
-"""A diagnostic with its place in the experiment."""
 
 
 class Measured:
@@ -28,7 +25,7 @@ class Measured:
         bonds_change = isinstance(experiment.fracture, RenewsBonds)
         particles_change = isinstance(experiment.rule, RenewsParticles)
         self._scene = scene
-        self._diagnostics = list(enumerate(experiment.diagnostics))
+        self._diagnostics = experiment.diagnostics
         numbers = [
             *((n, "bond", bonds_change) for n in bond_numbers(experiment)),
             *((n, "particle", particles_change) for n in particle_numbers(experiment)),
@@ -38,12 +35,12 @@ class Measured:
     @cached_property
     def every_step(self) -> bool:
         """Whether anything is measured at every step."""
-        return any(d.every_step for _, d in self._diagnostics)
+        return any(layout.when_measured(d) is When.STEP for d in self._diagnostics)
 
     @cached_property
     def shows_leaders(self) -> bool:
         """Whether anything is measured of each leader group."""
-        variables = (v for _, d in self._diagnostics for v in d.variables())
+        variables = (v for d in self._diagnostics for v in d.variables())
         return any("leader_group" in variable.dims for variable in variables)
 
     @cached_property
@@ -56,7 +53,7 @@ class Measured:
         if self.shows_leaders:
             sizes["leader_group"] = len(scene.leading)
         return sizes | {
-            n: len(values) for _, d in self._diagnostics for n, values in d.coordinates().items()
+            n: len(values) for d in self._diagnostics for n, values in d.coordinates().items()
         }
 
     def columns(self) -> list[Column]:
@@ -67,7 +64,7 @@ class Measured:
             _refuse_taken(
                 column.name, taken, f"a part remembers '{column.name}' of each {column.dims[-1]}"
             )
-        for _, diagnostic in self._diagnostics:
+        for diagnostic in self._diagnostics:
             own, whose = diagnostic.coordinates(), f"Diagnostic '{diagnostic.type}' declares"
             for name in (*own, *filter(None, [diagnostic.own_dimension])):
                 _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
@@ -87,7 +84,7 @@ class Measured:
         """Those of the diagnostics, by name."""
         return {
             name: partial(np.asarray, values)
-            for _, d in self._diagnostics
+            for d in self._diagnostics
             for name, values in d.coordinates().items()
         }
 
@@ -96,31 +93,26 @@ class Measured:
         return {c.name: now.remembered(c.name) for c in self._remembered if not c.grows}
 
     def at_record(self, now: Moment) -> Values:
-        """What changes, at a step that is recorded. Raises FloatingPointError for what is not
-        finite; so does `at_step`."""
+        """What is remembered and changes. Raises FloatingPointError for what is not finite."""
         values = {c.name: now.remembered(c.name) for c in self._remembered if c.grows}
         for name, value in values.items():
             if not np.isfinite(value).all():
                 raise FloatingPointError(f"{name} at step {now.step}")
-        recorded = (nd for nd in self._diagnostics if not (nd[1].every_step or nd[1].at_end))
-        return values | self._of(recorded, now, f"at step {now.step}")
+        return values
 
-    def at_step(self, now: Moment) -> Values:
-        """What is measured at every step."""
-        stepped = (nd for nd in self._diagnostics if nd[1].every_step)
-        return self._of(stepped, now, f"at step {now.step}")
+    def diagnosed(self, when: When, now: Moment) -> Values:
+        """What the diagnostics of that time measure, by variable.
 
-    def at_end(self, now: Moment) -> Values:
-        """What is measured once, after the last step; values that are not finite stay: the run may
-        have ended because of them."""
-        return self._of((nd for nd in self._diagnostics if nd[1].at_end), now, "at the end")
-
-    def _of(self, wanted: Iterable[Numbered], now: Moment, when: str) -> Values:
-        """By variable. Raises PluginError for another shape than declared."""
+        Raises PluginError for another shape than declared, and FloatingPointError for what is not
+        finite; at the end such values stay: the run may have ended because of them.
+        """
         values: Values = {}
-        for n, diagnostic in wanted:
+        told = "at the end" if when is When.END else f"at step {now.step}"
+        for n, diagnostic in enumerate(self._diagnostics):
+            if layout.when_measured(diagnostic) is not when:
+                continue
             sizes, own = dict(self.sizes), diagnostic.own_dimension
-            with blaming(diagnostic, when, "diagnostics", n):
+            with blaming(diagnostic, told, "diagnostics", n):
                 found = diagnostic.measure(now)
                 for variable, value in zip(diagnostic.variables(), found, strict=True):
                     if own in variable.dims and np.ndim(value) == len(variable.dims):
@@ -131,7 +123,7 @@ class Measured:
                         raise ValueError(
                             f"'{variable.name}' has the shape {np.shape(value)}, not {shape}"
                         )
-                    if not diagnostic.at_end:
+                    if when is not When.END:
                         _refuse_infinite(variable, value, now)
                     values[variable.name] = np.array(value)
         return values

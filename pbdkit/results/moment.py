@@ -35,22 +35,21 @@ class StateMoment(Moment):
         self._no_later_than = state.step if no_later_than is None else no_later_than
         self._state, self._tables = state, tables
         self._scene, self._raster = tables.scene, tables.raster
-        self._cells, self._forces = StateCells(state, tables), StateForces(state, tables)
 
     @property
     def body(self) -> NDArray[np.bool_]:
         """The same at every moment."""
         return self._tables.body
 
-    @property
+    @cached_property
     def cells(self) -> StateCells:
         """Made where somebody asks."""
-        return self._cells
+        return StateCells(self._state, self._tables)
 
-    @property
+    @cached_property
     def forces(self) -> ForceValues:
         """Made where somebody asks."""
-        return self._forces
+        return StateForces(self._state, self._tables)
 
     def rows(self, numbers: tuple[int, ...]) -> Indices:
         """Numbers count from 1 in the order of the rows."""
@@ -150,10 +149,10 @@ class StateMoment(Moment):
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""
         experiment, state = self._scene.experiment, self._state
-        own = [number.name for number in bond_numbers(experiment)]
-        of_bonds = dict(zip(own, state.bond_values, strict=True))
-        own = [number.name for number in particle_numbers(experiment)]
-        of_particles = dict(zip(own, state.particle_values, strict=True))
+        names = [number.name for number in bond_numbers(experiment)]
+        of_bonds = dict(zip(names, state.bond_values, strict=True))
+        names = [number.name for number in particle_numbers(experiment)]
+        of_particles = dict(zip(names, state.particle_values, strict=True))
         if name in of_bonds:
             return read_only(self._of_bonds(of_bonds[name]))
         if name in of_particles:
@@ -164,8 +163,7 @@ class StateMoment(Moment):
     def _of_bonds(self, planes: NDArray[Any]) -> NDArray[Any]:
         """Values on the planes of bonds, (bond,)."""
         bonds = self._scene.bonds
-        found: NDArray[Any] = planes.reshape(len(planes), -1)[bonds.plane, bonds.place]
-        return found
+        return np.asarray(planes.reshape(len(planes), -1)[bonds.plane, bonds.place])
 
 
 class StateForces(ForceValues):

@@ -69,10 +69,6 @@ class NetcdfSink(Sink):
             if not self._columns[name].grows:
                 self._store(name, slice(None), value)
                 continue
-            if self._batch[name] == 1:
-                self._store(name, self._written[name], value)
-                self._written[name] += 1
-                continue
             self._waiting[name].append(value)
             if len(self._waiting[name]) >= self._batch[name]:
                 self._flush(name)
@@ -99,14 +95,12 @@ class NetcdfSink(Sink):
         """Renames. Where it is asked for, a whole result replaces what is there; all else gets a
         name that is free."""
         folder, stem, suffix = self._temporary.parent, self._path.stem[:100], self._path.suffix
+        partial = "" if whole else PARTIAL
         if whole and self._replace:
             self._temporary.replace(folder / self._path.name)
             return
-        more = ("" if n == 1 else f"-{n}" for n in count(2 if whole else 1))
-        beside = (
-            self._path.with_name(f"{stem}{'' if whole else PARTIAL}{n}{suffix}") for n in more
-        )
-        names = chain([self._path], beside)
+        more = chain([] if whole else [PARTIAL], (f"{partial}-{n}" for n in count(2)))
+        names = chain([self._path], (self._path.with_name(f"{stem}{m}{suffix}") for m in more))
         self.written = next(name for name in names if self._take(folder / name.name))
 
     def _take(self, path: Path) -> bool:
@@ -155,11 +149,13 @@ class NetcdfSink(Sink):
     def _flush(self, name: str) -> None:
         entries, begin = self._waiting[name], self._written[name]
         if entries:
-            self._store(name, slice(begin, begin + len(entries)), np.stack(entries))
+            # A large one is stored as it is, not copied.
+            values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
+            self._store(name, slice(begin, begin + len(entries)), values)
             self._written[name] += len(entries)
             self._waiting[name] = []
 
-    def _store(self, name: str, where: slice | int, values: Any) -> None:
+    def _store(self, name: str, where: slice, values: Any) -> None:
         with self._storing():
             self._file.variables[name][where] = values
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
-    from matplotlib.figure import Figure
 
 KINDS = {
     FRAME: ("frame", "#F0E442"),
@@ -37,87 +36,64 @@ PAGE_IN, PANEL_IN, DPI, NUMBERED_PT = 7.2, 4.6, 200, 24.0
 @dataclass(frozen=True)
 class Look:
     """What the panels of a picture share: limits, the distance of particles at rest, the scale of
-    the values (None where there are none), and whether numbers are written."""
+    the values (None where there are none), whether numbers are written, and whether particles are
+    too many for dots."""
 
     box: tuple[float, float, float, float]
     spacing: float
     norm: Normalize | None
     numbers: bool
+    crowded: bool
 
 
 def draw(
     dataset: xarray.Dataset,
-    time: int | None = None,
+    times: Iterable[int | None],
     *,
     color: str | None = None,
     contours: bool = False,
     numbers: bool = False,
     ax: Axes | None = None,
-) -> Axes:
-    """Draws the configuration at one recorded step, by default the last, and returns its axes.
+) -> list[Axes]:
+    """Draws recorded steps (None: the last), a panel each, with the same limits and one scale of
+    colours, and returns their axes.
 
     Particles have the colours of their kinds, or of the variable `color` (the length of a vector);
     with `contours` its filled contours over the body lie below the particles' kinds. `numbers`
-    writes the number at each particle. Without `ax` a new figure is made: ``ax.figure``.
+    writes the number at each particle. Without `ax`, for one step, a new figure is made.
 
-    Raises ExperimentError for a step that was not recorded, for a variable that cannot be drawn,
-    and where matplotlib is missing.
+    Raises ExperimentError for a step that was not recorded, for no step at all, for a variable that
+    cannot be drawn, and where matplotlib is missing.
     """
-    _require_matplotlib()
-    snapshots = take_snapshots(dataset, [time], color, contours)
-    look = _look(dataset, snapshots, numbers)
-    axes = _canvas(1, look) if ax is None else [ax]
-    _paint(axes[0], dataset, snapshots[0], look)
-    title = f"{plain(dataset.attrs.get('title', ''))}, step {snapshots[0].step}"
-    axes[0].set_title(title.lstrip(", "))
-    _explain(axes, dataset, look, color, contours)
-    return axes[0]
-
-
-def figure(
-    dataset: xarray.Dataset,
-    times: Iterable[int],
-    *,
-    color: str | None = None,
-    contours: bool = False,
-    numbers: bool = False,
-) -> Figure:
-    """Draws several recorded steps, a panel each, with the same limits and one scale of colours.
-
-    The options and what is raised are those of `draw`; no times at all: ExperimentError.
-    """
-    _require_matplotlib()
+    if find_spec("matplotlib") is None:
+        raise ExperimentError("pictures need matplotlib: pip install 'pbdkit[plot]'")
     snapshots = take_snapshots(dataset, times, color, contours)
     if not snapshots:
         raise ExperimentError("a figure needs at least one time")
-    look = _look(dataset, snapshots, numbers)
-    axes = _canvas(len(snapshots), look)
-    for ax, snapshot in zip(axes, snapshots, strict=True):
-        _paint(ax, dataset, snapshot, look)
-        ax.set_title(f"step {snapshot.step}")
-    _label_outer_only(axes, _columns(len(axes), look))
+    look, title = _look(dataset, snapshots, numbers), plain(dataset.attrs.get("title", ""))
+    axes = _canvas(len(snapshots), look) if ax is None else [ax]
+    for panel, snapshot in zip(axes, snapshots, strict=True):
+        _paint(panel, dataset, snapshot, look)
+        panel.set_title(f"step {snapshot.step}")
+    if len(axes) == 1:
+        axes[0].set_title(f"{title}, step {snapshots[0].step}".lstrip(", "))
+    else:
+        axes[0].figure.suptitle(title)
     _explain(axes, dataset, look, color, contours)
-    whole = axes[0].get_figure(root=True)
-    assert whole is not None
-    whole.suptitle(plain(dataset.attrs.get("title", "")))
-    return whole
-
-
-def _require_matplotlib() -> None:
-    if find_spec("matplotlib") is None:
-        raise ExperimentError("pictures need matplotlib: pip install 'pbdkit[plot]'")
+    return axes
 
 
 def _look(dataset: xarray.Dataset, snapshots: list[Snapshot], numbers: bool) -> Look:
     count = dataset.sizes["particle"]
-    if numbers and _crowded(dataset):
+    if numbers and count > DETAILED:
         raise ExperimentError(f"{count} particles are too many to number; at most {DETAILED}")
     width, height = np.ptp(dataset["reference"].values, axis=0)
     spacing = float(max(math.sqrt(width * height / count), max(width, height) / count)) or 1.0
     low = np.min([s.position.min(axis=0) for s in snapshots], axis=0) - spacing
     high = np.max([s.position.max(axis=0) for s in snapshots], axis=0) + spacing
     norm = None if snapshots[0].values is None else _norm(snapshots)
-    return Look((low[0], high[0], low[1], high[1]), spacing, norm, numbers)
+    box = (low[0], high[0], low[1], high[1])
+    return Look(box, spacing, norm, numbers, count > DETAILED)
 
 
 def _norm(snapshots: list[Snapshot]) -> Normalize:
@@ -160,16 +136,13 @@ def _canvas(panels: int, look: Look) -> list[Axes]:
     size = (columns * wide + beside, rows * (tall + 0.3) + 0.9)
     layout = ConstrainedLayoutEngine(compress=True, w_pad=0.06, h_pad=0.06)
     whole = Figure(size, DPI, layout=layout)
-    return [whole.add_subplot(rows, columns, n + 1) for n in range(panels)]
-
-
-def _label_outer_only(axes: list[Axes], columns: int) -> None:
-    """Keeps the labels of panels with none below or none to their left."""
-    for n, ax in enumerate(axes):
-        lowest, leftmost = n >= len(axes) - columns, n % columns == 0
+    axes = [whole.add_subplot(rows, columns, n + 1) for n in range(panels)]
+    for n, ax in enumerate(axes):  # labels where no panel is below, or to the left
+        lowest, leftmost = n >= panels - columns, n % columns == 0
         ax.tick_params(labelbottom=lowest, labelleft=leftmost)
         ax.xaxis.label.set_visible(lowest)
         ax.yaxis.label.set_visible(leftmost)
+    return axes
 
 
 def _paint(ax: Axes, dataset: xarray.Dataset, now: Snapshot, look: Look) -> None:
@@ -182,29 +155,25 @@ def _paint(ax: Axes, dataset: xarray.Dataset, now: Snapshot, look: Look) -> None
     ax.set(xlabel=label("x", units), ylabel=label("y", units))
     inches = ax.bbox.transformed(ax.figure.dpi_scale_trans.inverted())
     apart = 72 * look.spacing * min(inches.width / (right - left), inches.height / (top - bottom))
-    size = 1.3 * apart if _crowded(dataset) else min(0.4 * apart, 7.0)
-    if not _crowded(dataset):
+    size = 1.3 * apart if look.crowded else min(0.4 * apart, 7.0)
+    if not look.crowded:
         ends = list(now.position[now.bonds])
         ax.add_collection(LineCollection(ends, colors=LINE, linewidths=0.08 * size, zorder=0))
-    _dots(ax, now, look.norm, size, _crowded(dataset))
+    _dots(ax, now, look, size)
     if look.numbers:
         for number, place in zip(dataset["number"].values, now.position, strict=True):
             beside = (0.5 * size, 0.5 * size)
             ax.annotate(str(number), place, beside, textcoords="offset points", fontsize=6)
 
 
-def _crowded(dataset: xarray.Dataset) -> bool:
-    return bool(dataset.sizes["particle"] > DETAILED)
-
-
-def _dots(ax: Axes, now: Snapshot, norm: Normalize | None, size: float, crowded: bool) -> None:
+def _dots(ax: Axes, now: Snapshot, look: Look, size: float) -> None:
     """Contours, and the particles on them: dots, or squares, unless those hid the contours."""
     from matplotlib.colors import BoundaryNorm
     from matplotlib.tri import Triangulation
 
-    (x, y), values, mesh = now.position.T, now.values, now.triangles
+    (x, y), values, mesh, norm = now.position.T, now.values, now.triangles, look.norm
     dense = {"marker": "s", "edgecolors": "none", "rasterized": True}
-    style: dict[str, Any] = dense if crowded else {"edgecolors": INK, "lw": 0.08 * size}
+    style: dict[str, Any] = dense if look.crowded else {"edgecolors": INK, "lw": 0.08 * size}
     if values is not None and mesh is None:
         style |= {"cmap": DOT_COLOURS, "norm": norm, "plotnonfinite": True}
         ax.scatter(x, y, (1.2 * size) ** 2, values, **style)
@@ -212,7 +181,7 @@ def _dots(ax: Axes, now: Snapshot, norm: Normalize | None, size: float, crowded:
     if values is not None and mesh is not None and len(mesh) and isinstance(norm, BoundaryNorm):
         fill, levels = Triangulation(x, y, mesh), norm.boundaries
         ax.tricontourf(fill, np.nan_to_num(values), levels, cmap=CONTOUR_COLOURS, norm=norm)
-    if mesh is None or not crowded:
+    if mesh is None or not look.crowded:
         for kind, (_, colour) in KINDS.items():
             ax.scatter(x[now.kind == kind], y[now.kind == kind], size**2, colour, **style)
 
@@ -228,7 +197,7 @@ def _explain(
         bar = axes[0].figure.colorbar(colours, ax=axes, aspect=25)
         bar.set_label(variable_label(dataset, color))
         bar.ax.ticklabel_format(axis="y", scilimits=(-3, 4))
-    if color is None or (contours and not _crowded(dataset)):
+    if color is None or (contours and not look.crowded):
         _legend(axes, np.unique(dataset["kind"].values))
 
 

@@ -23,8 +23,7 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
         nonlocal bar, due
         if not wanted or time.perf_counter() < due:
             return
-        if bar is None:
-            bar = _new_bar()
+        bar = bar or _new_bar()
         due = time.perf_counter() + REFRESH_S
         bar.update(bar.task_ids[0], description=what, completed=done)
 
@@ -37,15 +36,9 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
 
 def _new_bar() -> Any:
     from rich.console import Console
-    from rich.progress import Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress
 
-    bar = Progress(
-        *Progress.get_default_columns()[:2],
-        TextColumn("{task.percentage:.0f} %"),
-        TimeRemainingColumn(),
-        console=Console(file=sys.stderr),
-        transient=True,
-    )
+    bar = Progress(console=Console(file=sys.stderr), transient=True)
     bar.start()
     bar.add_task("", total=1)
     return bar

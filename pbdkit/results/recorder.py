@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.results import layout
-from pbdkit.results.layout import Column, Values
+from pbdkit.results.layout import Column, Values, When
 from pbdkit.results.measured import Measured
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
@@ -57,20 +57,16 @@ class Recorder:
     """Records the run of one scene into a sink."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
-        self._scene = scene
-        self._sink = sink
-        self._tables = Tables(scene)
-        self.last_recorded = -1
-        """The last step of which positions were taken."""
+        self._scene, self._sink = scene, sink
+        self._tables, self._measured = Tables(scene), Measured(scene)
+        self._last_recorded = -1
         self.warnings: tuple[str, ...] = ()
-        self._measured = Measured(scene)
 
     def begin(self) -> None:
         """Hands over the columns and everything that is known before the first step."""
-        columns, experiment = self._columns(), self._scene.experiment
-        records = experiment.recording.count(experiment.steps)
-        planned = {"time": records, "step": experiment.steps + 1}
-        self._sink.begin(columns, self._measured.sizes, planned)
+        steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
+        planned = {"time": recording.count(steps), "step": steps + 1}
+        self._sink.begin(self._columns(), self._measured.sizes, planned)
         for name, values in self._known().items():
             self._sink.put({name: values()})
 
@@ -91,38 +87,30 @@ class Recorder:
             known["leader_group"] = lambda: np.arange(len(scene.leading))
         return known | self._measured.coordinates()
 
-    def observe(self, state: State) -> None:
-        """Takes what is wanted of this step. Raises FloatingPointError where a recorded value has
-        left the finite numbers; nothing of that step is kept."""
-        with np.errstate(all="ignore"):
-            self._observe(state, self.records(state.step), self._measured.every_step)
-
-    def records(self, step: int) -> bool:
-        """Whether positions are recorded at that step."""
-        experiment = self._scene.experiment
-        return experiment.recording.keeps(step, experiment.steps)
-
-    def observe_last(self, state: State) -> None:
-        """Records the step at which a run stops before its end."""
-        if state.step > self.last_recorded:
-            with np.errstate(all="ignore"):
-                self._observe(state, recorded=True, stepped=False)
-
-    def _observe(self, state: State, recorded: bool, stepped: bool) -> None:
-        moment = StateMoment(state, self._tables)
+    @np.errstate(all="ignore")
+    def observe(self, state: State, *, last: bool = False) -> None:
+        """Takes what is wanted of this step; positions too of the `last` of a run that stops before
+        its end, which may have come before without that. Raises FloatingPointError where a recorded
+        value has left the finite numbers; nothing of that step is kept."""
+        moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
-        if recorded:
+        if (
+            state.step > self._last_recorded
+            if last
+            else experiment.recording.keeps(state.step, experiment.steps)
+        ):
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
             values |= self._measured.at_record(moment)
-            if self.last_recorded < 0:
+            values |= self._measured.diagnosed(When.RECORD, moment)
+            if self._last_recorded < 0:
                 values |= self._measured.at_start(moment)
-            self.last_recorded = state.step
-        if stepped:
-            values |= {"step": state.step} | self._measured.at_step(moment)
+            self._last_recorded = state.step
+        if self._measured.every_step and not last:
+            values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
         if values:
             self._sink.put(values)
 
@@ -131,14 +119,14 @@ class Recorder:
         the first step; `warnings` says what the user should know of the last state."""
         # Where a run diverged, what broke since the last record is no result.
         diverged = outcome.status == "diverged"
-        moment = StateMoment(state, self._tables, self.last_recorded if diverged else state.step)
+        moment = StateMoment(state, self._tables, self._last_recorded if diverged else state.step)
         if not diverged and (warning := moment.cells.inside_out()):
             self.warnings = (warning,)
         if self._scene.has_fracture:
             steps, strains = moment.broken_step(), moment.broken_strain()
             self._sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
-            self._sink.put(self._measured.at_end(moment))
+            self._sink.put(self._measured.diagnosed(When.END, moment))
         self._sink.finish(self._attributes(outcome, prediction))
 
     def _columns(self) -> list[Column]:
@@ -151,16 +139,10 @@ class Recorder:
             columns.append(layout.step_column())
         if self._measured.shows_leaders:
             columns.append(layout.leader_column())
-        return [self._as_recorded(column) for column in (*columns, *self._measured.columns())]
-
-    def _as_recorded(self, column: Column) -> Column:
-        """The column with the dtype that the experiment asks for."""
-        short = self._scene.experiment.record.dtype == "float32"
-        return (
-            replace(column, dtype="f4")
-            if short and column.grows and column.dtype == "f8"
-            else column
-        )
+        columns += self._measured.columns()
+        if self._scene.experiment.record.dtype == "float64":
+            return columns
+        return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +21,7 @@ class MemorySink(Sink):
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
         """Nothing is allocated before it comes."""
-        self._columns = columns
-        self._sizes = sizes
+        self._columns, self._sizes = columns, sizes
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
 
     def put(self, values: Values) -> None:
@@ -71,7 +69,7 @@ class OverlappingSink(Sink):
 
     def __init__(self, inner: Sink) -> None:
         self._inner = inner
-        self._thread: ThreadPoolExecutor | None = None
+        self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
         self._waiting: deque[Future[None]] = deque()
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
@@ -80,11 +78,9 @@ class OverlappingSink(Sink):
 
     def put(self, values: Values) -> None:
         """Takes the values over: they must not be changed afterwards."""
-        if self._thread is None:
-            if sum(np.asarray(v).nbytes for v in values.values()) < LARGE_BYTES:
-                self._inner.put(values)
-                return
-            self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
+        if not self._waiting and sum(np.asarray(v).nbytes for v in values.values()) < LARGE_BYTES:
+            self._inner.put(values)
+            return
         while len(self._waiting) >= MOST_WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(self._inner.put, values))
@@ -93,19 +89,11 @@ class OverlappingSink(Sink):
         """When all is written."""
         while self._waiting:
             self._waiting.popleft().result()
-        self._end_thread()
+        self._thread.shutdown()
         self._inner.finish(attributes)
 
     def abandon(self) -> None:
         """What waits is not written."""
-        for future in self._waiting:
-            future.cancel()
-        while self._waiting:
-            with suppress(BaseException):
-                self._waiting.popleft().result()
-        self._end_thread()
+        self._thread.shutdown(cancel_futures=True)
+        self._waiting.clear()
         self._inner.abandon()
-
-    def _end_thread(self) -> None:
-        if self._thread:
-            self._thread.shutdown()

@@ -54,7 +54,7 @@ def take_snapshots(
     a body that has no triangles.
     """
     if color is not None or contours:
-        _check(color, drawable(dataset))
+        _check(color, dataset)
     rows = [_row(dataset["time"].values, time) for time in times]
     triangles = _body_triangles(dataset) if contours and rows else None
     return [_snapshot(dataset.isel(time=row), color, triangles) for row in rows]
@@ -73,18 +73,6 @@ def _snapshot(now: xarray.Dataset, color: str | None, triangles: Array | None) -
         triangles = triangles[whole]
     position = now["position"].transpose("particle", "axis").values
     return Snapshot(step, position, now["kind"].values, values, bonds[~gone], triangles)
-
-
-def drawable(dataset: xarray.Dataset) -> list[str]:
-    """The variables that have a number or a vector for each particle."""
-    shapes = ({"particle"}, {"particle", "axis"})
-    return [
-        str(name)
-        for name, variable in dataset.data_vars.items()
-        if set(variable.dims) - {"time"} in shapes
-        and name != "kind"
-        and variable.dtype.kind in "biuf"
-    ]
 
 
 def variable_label(dataset: xarray.Dataset, name: str) -> str:
@@ -130,7 +118,14 @@ def _have_side(triangles: Array, pairs: Array) -> Array:
     return np.asarray(found.any(axis=1))
 
 
-def _check(color: str | None, known: list[str]) -> None:
+def _check(color: str | None, dataset: xarray.Dataset) -> None:
+    """What can be drawn has a number or a vector for each particle."""
+    shapes = ({"particle"}, {"particle", "axis"})
+    known = [
+        str(name)
+        for name, variable in dataset.drop_vars("kind").data_vars.items()
+        if set(variable.dims) - {"time"} in shapes and variable.dtype.kind in "biuf"
+    ]
     names = f"what can be drawn: {', '.join(known)}"
     if color is None:
         raise ExperimentError(f"contours need a variable as color; {names}")

@@ -31,8 +31,7 @@ def broken_along(scene: Scene, state: State, block: Block, slot: Slot) -> NDArra
     assert state.broken_step is not None
     plane, at_this_end = scene.neighbourhood.home[slot]
     home = block if at_this_end else block.seen_through(slot)
-    broken: NDArray[np.bool_] = home.within(state.broken_step[plane]) >= 0
-    return broken
+    return np.asarray(home.within(state.broken_step[plane]) >= 0)
 
 
 class Tables:

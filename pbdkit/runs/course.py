@@ -1,10 +1,10 @@
-"""The run of a scene, and its recording."""
+"""The run of a scene, its recording, and a rehearsal of that."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.results.recorder import Outcome, Recorder, Sink
+from pbdkit.results.sinks import MemorySink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice
@@ -23,6 +24,8 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
     Equilibrium: Straight,
 }
 """What carries out what an experiment asks for under `solver`."""
+LARGEST = 50_000
+"""Of larger bodies nothing is measured ahead of the run."""
 
 
 class Run:
@@ -55,12 +58,6 @@ class Run:
         return self.driver.state
 
     @property
-    def ending(self) -> bool:
-        """Whether the state just given out is the last of a run that ends before its last step, to
-        be kept whatever the experiment records. It may have come before without that."""
-        return self.driver.ending
-
-    @property
     def choice(self) -> Choice:
         """The engine, its threads, and why."""
         return self.driver.choice
@@ -69,10 +66,6 @@ class Run:
     def warnings(self) -> tuple[str, ...]:
         """What is to be said before the first step: of the scene, and of stability."""
         return quick_warnings(self.scene)
-
-    def reject(self, error: FloatingPointError) -> None:
-        """The state just given out has values that are not finite: the run is to end here."""
-        self.driver.rejection = error
 
 
 @dataclass(frozen=True)
@@ -102,9 +95,9 @@ def record(run: Run, sink: Sink) -> Report:
         for state in run:
             try:
                 with _located(scene):
-                    (recorder.observe_last if run.ending else recorder.observe)(state)
+                    recorder.observe(state, last=run.driver.ending)
             except FloatingPointError as error:
-                run.reject(error)
+                run.driver.rejection = error
         assert run.outcome is not None
         with _located(scene):
             recorder.finish(run.state, run.outcome, prediction(scene))
@@ -113,6 +106,16 @@ def record(run: Run, sink: Sink) -> Report:
         raise
     wall_s = time.perf_counter() - begun
     return Report(run.outcome, scene.raster.count, wall_s, run.choice, recorder.warnings)
+
+
+def rehearse(scene: Scene) -> None:
+    """Measures at the start what the run will record; raises what the run would."""
+    if not scene.experiment.diagnostics or scene.raster.count > LARGEST:
+        return
+    recorder = Recorder(scene, MemorySink())
+    with _located(scene), suppress(FloatingPointError):  # such a run diverges at once, and says so
+        recorder.begin()
+        recorder.observe(initial_state(scene))
 
 
 @contextmanager

@@ -59,7 +59,11 @@ class Stepwise(Driver):
         self._engine, self.choice = make_engine(scene, choose(scene))
         self._patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
         self.guard = Guard.of(scene, state)
-        self.settling = _settling(scene, state, watch)
+        self.settling: Settling | None = None
+        if asked := scene.experiment.stepping.settle:
+            from pbdkit.equilibrium.settlement import Settling  # only where it is asked for
+
+            self.settling = Settling(scene, asked, state, watch)
         self.kept = -1
         """The last step that was given out to be recorded, and was not rejected."""
 
@@ -141,15 +145,6 @@ class Stepwise(Driver):
                         "leaders' ways"
                     )
         return Outcome("diverged", reason, step)
-
-
-def _settling(scene: Scene, start: State, watch: Watch) -> Settling | None:
-    asked = scene.experiment.stepping.settle
-    if asked is None:
-        return None
-    from pbdkit.equilibrium.settlement import Settling  # only where it is asked for
-
-    return Settling(scene, asked, start, watch)
 
 
 class Straight(Driver):

@@ -1,4 +1,4 @@
-"""``pbdkit explain``."""
+"""``pbdkit plot`` and ``explain``: a result looked at."""
 
 from __future__ import annotations
 
@@ -17,6 +17,38 @@ if TYPE_CHECKING:
 
 SHOWN = 20
 """So many broken bonds are listed in words; --json has all."""
+
+
+@click.command()
+@click.argument("file", metavar="OUT.nc", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="PNG, SVG or PDF.")
+@click.option("--time", "times", type=int, multiple=True, help="A recorded step; several panels.")
+@click.option("--color", metavar="VARIABLE", help="Colour by a variable, e.g. pe1.")
+@click.option("--contours", is_flag=True, help="Fill contours of the variable.")
+@click.option("--numbers", is_flag=True, help="Write the particles' numbers.")
+@click.option("--force", is_flag=True, help="Replace an existing picture.")
+def plot(
+    file: Path,
+    output: Path | None,
+    times: tuple[int, ...],
+    color: str | None,
+    contours: bool,
+    numbers: bool,
+    force: bool,
+) -> None:
+    """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
+    from pbdkit.cli.output import refuse_output, refuse_unwritable, save
+    from pbdkit.results.accessor import reading
+    from pbdkit.results.picture import draw
+
+    path = output or file.with_suffix(".png")
+    refuse_output(path, force=force)
+    refuse_unwritable(path)
+    with reading(file) as dataset:
+        axes = draw(dataset, times or [None], color=color, contours=contours, numbers=numbers)
+        whole = axes[0].get_figure(root=True)
+        assert whole is not None
+        save(path, whole)
 
 
 @click.command()
@@ -44,7 +76,7 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
 def _of_all(explained: Explained) -> dict[str, Any]:
     steps = explained.steps
     return {
-        "fracture": explained.fracture,
+        "fracture": explained.model.type,
         "bonds": len(steps),
         "broken": int((steps > 0).sum()),
         "broken_from_the_start": int((steps == 0).sum()),
@@ -60,7 +92,7 @@ def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
     most = explained.most_strained(row)
     (standing,) = explained.standings(np.array([row]))
     return {
-        "fracture": explained.fracture,
+        "fracture": explained.model.type,
         "bond": standing,
         "most_strained": {"step": most[0], "strain": most[1]},
         "remembered": explained.remembered(row),
@@ -115,18 +147,16 @@ def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
 
 def _around_in_words(around: list[Standing], s: Standing) -> Iterator[str]:
     """The other bonds at its ends: what broke before it, with it and after it."""
-    broken = [other for other in around if other.step is not None]
-    if s.step is None:
-        groups = {"broken around it": broken}
-    else:
-        step = s.step
+    broken = [(other.step, other) for other in around if other.step is not None]
+    groups = {"broken around it": broken}
+    if (step := s.step) is not None:
         groups = {
-            "broken around it before": [o for o in broken if o.step is not None and o.step < step],
-            "in the same step": [o for o in broken if o.step == step],
-            "after": [o for o in broken if o.step is not None and o.step > step],
+            "broken around it before": [each for each in broken if each[0] < step],
+            "in the same step": [each for each in broken if each[0] == step],
+            "after": [each for each in broken if each[0] > step],
         }
     for title, group in groups.items():
-        listed = ", ".join(f"{o.bond[0]}-{o.bond[1]} (step {o.step})" for o in group)
+        listed = ", ".join(f"{o.bond[0]}-{o.bond[1]} (step {at})" for at, o in group)
         yield f"{title}: {listed or 'none'}"
     whole = [o for o in around if o.step is None]
     yield f"not broken around it: {len(whole)}" + (

@@ -53,21 +53,22 @@ class Project:
     type: str
     class_name: str
     interface: str
+    field: str
 
     def files(self) -> dict[str, str]:
         """The text of each file, by its place in the project's folder."""
-        field = _field_of(self.interface)
-        own = f"{{type: {self.type}}}" if field != "diagnostics" else f"[{{type: {self.type}}}]"
-        parts = DEFAULT_PARTS | {field: own}
+        own = (
+            f"[{{type: {self.type}}}]" if self.field == "diagnostics" else f"{{type: {self.type}}}"
+        )
+        parts = DEFAULT_PARTS | {self.field: own}
         known = {
             **vars(self),
             "variable": self.type.replace("-", "_"),
-            "field": field,
             "own": own,
             "pbdkit_version": ".".join(__version__.split(".")[:2]),
-            "parts": "\n".join(f"{field}: {part}" for field, part in parts.items()),
+            "parts": "\n".join(f"{name}: {part}" for name, part in parts.items()),
         }
-        folder = files("pbdkit.skeleton").joinpath("templates")
+        folder = files("pbdkit.cli").joinpath("templates")
         return {
             file.format(**known): Template(
                 folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
@@ -120,13 +121,10 @@ def project_of(name: str, interface: str) -> Project:
         raise ExperimentError(f"'{name}' makes no name for a class{instead}")
     if module in keyword.kwlist or _is_module(module):
         raise ExperimentError(f"there is a module {module} already{instead}")
-    if kind in Registry().components(INTERFACES[_field_of(interface)], installed=False):
+    field, own = next((field, i) for field, i in INTERFACES.items() if i.__name__ == interface)
+    if kind in Registry().components(own, installed=False):
         raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
-    return Project(distribution, module, kind, class_name, interface)
-
-
-def _field_of(interface: str) -> str:
-    return next(field for field, i in INTERFACES.items() if i.__name__ == interface)
+    return Project(distribution, module, kind, class_name, interface, field)
 
 
 def _is_module(name: str) -> bool:
