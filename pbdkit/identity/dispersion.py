@@ -108,19 +108,17 @@ def long_rates(q: Floats, degrees: Floats) -> Complex:
 
 def ranges(q: Floats) -> tuple[Range, Range]:
     """Of the diffusivities of the fast and of the slow wave."""
-    found = []
-    for wave in (0, 1):
-        ends = []
-        for sign in (1.0, -1.0):
 
-            def value(at: Floats, sign: float = sign, wave: int = wave) -> Floats:
-                rates: Floats = long_rates(q, at[:, 0])[:, wave].real.astype(float)
-                return sign * rates
+    def least(wave: int, sign: float) -> tuple[float, float]:
+        def value(at: Floats) -> Floats:
+            rates: Floats = long_rates(q, at[:, 0])[:, wave].real.astype(float)
+            return sign * rates
 
-            at, least = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
-            ends += [sign * least, round(float(at[0]), 3) % 180.0]
-        found.append(Range(*ends))
-    return found[0], found[1]
+        at, found = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
+        return sign * found, round(float(at[0]), 3) % 180.0
+
+    fast, slow = (Range(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
+    return fast, slow
 
 
 def gradients(waves: SlowWaves) -> tuple[Gradient, ...]:

@@ -100,17 +100,6 @@ class Identity:
         isotropic = self.body is not None and self.body.symmetry == "isotropic"
         return self.body.poisson_ratio(0.0) if self.body and isotropic else None
 
-    def speed(self, diffusivity: float) -> float | None:
-        """Spacings a step of a wave of that diffusivity D with the solver's relaxation w and
-        memory b: √(w D / √b). None without memory, or where it grows by itself.
-
-        μ² - (1 + b - w D k²) μ + b = 0 has the roots √b exp(±iω) with
-        ω² = (w D k² - (1 - √b)²) / √b for small ω: waves of that speed, less a cut-off.
-        """
-        if not 0.0 < self.memory <= 1.0 or diffusivity < 0.0:
-            return None
-        return float(np.sqrt(self.relaxation * diffusivity / np.sqrt(self.memory)))
-
     def as_dict(self) -> dict[str, Any]:
         """What ``pbdkit identify --json`` prints, in units of the spacing and of a step."""
         plain = ("name", "lattice", "neighbours", "rule", "kind", "spacing", "linear", "symmetric")

@@ -157,19 +157,6 @@ class SlowWaves:
             x.append((self.solver @ right)[: len(alike)])
         return a
 
-    def rates(self, k: Floats) -> Floats:
-        """(wave, 2): real parts of the two rates at finite k, (wave, axis), the larger first.
-
-        With several sites those whose waves move all sites most alike.
-        """
-        values, vectors = np.linalg.eig(operator(self.stencil, k))
-        if self.stencil.sites > 1:
-            alike = _all_alike(self.stencil.sites)
-            shared = np.linalg.norm(np.swapaxes(vectors, 1, 2) @ alike, axis=-1)
-            best = np.argsort(-shared, axis=1)[:, :2]
-            values = np.take_along_axis(values, best, axis=1)
-        return np.sort(values.real, axis=1)[:, ::-1]
-
 
 def slow_waves(stencil: Primitive) -> SlowWaves:
     """The slow waves; NoSlowWavesError where a translation of the whole is not left alone, or
