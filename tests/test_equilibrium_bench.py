@@ -8,9 +8,9 @@ import pytest
 
 import pbdkit
 from pbdkit.bench import measurement
-from pbdkit.bench.decay import Decay, decay_of, followers_of
 from pbdkit.bench.measurement import Row, measure
 from pbdkit.bench.work_precision import lines, picture, table
+from pbdkit.bench.worker import Decay, decay_of, followers_of
 from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.scene.scene import build_scene
 

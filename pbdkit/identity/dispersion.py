@@ -16,8 +16,7 @@ elasticity, where rows beyond the next attract.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,20 +71,6 @@ class LongWaves:
     fast: Range
     slow: Range
     gradients: tuple[Gradient, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """The figures as plain values."""
-        tensor = self.diffusivity
-        return {
-            "second_order": self.second.tolist(),
-            "diffusivity_tensor": None if tensor is None else tensor.tolist(),
-            "fast": asdict(self.fast),
-            "slow": asdict(self.slow),
-            "gradients": [
-                asdict(g) | {"total": list(g.total), "material": list(g.material)}
-                for g in self.gradients
-            ],
-        }
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class Elasticity:
         return float(-(across @ compliance @ along) / own) if known else None
 
     def as_dict(self) -> dict[str, Any]:
-        """The constants by name and what follows from them, as plain values."""
+        """The constants by name and what follows from them."""
         constants = {
             f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j])
             for i in range(3)
@@ -112,7 +112,7 @@ class Elasticity:
             "zener": self.zener,
             "axis": self.axis,
             "least_stiffness": self.least_stiffness,
-            "mobility": self.mobility.tolist(),
+            "mobility": self.mobility,
         }
 
 
