@@ -15,7 +15,7 @@ import pbdkit
 from pbdkit.components import pbdkit_components
 from pbdkit.components.rules import MixedCoordinate
 from pbdkit.interfaces import INTERFACES
-from pbdkit.testing import PROPERTIES, Examination, conformance, examine, examine_all, examples_of
+from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of, properties_of
 
 test_built_in_components_conform = conformance(*pbdkit_components())
 
@@ -153,7 +153,7 @@ def test_nobody_is_excused():
     for component in pbdkit_components():
         asked = [p.name for p in PROPERTIES if issubclass(component, p.interfaces)]
         for example in examples_of(component):
-            assert [p.name for p in Examination(example).properties] == asked
+            assert [p.name for p in properties_of(type(example))] == asked
 
 
 def test_a_report_tells_what_ran_and_why_not():

@@ -291,7 +291,7 @@ def test_waves_with_memory_have_the_speed_that_the_steps_give_them():
     """ω² = c² k² less a constant, along x where λ = (1 + cos k)/2."""
     memory, k = 0.81, np.array([0.25, 0.26])
     found = identity(SQUARE, NEAREST, BARYCENTRE, solver={"type": "stepping", "memory": memory})
-    speed = found.speed(found.diffusivity)
+    speed = math.sqrt(found.relaxation * found.diffusivity / math.sqrt(found.memory))
     assert speed == pytest.approx(math.sqrt(0.25 / 0.9))
     frequency = np.angle(modes((1 + np.cos(k)) / 2 + 0j, 1.0, memory)[:2])
     assert np.diff(frequency**2) / np.diff(k**2) == pytest.approx(speed**2, rel=0.01)
@@ -304,8 +304,8 @@ def test_slow_waves_follow_their_series_to_the_fourth_order():
     series = waves.series(direction)
     for k, within in ((0.1, 2e-8), (0.05, 2e-8 / 2**6)):
         expected = np.linalg.eigvals(sum(term * k**m for m, term in enumerate(series)))
-        exact = waves.rates(k * direction[None])[0]
-        np.testing.assert_allclose(np.sort(expected.real)[::-1], exact, atol=within)
+        exact = np.linalg.eigvals(operator(found.stencil, k * direction[None])[0]).real
+        np.testing.assert_allclose(np.sort(expected.real), np.sort(exact)[:2], atol=within)
 
 
 @pytest.mark.parametrize("lattice", LATTICES)

@@ -1,7 +1,6 @@
 """What `pbdkit identify` says of third parties' rules and lattices, and how it says it."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from identity_cases import (
 from remembering_parts import Tiring
 
 import pbdkit
-from pbdkit.identity.polar import by_direction
 
 HONEYCOMB = {"type": "honeycomb"}
 
@@ -198,37 +196,3 @@ def test_the_table_of_an_anisotropic_body(call):
     assert rows["Poisson's ratio"] == "0.2 pulled along x, 0.1 along y (plane stress)"
     assert rows["axis of symmetry"] == "at 0°"
     assert rows["relaxation"] == "stable below 0.900625 with memory 0.25"
-    assert rows["wave speed"].endswith("h/step with memory 0.25")
-
-
-def test_the_picture(call, monkeypatch):
-    settings = ("--set", "rule={type: springs}", "--set", "neighbours={type: chebyshev}")
-    result = call("identify", "e.json", "--picture", "e.svg", *settings)
-    assert (result.code, result.out.splitlines()[-1]) == (0, "e.svg written")
-    assert Path("e.svg").read_text().rstrip().endswith("</svg>")
-    assert call("identify", "e.json", "--picture", "e.txt").err == (
-        "pbdkit: e.txt: a picture ends in .png, .svg, .pdf\n"
-    )
-    assert call("identify", "e.json", "--picture", "no/e.png").code == 6
-    monkeypatch.setattr("pbdkit.cli.output.find_spec", lambda name: None)
-    assert call("identify", "e.json", "--picture", "e.png").err == (
-        "pbdkit: a picture needs matplotlib: pip install 'pbdkit[plot]'\n"
-    )
-
-
-def test_the_curves_of_the_picture():
-    """Circles for an isotropic body, of E = 1 and ν; the faster wave is C11, the slower C66."""
-    found = identity(SQUARE, EIGHT, {"type": "elastic", "poisson_ratio": 0.3})
-    waves, bars = by_direction(found).axes
-    fast, slow, *_ = (line.get_ydata() for line in waves.lines)
-    np.testing.assert_allclose(fast, found.body.stiffness[0, 0], rtol=1e-6)
-    np.testing.assert_allclose(slow, found.body.stiffness[2, 2], rtol=1e-6)
-    modulus, ratio = (line.get_ydata() for line in bars.lines)
-    np.testing.assert_allclose(modulus, 1.0, rtol=1e-12)
-    np.testing.assert_allclose(ratio, 0.3, rtol=1e-11)
-    assert len(by_direction(identity(SQUARE, NEAREST, BARYCENTRE)).axes) == 1
-
-
-def test_nothing_is_drawn_where_there_are_no_waves():
-    with pytest.raises(pbdkit.ExperimentError, match="'anchored' has no waves to draw: a rigid"):
-        by_direction(identity(SQUARE, NEAREST, "anchored"))

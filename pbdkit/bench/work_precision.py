@@ -79,41 +79,15 @@ def _cell(row: Row, name: str) -> str:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """What the columns are, why rows are left out, and what is gained over stepping."""
+    """What the columns are, and why rows are left out."""
     told = [f"{COLUMNS[n][0]}: {COLUMNS[n][2]}" for n in _shown(rows) if COLUMNS[n][2]]
     for row in rows:
         if row.reason:
             tolerance = f", {row.tolerance:.0e}" if row.tolerance else ""
-            told.append(f"left out: {row.line} at {_size(row)}{tolerance}: {row.reason}")
-    return [*dict.fromkeys(told), *gains(rows)]
-
-
-def _size(row: Row) -> str:
-    return f"size {_cell(row, 'size')}"
-
-
-def gains(rows: Sequence[Row]) -> list[str]:
-    """How much less processor time than steps the cheapest method takes, a line a size, at the
-    tightest tolerance that both reach."""
-    told = []
-    for _, block in groupby(rows, key=lambda row: row.size):
-        there = [row for row in block if row.cpu_s and row.tolerance]
-        ways = [row for row in there if row.certified is not None]
-        for steps in sorted((r for r in there if r.steps and r.certified is None), key=_tolerance):
-            reach = [row for row in ways if (row.certified or 0.0) <= _tolerance(steps)]
-            if reach:
-                best = min(reach, key=lambda row: row.cpu_s or 0.0)
-                how = "would take" if steps.is_predicted else "take"
-                told.append(
-                    f"{_size(steps)}, to {steps.tolerance:.0e}: {steps.steps} steps {how} "
-                    f"{steps.cpu_s:.3g} s of processor time, {best.method} {best.cpu_s:.3g} s"
-                )
-                break
-    return told
-
-
-def _tolerance(row: Row) -> float:
-    return row.tolerance or 0.0
+            told.append(
+                f"left out: {row.line} at size {_cell(row, 'size')}{tolerance}: {row.reason}"
+            )
+    return list(dict.fromkeys(told))
 
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
@@ -150,7 +124,7 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
     for ax, particles in zip(panels, sizes, strict=False):
         for n, kind in enumerate(kinds):
             some = [row for row in drawn_rows if row.line == kind and row.particles == particles]
-            _draw(ax, some, COLOURS[n % len(COLOURS)], MARKERS[n % len(MARKERS)])
+            _draw(ax, some, kind, COLOURS[n % len(COLOURS)], MARKERS[n % len(MARKERS)])
         ax.set_title(f"{particles:,} particles".replace(",", " "), fontsize=8)
         ax.set(xscale="log", yscale="log")
         ax.grid(visible=True, linewidth=0.3, alpha=0.6)
@@ -165,7 +139,9 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
         ax.set_xlabel("ns a particle and step" if by_step else "seconds of processor time")
     drawn.supylabel("largest error, as a share", fontsize=8)
     drawn.suptitle(title, fontsize=9)
-    _legend(drawn, panels, kinds)
+    named = panels[0].get_legend_handles_labels()
+    columns = min(4, len(kinds) or 1)
+    drawn.legend(*named, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
     return drawn
 
 
@@ -173,23 +149,9 @@ def _x(row: Row) -> float:
     return row.ns_per_particle_step or row.cpu_s or 0.0
 
 
-def _draw(ax: Axes, rows: Sequence[Row], colour: str, marker: str) -> None:
+def _draw(ax: Axes, rows: Sequence[Row], kind: str, colour: str, marker: str) -> None:
     x, y = [_x(row) for row in rows], [max(row.error or 0.0, FLOOR) for row in rows]
     face = ["white" if row.is_predicted else colour for row in rows]
-    ax.plot(
-        x,
-        y,
-        color=colour,
-        linewidth=0.9,
-        linestyle=":",
-    )
+    ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
     ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
-
-
-def _legend(drawn: Figure, panels: Any, kinds: Sequence[str]) -> None:
-    for n, kind in enumerate(kinds):
-        colour, marker = COLOURS[n % len(COLOURS)], MARKERS[n % len(MARKERS)]
-        panels[0].scatter([], [], color=colour, marker=marker, label=kind)
-    drawn.legend(
-        loc="outside lower center", ncols=min(4, len(kinds) or 1), fontsize=7, frameon=False
-    )
+    ax.scatter([], [], color=colour, marker=marker, label=kind)

@@ -65,15 +65,11 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
 @experiment_argument
 @set_option
 @json_option
-@click.option("--picture", type=click.Path(path_type=Path), help="PNG, SVG or PDF.")
-def identify(
-    experiment: str, settings: tuple[str, ...], as_json: bool, picture: Path | None
-) -> None:
+def identify(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Say what the experiment's rule is physically, on its lattice and neighbours."""
     from pbdkit.api import identify, load
-    from pbdkit.cli.output import refuse_unwritable, save, show_table
+    from pbdkit.cli.output import show_table
 
-    refuse_unwritable(picture)
     found = identify(load(experiment, settings=settings))
     if as_json:
         click.echo(json.dumps(found.as_dict()))
@@ -84,10 +80,6 @@ def identify(
         show_table(table(found))
         for note in found.notes:
             click.echo(f"note: {note}")
-    if picture:
-        from pbdkit.identity.polar import by_direction
-
-        save(picture, by_direction(found), quiet=as_json)
 
 
 class Sizes(click.ParamType[tuple[int, ...]]):

@@ -16,8 +16,7 @@ elasticity, where rows beyond the next attract.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,20 +72,6 @@ class LongWaves:
     slow: Range
     gradients: tuple[Gradient, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """The figures as plain values."""
-        tensor = self.diffusivity
-        return {
-            "second_order": self.second.tolist(),
-            "diffusivity_tensor": None if tensor is None else tensor.tolist(),
-            "fast": asdict(self.fast),
-            "slow": asdict(self.slow),
-            "gradients": [
-                asdict(g) | {"total": list(g.total), "material": list(g.material)}
-                for g in self.gradients
-            ],
-        }
-
 
 @dataclass(frozen=True)
 class Spectrum:
@@ -108,19 +93,17 @@ def long_rates(q: Floats, degrees: Floats) -> Complex:
 
 def ranges(q: Floats) -> tuple[Range, Range]:
     """Of the diffusivities of the fast and of the slow wave."""
-    found = []
-    for wave in (0, 1):
-        ends = []
-        for sign in (1.0, -1.0):
 
-            def value(at: Floats, sign: float = sign, wave: int = wave) -> Floats:
-                rates: Floats = long_rates(q, at[:, 0])[:, wave].real.astype(float)
-                return sign * rates
+    def least(wave: int, sign: float) -> tuple[float, float]:
+        def value(at: Floats) -> Floats:
+            rates: Floats = long_rates(q, at[:, 0])[:, wave].real.astype(float)
+            return sign * rates
 
-            at, least = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
-            ends += [sign * least, round(float(at[0]), 3) % 180.0]
-        found.append(Range(*ends))
-    return found[0], found[1]
+        at, found = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
+        return sign * found, round(float(at[0]), 3) % 180.0
+
+    fast, slow = (Range(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
+    return fast, slow
 
 
 def gradients(waves: SlowWaves) -> tuple[Gradient, ...]:

@@ -82,24 +82,26 @@ class Elasticity:
     def youngs_modulus(self, degrees: float) -> float:
         """Of a bar in plane stress cut along that direction, in the units of `stiffness`; 0 where
         it can be pulled at no cost."""
-        compliance = _adjugate(self.stiffness)
-        along, _ = _directions(degrees)
-        own = along @ compliance @ along
-        known = abs(own) > SAME * np.abs(compliance).max()
-        return float(np.linalg.det(self.stiffness) / own) if known else 0.0
+        own, _ = self._strains(degrees)
+        return float(np.linalg.det(self.stiffness) / own) if own else 0.0
 
     def poisson_ratio(self, degrees: float) -> float | None:
         """-ε_across / ε_along of a bar in plane stress cut along that direction; None where it
-        cannot be pulled along it. From the minors of C, so that a body without stiffness against
-        one strain has one too."""
+        cannot be pulled along it."""
+        own, other = self._strains(degrees)
+        return -other / own if own else None
+
+    def _strains(self, degrees: float) -> tuple[float, float]:
+        """Along and across a bar pulled along a direction, times det C; the first is 0 where
+        it is nothing. From the minors of C, so that a body without stiffness against one strain has
+        them too."""
         compliance = _adjugate(self.stiffness)
         along, across = _directions(degrees)
-        own = along @ compliance @ along
-        known = abs(own) > SAME * np.abs(compliance).max()
-        return float(-(across @ compliance @ along) / own) if known else None
+        own, other = float(along @ compliance @ along), float(across @ compliance @ along)
+        return own if abs(own) > SAME * np.abs(compliance).max() else 0.0, other
 
     def as_dict(self) -> dict[str, Any]:
-        """The constants by name and what follows from them, as plain values."""
+        """The constants by name and what follows from them."""
         constants = {
             f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j])
             for i in range(3)
@@ -112,7 +114,7 @@ class Elasticity:
             "zener": self.zener,
             "axis": self.axis,
             "least_stiffness": self.least_stiffness,
-            "mobility": self.mobility.tolist(),
+            "mobility": self.mobility,
         }
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import json
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -100,33 +101,29 @@ class Identity:
         isotropic = self.body is not None and self.body.symmetry == "isotropic"
         return self.body.poisson_ratio(0.0) if self.body and isotropic else None
 
-    def speed(self, diffusivity: float) -> float | None:
-        """Spacings a step of a wave of that diffusivity D with the solver's relaxation w and
-        memory b: √(w D / √b). None without memory, or where it grows by itself.
-
-        μ² - (1 + b - w D k²) μ + b = 0 has the roots √b exp(±iω) with
-        ω² = (w D k² - (1 - √b)²) / √b for small ω: waves of that speed, less a cut-off.
-        """
-        if not 0.0 < self.memory <= 1.0 or diffusivity < 0.0:
-            return None
-        return float(np.sqrt(self.relaxation * diffusivity / np.sqrt(self.memory)))
-
     def as_dict(self) -> dict[str, Any]:
         """What ``pbdkit identify --json`` prints, in units of the spacing and of a step."""
-        plain = ("name", "lattice", "neighbours", "rule", "kind", "spacing", "linear", "symmetric")
-        return {name: getattr(self, name) for name in plain} | {
+        names = (
+            *("name", "lattice", "neighbours", "rule", "kind", "spacing", "linear", "symmetric"),
+            *("rests_at_edges", "symmetry", "reasons", "notes", "diffusivity", "poisson_ratio"),
+        )
+        found = {name: getattr(self, name) for name in names} | {
             "turns_with_the_body": self.turns,
-            "rests_at_edges": self.rests_at_edges,
-            "symmetry": self.symmetry,
-            "reasons": list(self.reasons),
-            "notes": list(self.notes),
             "sites": self.stencil.sites,
-            "diffusivity": self.diffusivity,
-            "poisson_ratio": self.poisson_ratio,
             "elasticity": self.body.as_dict() if self.body else None,
-            "long_waves": self.long.as_dict() if self.long else None,
-            "spectrum": asdict(self.spectrum),
+            "long_waves": None,
+            "spectrum": vars(self.spectrum),
         }
+        if long := self.long:
+            found["long_waves"] = {
+                "second_order": long.second,
+                "diffusivity_tensor": long.diffusivity,
+                "fast": vars(long.fast),
+                "slow": vars(long.slow),
+                "gradients": [vars(gradient) for gradient in long.gradients],
+            }
+        plain: dict[str, Any] = json.loads(json.dumps(found, default=np.ndarray.tolist))
+        return plain
 
 
 def identified(scene: Scene) -> Identity:

@@ -85,24 +85,8 @@ def _waves(found: Identity) -> Iterator[Row]:
         if not one or (name == "fast" and not found.isotropic):
             label = "diffusivity D" if one else f"{name} long waves"
             yield label, _range_text(waves, one=one)
-    speeds = [found.speed(d) for d in _ends(found.long)]
-    if found.memory == 0.0:
-        yield "wave speed", f"none without memory; as memory goes to 1, {_speeds(found.long)}"
-    elif None in speeds:
-        yield "wave speed", f"none with memory {found.memory:g}"
-    else:
-        text = _span(*(speed or 0.0 for speed in speeds))
-        yield "wave speed", f"{text} h/step with memory {found.memory:g}"
     for gradient in found.long.gradients:
         yield "gradient length²", _gradient_text(gradient)
-
-
-def _ends(long: LongWaves) -> tuple[float, float]:
-    return long.slow.smallest, long.fast.largest
-
-
-def _speeds(long: LongWaves) -> str:
-    return f"{_span(*(float(np.sqrt(max(d, 0.0))) for d in _ends(long)))} h/step"
 
 
 def _range_text(waves: Range, *, one: bool) -> str:
@@ -122,10 +106,6 @@ def _gradient_text(gradient: Gradient) -> str:
     fast, slow = gradient.material
     values = _number(fast) if abs(fast - slow) < 1e-9 else f"{_number(fast)} and {_number(slow)}"
     return f"{values} h² {where}"
-
-
-def _span(low: float, high: float) -> str:
-    return _number(low) if high - low < 1e-9 * high else f"{_number(low)} to {_number(high)}"
 
 
 def _character(found: Identity) -> Iterator[Row]:

@@ -157,19 +157,6 @@ class SlowWaves:
             x.append((self.solver @ right)[: len(alike)])
         return a
 
-    def rates(self, k: Floats) -> Floats:
-        """(wave, 2): real parts of the two rates at finite k, (wave, axis), the larger first.
-
-        With several sites those whose waves move all sites most alike.
-        """
-        values, vectors = np.linalg.eig(operator(self.stencil, k))
-        if self.stencil.sites > 1:
-            alike = _all_alike(self.stencil.sites)
-            shared = np.linalg.norm(np.swapaxes(vectors, 1, 2) @ alike, axis=-1)
-            best = np.argsort(-shared, axis=1)[:, :2]
-            values = np.take_along_axis(values, best, axis=1)
-        return np.sort(values.real, axis=1)[:, ::-1]
-
 
 def slow_waves(stencil: Primitive) -> SlowWaves:
     """The slow waves; NoSlowWavesError where a translation of the whole is not left alone, or
@@ -200,13 +187,9 @@ def slow_waves(stencil: Primitive) -> SlowWaves:
 
 def operator(stencil: Primitive, k: Floats) -> Complex:
     """L(k) for waves k, (wave, axis): (wave, 2S, 2S); 1 - L(k) is what a step multiplies by."""
-    found = np.zeros((len(k), 2 * stencil.sites, 2 * stencil.sites), complex)
+    found = -_coupled(stencil, np.exp(1j * k @ stencil.rest.T))
     for s, own in enumerate(stencil.own):
         found[:, 2 * s : 2 * s + 2, 2 * s : 2 * s + 2] -= own
-    phase = np.exp(1j * k @ stencil.rest.T)
-    for e, (s, t) in enumerate(zip(stencil.source, stencil.target, strict=True)):
-        term = phase[:, e, None, None] * stencil.matrix[e]
-        found[:, 2 * s : 2 * s + 2, 2 * t : 2 * t + 2] -= term
     return found
 
 
@@ -215,10 +198,18 @@ def _moment(stencil: Primitive, direction: Floats, m: int) -> Complex:
     if m == 0:
         still: Complex = operator(stencil, np.zeros((1, 2)))[0]
         return still
-    found = np.zeros((2 * stencil.sites, 2 * stencil.sites), complex)
     weight = -(1j**m) / math.factorial(m) * (stencil.rest @ direction) ** m
+    found: Complex = _coupled(stencil, weight[None])[0]
+    return found
+
+
+def _coupled(stencil: Primitive, weight: Complex) -> Complex:
+    """Σ weight W over the entries, (wave, entry), between the sites that they couple."""
+    found = np.zeros((len(weight), 2 * stencil.sites, 2 * stencil.sites), complex)
     for e, (s, t) in enumerate(zip(stencil.source, stencil.target, strict=True)):
-        found[2 * s : 2 * s + 2, 2 * t : 2 * t + 2] += weight[e] * stencil.matrix[e]
+        found[:, 2 * s : 2 * s + 2, 2 * t : 2 * t + 2] += (
+            weight[:, e, None, None] * stencil.matrix[e]
+        )
     return found
 
 

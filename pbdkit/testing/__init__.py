@@ -11,7 +11,6 @@ components of a distribution. docs/extending/testing.md lists the properties.
 """
 
 from pbdkit.testing.examination import (
-    Examination,
     Outcome,
     Report,
     conformance,
@@ -24,7 +23,6 @@ from pbdkit.testing.subject import examples_of
 
 __all__ = [
     "PROPERTIES",
-    "Examination",
     "NotAskedError",
     "Outcome",
     "Property",

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 from pbdkit.errors import PluginError
@@ -15,10 +16,9 @@ from pbdkit.interfaces.answers import AnswerError
 from pbdkit.registry.blame import remedy
 from pbdkit.testing.properties import properties_of
 from pbdkit.testing.property import NotAskedError, Property, PropertyError
-from pbdkit.testing.subject import Subject, examples_of
+from pbdkit.testing.subject import Subject, examples_of, full_name
 
 State = Literal["held", "failed", "skipped"]
-NOT_JUDGED = "not judged while"
 NEEDED = "has-examples"
 """The one property of a class: that components can be made of it."""
 
@@ -72,56 +72,42 @@ class Report:
         return "\n".join([self.summary(), *rows])
 
 
-class Examination:
-    """One component and how its properties come out; each is judged once, when first asked for."""
+def _outcomes(component: Component, parts: Mapping[str, Any]) -> Iterator[Outcome]:
+    """How each property comes out, in their order; none is judged after a needed one that fails."""
+    subject, failed = Subject(component, parts), ""
+    for asked in properties_of(type(component)):
+        if failed:
+            yield Outcome(asked.name, "skipped", f"not judged while {failed} fails")
+            continue
+        outcome = _judged(asked, subject)
+        yield outcome
+        failed = asked.name if asked.is_needed and outcome.state == "failed" else ""
 
-    def __init__(self, component: Component, parts: Mapping[str, Any] | None = None) -> None:
-        self._subject = Subject(component, parts)
-        self.name = self._subject.name
-        self.properties = properties_of(type(component))
-        self._by_name = {p.name: p for p in self.properties}
-        self._known: dict[str, Outcome] = {}
 
-    def outcome(self, name: str) -> Outcome:
-        """How the property of that name comes out, those that it needs first."""
-        if name not in self._known:
-            self._known[name] = self._judge(self._by_name[name])
-        return self._known[name]
-
-    def report(self) -> Report:
-        """How all of them come out."""
-        return Report(self.name, tuple(self.outcome(p.name) for p in self.properties))
-
-    def _judge(self, asked: Property) -> Outcome:
-        for needed in (self.outcome(name) for name in asked.needs if name in self._by_name):
-            if needed.state == "failed":
-                return Outcome(asked.name, "skipped", f"{NOT_JUDGED} {needed.property} fails")
-            if needed.reason.startswith(NOT_JUDGED):
-                return Outcome(asked.name, "skipped", needed.reason)
-        try:
-            asked.check(self._subject)
-        except NotAskedError as reason:
-            return Outcome(asked.name, "skipped", str(reason))
-        except (PropertyError, AnswerError) as fault:
-            return Outcome(asked.name, "failed", str(fault))
-        except Exception as error:
-            return Outcome(asked.name, "failed", _told(error))
-        return Outcome(asked.name, "held")
+def _judged(asked: Property, subject: Subject) -> Outcome:
+    try:
+        asked.check(subject)
+    except NotAskedError as reason:
+        return Outcome(asked.name, "skipped", str(reason))
+    except (PropertyError, AnswerError) as fault:
+        return Outcome(asked.name, "failed", str(fault))
+    except Exception as error:
+        return Outcome(asked.name, "failed", _told(error))
+    return Outcome(asked.name, "held")
 
 
 def examine(component: Component | type[Component], **parts: Any) -> Report:
     """The report of one component; a class stands for its first example. `parts` of an experiment
     (lattice=..., neighbours=...) stand in for those that are tried, for a component that goes with
     them alone. Of a class of which none can be made the report says why."""
-    if not isinstance(component, type):
-        return Examination(component, parts).report()
     try:
-        return Examination(examples_of(component)[0], parts).report()
+        one = examples_of(component)[0] if isinstance(component, type) else component
     except PluginError as error:
         return _nothing(component, error)
+    return Report(full_name(one), tuple(_outcomes(one, parts)))
 
 
-def _nothing(component: type[Component], error: PluginError) -> Report:
+def _nothing(component: Any, error: PluginError) -> Report:
     return Report(component.__name__, (Outcome(NEEDED, "failed", str(error)),))
 
 
@@ -186,27 +172,27 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
 
     if not components:
         raise ValueError("conformance() is given no component")
-    examinations = [
-        Examination(one, parts)
+    tried = [
+        one
         for given in components
         for one in (examples_of(given) if isinstance(given, type) else [given])
     ]
+    report_of = cache(lambda n: examine(tried[n], **parts))
     cases = [
-        pytest.param(examination, asked.name, id=f"{examination.name}-{asked.name}")
-        for examination in examinations
-        for asked in examination.properties
+        pytest.param(n, asked.name, id=f"{full_name(one)}-{asked.name}")
+        for n, one in enumerate(tried)
+        for asked in properties_of(type(one))
     ]
 
-    @pytest.mark.parametrize(("examination", "asked"), cases)
-    def test_conformance(
-        examination: Examination, asked: str, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        outcome = examination.outcome(asked)
-        if asked == examination.properties[-1].name:
+    @pytest.mark.parametrize(("component", "asked"), cases)
+    def test_conformance(component: int, asked: str, capsys: pytest.CaptureFixture[str]) -> None:
+        report = report_of(component)
+        outcome = next(o for o in report.outcomes if o.property == asked)
+        if outcome is report.outcomes[-1]:
             with capsys.disabled():
-                print(f"\n{examination.report().summary()}")
+                print(f"\n{report.summary()}")
         if outcome.state == "failed":
-            pytest.fail(f"{examination.name}: {asked}: {outcome.reason}", pytrace=False)
+            pytest.fail(f"{report.component}: {asked}: {outcome.reason}", pytrace=False)
         if outcome.state == "skipped":
             pytest.skip(outcome.reason)
 

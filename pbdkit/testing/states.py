@@ -1,9 +1,11 @@
-"""States made by hand, what a few steps make of them, and the numbers that a part remembers, as it
-declares them, draws them and is asked about them."""
+"""States made by hand and what a few steps make of them; the numbers that a part remembers, and
+moments shown in another order."""
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,19 +15,20 @@ from pbdkit.errors import PluginError
 from pbdkit.interfaces import (
     Bonds,
     Component,
-    Draws,
     FollowerRule,
-    FractureModel,
+    LeaderRows,
     Particles,
     Remembered,
+    Vector,
 )
-from pbdkit.interfaces.values import Drawn
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.remembered_values import describe_bonds, describe_particles, generator_for
+from pbdkit.stepping.remembered_values import describe_bonds, describe_particles
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.property import Arrays, NotAskedError, Question
+from pbdkit.testing.property import NotAskedError
 
 Floats = NDArray[np.float64]
 
@@ -91,75 +94,104 @@ def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
     """Those of whom it remembers numbers, as `draw` is shown them."""
-    is_of_bonds = isinstance(part, FractureModel)
-    return describe_bonds(scene) if is_of_bonds else describe_particles(scene)
+    is_rule = isinstance(part, FollowerRule)
+    return describe_particles(scene) if is_rule else describe_bonds(scene)
 
 
-def drawn(part: Component, shown: Bonds | Particles, generator: np.random.Generator) -> Drawn:
-    """What it draws for them."""
-    assert isinstance(part, Draws)
-    return part.draw(shown, generator)
+def _vector(size: float, rng: np.random.Generator) -> Vector:
+    return Vector(*rng.uniform(-size, size, (2, *SHAPE)))
 
 
-def draws(part: FractureModel | FollowerRule, scene: Scene) -> list[Question]:
-    """The question where its numbers start, if it draws them."""
+def differences(scene: Scene, seed: int, share: float = 0.3) -> list[Vector]:
+    """A difference along each slot of the first sublattice, at random."""
+    rng = np.random.default_rng(seed)
+    return [_vector(share * spacing(scene), rng) for _ in scene.neighbourhood.slots[0]]
+
+
+def here(scene: Scene, seed: int) -> dict[str, Any]:
+    """u and X of some particles, at random, and what the rule remembers of some, as `own`."""
+    rng, size = np.random.default_rng(seed + 1), spacing(scene)
+    own = remembers(scene.experiment.rule, scene, seed)
+    return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": own}
+
+
+def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
+    """Numbers that it remembers of some particles, or of some bonds that have not broken, as they
+    are at the start or two steps later; those of one owner stand together."""
     try:
         numbers_of(part, scene)
     except NotAskedError:
-        return []
-    if not isinstance(part, Draws):
-        return []
-    shown = owners(part, scene)
-
-    def draw(arrays: Arrays) -> Arrays:
-        generator = generator_for(SEED, "fracture")
-        return dict(drawn(part, type(shown)(**arrays), generator))
-
-    return [Question("draw", dict(vars(shown)), draw)]
-
-
-def remembered_of_bonds(scene: Scene, seed: int) -> Arrays:
-    """Numbers of some bonds that have not broken, as they are at the start or two steps later;
-    those of one bond stand together."""
-    if not bond_numbers(scene.experiment):
-        return {}
-    pools = []
-    for state in _reached(scene, seed):
-        assert state.broken_step is not None
-        where = scene.bonds.plane, scene.bonds.place
-        table = [v.reshape(len(v), -1)[where] for v in state.bond_values]
-        intact = state.broken_step.reshape(len(state.broken_step), -1)[where] < 0
-        pools.append([column[intact] for column in table])
-    return _chosen(pools, seed)
-
-
-def remembered_of_particles(scene: Scene, seed: int) -> Arrays:
-    """The same of some of the body's particles."""
-    if not particle_numbers(scene.experiment):
-        return {}
-    places = scene.raster.place_of(scene.raster.body_rows)
-    states = _reached(scene, seed)
-    return _chosen([[v.ravel()[places] for v in s.particle_values] for s in states], seed)
-
-
-def own_of(arrays: Arrays) -> tuple[Any, ...]:
-    """The numbers among the arrays of a question, in their order."""
-    return tuple(arrays[f"own{n}"] for n in range(sum(k.startswith("own") for k in arrays)))
-
-
-def _reached(scene: Scene, seed: int) -> list[State]:
-    """The start, and where two steps lead if they can be made: what fails is asked about directly,
-    and named there."""
+        return ()
     states = [initial_state(scene)]
-    try:
+    with suppress(PluginError):  # what fails is asked about directly, and named there
         start = state_with(scene, displacements(scene, seed, share=0.1))
         states.append(Stepper(scene).advance(start, 2))
-    except PluginError:
-        pass
-    return states
-
-
-def _chosen(pools: list[list[NDArray[Any]]], seed: int) -> Arrays:
+    pools = [_columns(part, scene, state) for state in states]
     columns = [np.concatenate(values) for values in zip(*pools, strict=True)]
     rows = np.random.default_rng(seed + 2).integers(0, len(columns[0]), SHAPE)
-    return {f"own{n}": column[rows] for n, column in enumerate(columns)}
+    return tuple(column[rows] for column in columns)
+
+
+def _columns(part: Component, scene: Scene, state: State) -> list[NDArray[Any]]:
+    if isinstance(part, FollowerRule):
+        places = scene.raster.place_of(scene.raster.body_rows)
+        return [values.ravel()[places] for values in state.particle_values]
+    assert state.broken_step is not None
+    where = scene.bonds.plane, scene.bonds.place
+    broken, *table = (v.reshape(len(v), -1)[where] for v in (state.broken_step, *state.bond_values))
+    return [column[broken < 0] for column in table]
+
+
+def moment_of(scene: Scene, seed: int) -> StateMoment:
+    """The scene two steps after a random start; bonds may have broken."""
+    state = state_with(scene, displacements(scene, seed, share=0.6))
+    return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
+
+
+class _Shown:
+    """A moment, its cells or its forces; see `shown`."""
+
+    OWN = ("displacement", "previous_displacement", "reference")
+    OF_PARTICLES = ("body", "sum_over_neighbours", "gradient", "on_particles", "remembered")
+
+    def __init__(self, inner: Any, order: Any, tables: Any = None) -> None:
+        self._inner = inner
+        self._order = order
+        self._tables = tables
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """Those that particles have in every moment, by name, in this order."""
+        return self._tables or {n: getattr(self._inner, n)()[self._order] for n in self.OWN}
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self.OWN:
+            table = self.tables[name]
+            return lambda rows=None: table if rows is None else table[rows]
+        found = getattr(self._inner, name)
+        if name in ("cells", "forces"):
+            return _Shown(found, self._order)
+        if not callable(found):
+            return self._shown(name, found)
+        return lambda *given, **named: self._shown(name, found(*given, **named))
+
+    def _shown(self, name: str, found: Any) -> Any:
+        place = np.argsort(self._order)
+        if name in ("rows", "nearest"):
+            return place[found]
+        if name == "leader_groups":
+            return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+        in_order = name in self.OF_PARTICLES and len(found) == len(place)
+        return found[self._order] if in_order else found
+
+
+def shown(moment: StateMoment, order: Any = None, tables: Any = None) -> Any:
+    """The moment with other tables in the place of its own, or with its particles in another order:
+    row n shows what stands in row order[n]. What is in no order of particles is as it is."""
+    return _Shown(moment, np.arange(len(moment.body)) if order is None else order, tables)
+
+
+def frame_showing(frame: Any, site: Any, point: Any, body: Any) -> Any:
+    """The frame with other sites, and with these pairs for those that are nearest."""
+    same = {name: getattr(frame, name) for name in ("cell", "low", "high", "rule", "body_at")}
+    return SimpleNamespace(**same, site=site, nearest=lambda: (point, body))

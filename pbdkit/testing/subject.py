@@ -21,8 +21,8 @@ from pbdkit.interfaces import (
 )
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.testing.property import PropertyError, Question
-from pbdkit.testing.questions import questions_of
+from pbdkit.testing.property import PropertyError
+from pbdkit.testing.question import Question, questions_of
 
 LATTICES: dict[str, dict[str, Any]] = {
     "square": {"type": "square", "a": 1.0},
@@ -107,11 +107,6 @@ class Subject:
         self.component: Any = component
         self.parts = dict(parts or {})
 
-    @property
-    def name(self) -> str:
-        """Interface, type and parameters."""
-        return f"{interface_of(type(self.component)).__name__} {name_of(self.component)}"
-
     @cached_property
     def scenes(self) -> list[Scene]:
         """The scenes that it takes part in; ExperimentErrors are its right to refuse.
@@ -182,8 +177,9 @@ def _made(component: type[Component], given: dict[str, Any]) -> Component:
         ) from None
 
 
-def name_of(component: Component) -> str:
-    """Its type with the parameters that are not at their defaults."""
+def full_name(component: Component) -> str:
+    """Its interface and type, with the parameters that are not at their defaults."""
     dumped = component.model_dump(exclude_defaults=True, exclude={"type"}, mode="json")
     given = ", ".join(f"{k}={v}" for k, v in dumped.items())
-    return f"{component.type} ({given})" if given else component.type
+    name = f"{interface_of(type(component)).__name__} {component.type}"
+    return f"{name} ({given})" if given else name

@@ -22,13 +22,12 @@ from pbdkit.interfaces import (
 from pbdkit.registry.registry import Registry
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
-from pbdkit.testing.properties.repetition import REPEATABLE
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
-from pbdkit.testing.sight import SeenFrame
+from pbdkit.testing.states import frame_showing
 from pbdkit.testing.subject import LATTICES, Subject, alternatives, place_of
 
 
-@asked_of(Lattice)
+@asked_of(Lattice, is_needed=True)
 def has_a_sound_cell(subject: Subject) -> None:
     """The cell vectors span an area, no two basis sites share an index, a place or a primitive
     index, all lie within the period and near where their index says, and `primitive` counts equal
@@ -88,7 +87,7 @@ def _refuse_equal(
             )
 
 
-@asked_of(Lattice, needs=("has-a-sound-cell",))
+@asked_of(Lattice)
 def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
     """The origin moves the lattice and does not enter its cell: no digit of a run depends on where
     the body lies."""
@@ -101,7 +100,7 @@ def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
 Chosen = set[tuple[int, tuple[int, ...]]]
 
 
-@asked_of(NeighbourMetric)
+@asked_of(NeighbourMetric, is_needed=True)
 def is_mutual(subject: Subject) -> None:
     """Whoever is a neighbour has this particle as its own neighbour, in the same shell, once: bonds
     have two ends, and a body at rest stays at rest."""
@@ -113,7 +112,7 @@ def is_mutual(subject: Subject) -> None:
             raise PropertyError(f"on the {lattice} lattice: {error}") from None
 
 
-@asked_of(NeighbourMetric, needs=("is-mutual",))
+@asked_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
     """Every offset is one that the cell itself gives, so that its site index and its opposite
     agree with the lattice's."""
@@ -127,7 +126,7 @@ def takes_offsets_of_the_cell(subject: Subject) -> None:
                     )
 
 
-@asked_of(NeighbourMetric, needs=REPEATABLE)
+@asked_of(NeighbourMetric)
 def takes_sublattices_in_any_order(subject: Subject) -> None:
     """The basis sites in another order have the same neighbours: how a cell is written down means
     nothing."""
@@ -142,7 +141,7 @@ def takes_sublattices_in_any_order(subject: Subject) -> None:
                 )
 
 
-@asked_of(NeighbourMetric, needs=REPEATABLE)
+@asked_of(NeighbourMetric, is_needed=True)
 def finds_the_same_anew(subject: Subject) -> None:
     """Neighbours that are found anew at every step are, in the reference configuration, those that
     it chooses on the lattice."""
@@ -192,7 +191,7 @@ def _chosen(metric: NeighbourMetric, cell: Cell, sublattice: int) -> Chosen:
     return {(n, o.site) for n, shell in enumerate(shells, 1) for o in shell}
 
 
-@asked_of(FramePolicy, needs=REPEATABLE)
+@asked_of(FramePolicy)
 def takes_every_point_alone(subject: Subject) -> None:
     """Whom a frame point follows does not depend on which other points there are."""
     policy, reason = subject.component, "it has no points"
@@ -201,11 +200,12 @@ def takes_every_point_alone(subject: Subject) -> None:
         if frame is None:
             continue
         point, body = frame.nearest()
-        seen = SeenFrame.showing(frame, frame.site, point, body)
-        whole = policy.follow(seen)
+        whole = policy.follow(frame_showing(frame, frame.site, point, body))
         for some in (np.arange(0, len(frame.site), 2), np.array([len(frame.site) - 1])):
+            kept = np.isin(point, some)
+            anew = np.searchsorted(some, point[kept])
             try:
-                part = policy.follow(seen.only(some))
+                part = policy.follow(frame_showing(frame, frame.site[some], anew, body[kept]))
             except ExperimentError as refusal:
                 reason = reason and f"it takes whole frames only: {refusal}"
                 continue

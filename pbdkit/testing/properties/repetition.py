@@ -20,22 +20,14 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
 )
-from pbdkit.testing.calls import applied, differences, gathered, here
-from pbdkit.testing.property import Arrays, PropertyError, Question, asked_of
+from pbdkit.testing.property import PropertyError, asked_of
+from pbdkit.testing.question import Arrays, Question, applied, each, flat, gathered
+from pbdkit.testing.states import differences, here
 from pbdkit.testing.subject import Subject
 
 ALL = tuple(INTERFACES.values())
-NEEDS = (
-    "has-a-sound-cell",
-    "is-mutual",
-    "takes-part",
-    "declares-what-it-remembers",
-    "draws-what-it-remembers",
-)
 UNUSUAL = 918273645
 """A seed that nobody else takes."""
-REPEATABLE = (*NEEDS, "changes-no-input", "remembers-nothing", "answers-the-same")
-"""What must hold before any comparison of two answers means something."""
 
 
 def differing(one: Arrays, other: Arrays) -> list[str]:
@@ -49,26 +41,26 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
     return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=numbers)
 
 
-@asked_of(*ALL, needs=("has-a-sound-cell", "is-mutual"))
+@asked_of(*ALL, is_needed=True)
 def takes_part(subject: Subject) -> None:
     """A scene can be built with it: at least one of those tried takes it, and none makes it fail
     with anything but an ExperimentError."""
     subject.scene()
 
 
-@asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, needs=NEEDS)
+@asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, is_needed=True)
 def changes_no_input(subject: Subject) -> None:
     """What it is given it leaves as it is: the arrays belong to the state of the run."""
     for question in subject.questions():
-        given = {name: np.array(value) for name, value in question.inputs.items()}
+        given = each(np.array, question.inputs)
         try:
             with np.errstate(all="ignore"):
-                question.ask(given)
+                question.ask(**given)
         except ValueError as error:
             if "read-only" not in str(error):
                 raise
             raise PropertyError(_written(question.what, "what it is given")) from error
-        if names := differing(dict(question.inputs), given):
+        if names := differing(flat(question.inputs), flat(given)):
             raise PropertyError(_written(question.what, _listed(names)))
 
 
@@ -76,7 +68,7 @@ def _written(function: str, where: str) -> str:
     return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
 
 
-@asked_of(*ALL, needs=(*NEEDS, "changes-no-input"))
+@asked_of(*ALL, is_needed=True)
 def remembers_nothing(subject: Subject) -> None:
     """What it was asked before does not matter: whatever must be remembered belongs to the state of
     the run, or a run that is continued would differ from one that was never interrupted."""
@@ -84,7 +76,7 @@ def remembers_nothing(subject: Subject) -> None:
         before = remembered(subject.component)
         answers = [question.answer() for _ in range(3)]
         other.answer()
-        question.larger().answer()
+        question.answer(lambda v: 10.0 * v if v.dtype.kind == "f" else v.copy())
         later = question.answer()
         kept = changed(before, remembered(subject.component))
         steady = not differing(answers[1], answers[2])
@@ -95,7 +87,7 @@ def remembers_nothing(subject: Subject) -> None:
             )
 
 
-@asked_of(*ALL, needs=(*NEEDS, "changes-no-input", "remembers-nothing"))
+@asked_of(*ALL, is_needed=True)
 def answers_the_same(subject: Subject) -> None:
     """The same question gets the same answer to the last bit, and the generators of random numbers
     that all share stay as they are, so that every run can be repeated."""
@@ -120,7 +112,7 @@ def answers_the_same(subject: Subject) -> None:
             )
 
 
-@asked_of(*ALL, needs=(*REPEATABLE, "returns-a-value-a-particle"))
+@asked_of(*ALL)
 def is_finite(subject: Subject) -> None:
     """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
     one NaN spreads over the body within a few steps."""
@@ -140,15 +132,17 @@ def _meeting(subject: Subject) -> list[Question]:
     if not isinstance(rule, FollowerRule):
         return []
     scene = subject.scene()
-    arrays = differences(scene, 0) | here(scene, 0)
-    for k, slot in enumerate(scene.neighbourhood.slots[0]):
-        for c, r in zip("xy", slot.rest, strict=True):
-            arrays[f"d{k}.{c}"] = np.full_like(arrays[f"d{k}.{c}"], -r)
+    slots = scene.neighbourhood.slots[0]
+    meeting = [
+        d.each(lambda v, r: np.full_like(v, -r), slot.rest)
+        for d, slot in zip(differences(scene, 0), slots, strict=True)
+    ]
 
-    def ask(given: Arrays) -> Arrays:
-        return applied(scene, gathered(scene, given), given)
+    def ask(d: Any, **at: Any) -> Any:
+        return applied(scene, gathered(scene, d), **at)
 
-    return [Question("apply, where all neighbours meet in the particle,", arrays, ask)]
+    inputs = {"d": meeting} | here(scene, 0)
+    return [Question("apply, where all neighbours meet in the particle,", inputs, ask)]
 
 
 def _listed(names: list[str]) -> str:

@@ -25,9 +25,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.properties.elementwise import ORDERLY
 from pbdkit.testing.properties.repetition import differing
 from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.question import Arrays
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
 from pbdkit.testing.subject import Subject, place_of, scenes_with
 
@@ -36,11 +36,9 @@ STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 ROUNDING = 1e-12
 """As a share of the largest displacement; a few steps are some hundred roundings of 1e-16."""
 STEPS = 4
-SOUND = (*ORDERLY, "takes-particles-in-any-order")
-"""What must hold before it means something to step with it."""
 
 
-@asked_of(*STEPPED, needs=(*SOUND, "finds-the-same-anew", "is-seen-alike-from-both-ends"))
+@asked_of(*STEPPED)
 def rests(subject: Subject) -> None:
     """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
     by 1e-17 has moved."""
@@ -67,7 +65,7 @@ def _warned(scene: Scene) -> bool:
     return bool(scene.experiment.fracture.check(scene.neighbourhood.shells()))
 
 
-@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy, needs=SOUND)
+@asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
 def follows_translations(subject: Subject) -> None:
     """A body that is translated as a whole moves as before, translated, to rounding; rules that
     declare `uses_reference` and frames that take on `Anchors` need not."""
@@ -108,7 +106,7 @@ def _free(subject: Subject) -> list[Scene]:
     return free
 
 
-@asked_of(FollowerRule, FramePolicy, needs=SOUND)
+@asked_of(FollowerRule, FramePolicy)
 def superposes(subject: Subject) -> None:
     """Where a rule declares `linear`, and with every frame, the steps from two displacements
     together are the steps from each, added, to rounding."""
@@ -135,12 +133,14 @@ def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
     return float(np.abs(one - other).max() / max(1e-300, np.abs(all_of_them).max()))
 
 
-@asked_of(*ALL, needs=(*SOUND, "survives-json"))
+@asked_of(*ALL, is_needed=True)
 def continues_where_it_stopped(subject: Subject) -> None:
     """A run that is saved, read by a component made anew from its JSON and continued is the same to
     the last bit as one that was never interrupted."""
     component, kind = subject.component, type(subject.component)
     anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
+    if any(getattr(anew, name) != getattr(component, name) for name in kind.model_fields):
+        raise NotAskedError("it is another one after JSON")
     for n, (scene, again) in enumerate(
         zip(subject.scenes, scenes_with(anew, subject.parts), strict=True)
     ):
@@ -154,24 +154,21 @@ def continues_where_it_stopped(subject: Subject) -> None:
         _refuse_difference(continued, whole, f"a run continued at step {STEPS}", scene)
         copied = Stepper(again).advance(kept, STEPS)
         _refuse_difference(copied, whole, f"a run continued from a copy of step {STEPS}", scene)
-        if isinstance(component, Diagnostic) and isinstance(anew, Diagnostic):
-            _compare_measured(component, scene, whole, anew, again, continued)
+        if isinstance(component, Diagnostic):
+            measured = _measured(component, scene, whole), _measured(anew, again, continued)
+            if names := differing(*measured):
+                raise PropertyError(
+                    f"`{names[0]}` of a run continued at step {STEPS} is another one"
+                )
 
 
-def _compare_measured(
-    one: Diagnostic, scene: Scene, whole: State, other: Diagnostic, again: Scene, continued: State
-) -> None:
-    names = [variable.name for variable in one.variables()]
-    expected = one.measure(StateMoment(whole, Tables(scene)))
-    found = other.measure(StateMoment(continued, Tables(again)))
-    pairs = [
-        {n: np.array(v) for n, v in zip(names, values, strict=True)} for values in (expected, found)
-    ]
-    if names := differing(*pairs):
-        raise PropertyError(f"`{names[0]}` of a run continued at step {STEPS} is another one")
+def _measured(diagnostic: Any, scene: Scene, state: State) -> Arrays:
+    names = [variable.name for variable in diagnostic.variables()]
+    values = diagnostic.measure(StateMoment(state, Tables(scene)))
+    return {name: np.array(value) for name, value in zip(names, values, strict=True)}
 
 
-@asked_of(*STEPPED, needs=(*SOUND, "is-local", "continues-where-it-stopped"))
+@asked_of(*STEPPED)
 def is_the_same_compiled(subject: Subject) -> None:
     """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
     compile is stepped by numpy, and says so."""
