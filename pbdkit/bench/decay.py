@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.certificate import scale_of
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
@@ -52,9 +51,7 @@ def decay_of(scene: Scene, exact: NDArray[np.float64]) -> Decay:
         return Decay(0.0, 0.0)
     resting = initial_state(scene)
     resting.u[...] = 0.0
-    operator = step_operator(scene, resting, scene.experiment.steps)
-    X = scene.raster.reference(operator.followers)
-    system, mode, slowness = System(operator, "auto", X, Watch()), way, 0.0
+    system, mode, slowness = System(scene, resting, "auto", Watch()), way, 0.0
     for _ in range(TURNS):
         mode = mode / np.abs(mode).max()
         after = system.solve(mode, ROUGH)

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import StepOperator
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
@@ -72,11 +70,6 @@ def spacing_of(scene: Scene) -> float:
     return min(min(lengths) for lengths in scene.neighbourhood.shells())
 
 
-def never_rests(leading: Leading, steps: int) -> bool:
-    """Whether a group still leads in the last step, in a motion that has no end."""
-    return leading.group.leads(steps) and leading.group.motion.rests_after() is None
-
-
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -104,15 +97,6 @@ class Moves:
             self._followers.move(u, self._after, state)
         moved = (self._after.reshape(len(self._after), -1)[:, place] - flat[:, place]).T
         return moved.astype(float)
-
-
-def owed_by(operator: StepOperator, state: State, place: Indices) -> NDArray[np.float64] | None:
-    """What followers at their flat places have yet to get, (follower, axis), where the step looks
-    back: before · (u(t-1) - u(t)), None elsewhere."""
-    if not operator.couplings_before.parts:
-        return None
-    u, previous = (p.reshape(len(p), -1)[:, place] for p in (state.u, state.previous))
-    return operator.couplings_before.times((previous - u).T.astype(float))
 
 
 def rounding(u: Floats) -> float:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.equilibrium.certificate import Moves, owed_by, rounding, spacing_of
+from pbdkit.equilibrium.certificate import CORRECTION, Certificate, Moves, rounding, spacing_of
 from pbdkit.equilibrium.newton import FIRST_ORDER, LINEAR
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
@@ -29,27 +28,12 @@ BENT = "the rule bends too much between there and equilibrium for a bound"
 
 @dataclass(frozen=True)
 class Outlook:
-    """`u` is the equilibrium ahead as far as it is known, and no follower is farther from it than
-    `distance`; `residual` is the largest move at the state, `bound` says how the distance was
-    obtained, by which linear `method`, and whether the rule was `linearised`; `obstacle` why there
-    is no distance, where it is infinite."""
+    """`u` is the equilibrium ahead as far as it is known, and the certificate says how far at most
+    any follower is from it; `obstacle` why there is no distance, where it is infinite."""
 
     u: Floats
-    distance: float
-    residual: float
-    method: str
-    bound: str
-    linearised: bool
+    certificate: Certificate
     obstacle: str
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """A linearisation of the step, and where its unknowns are on the flat raster."""
-
-    operator: StepOperator
-    system: System
-    place: NDArray[np.intp]
 
 
 class Foresight:
@@ -64,14 +48,13 @@ class Foresight:
     and only where the correction leaves a tenth of the moves at most.
     """
 
-    def __init__(self, scene: Scene, watch: Watch) -> None:
-        self._scene, self._moves, self._watch = scene, Moves(scene), watch
-        self._at_rest: _Linearised | None = None
+    def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
+        self._scene, self._scale, self._watch = scene, scale, watch
+        self._moves = Moves(scene)
+        self._at_rest: System | None = None
         self._broken = 0
         self._linear = False
-        self._past_iterations = 0
-        self.linearisations = 0
-        """How often a system was set up."""
+        self._past_iterations = self._linearisations = 0
 
     def from_(self, state: State) -> Outlook:
         """The outlook from the end of a step, which is left as it is.
@@ -89,23 +72,14 @@ class Foresight:
             return self._outlook(here, self._at_rest)
         known = self._linearised(here, u)
         found = self._outlook(here, known, anew=True)
-        self._past_iterations += known.system.iterations
+        self._past_iterations += known.iterations
         return found
 
-    @property
-    def iterations(self) -> int:
-        """Those of the linear solvers."""
-        own = self._at_rest.system.iterations if self._at_rest else 0
-        return self._past_iterations + own
+    def _linearised(self, state: State, u: Floats) -> System:
+        self._linearisations += 1
+        return System(self._scene, replace(state, u=u), "auto", self._watch)
 
-    def _linearised(self, state: State, u: Floats) -> _Linearised:
-        operator = step_operator(self._scene, replace(state, u=u))
-        reference = self._scene.raster.reference(operator.followers)
-        self.linearisations += 1
-        system = System(operator, "auto", reference, self._watch)
-        return _Linearised(operator, system, self._scene.raster.place_of(operator.followers))
-
-    def _outlook(self, here: State, known: _Linearised, *, anew: bool = False) -> Outlook:
+    def _outlook(self, here: State, known: System, *, anew: bool = False) -> Outlook:
         """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
         moves = self._moves.at(here, known.place)
         ahead, distance = here.u.copy(), math.inf
@@ -113,33 +87,37 @@ class Foresight:
         if correction is not None:
             ahead.reshape(len(ahead), -1)[:, known.place] += correction.T
             left = self._moves.at(replace(here, u=ahead), known.place)
-            bound = known.system.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
+            bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
             if anew and not _smaller(left, moves, rounding(ahead)):
                 distance, obstacle = math.inf, BENT
-        return Outlook(
-            u=ahead,
-            distance=distance if math.isfinite(distance) else math.inf,
+        distance = distance if math.isfinite(distance) else math.inf
+        assert self._at_rest is not None
+        own = known.iterations if anew else 0
+        certificate = Certificate(
+            method=known.methods,
+            iterations=self._linearisations,
+            inner_iterations=self._past_iterations + self._at_rest.iterations + own,
             residual=float(np.abs(moves).max(initial=0.0)),
-            method=known.system.methods,
-            bound=known.system.how,
+            distance=distance,
+            share=distance / self._scale,
+            bound=CORRECTION + known.how,
             linearised=anew,
-            obstacle=obstacle,
         )
+        return Outlook(ahead, certificate, obstacle)
 
     def _correction(
-        self, here: State, known: _Linearised, moves: Vectors, anew: bool
+        self, here: State, known: System, moves: Vectors, anew: bool
     ) -> tuple[Vectors | None, str]:
         """(follower, axis); None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:
-                known.system.refuse_moving_floats(moves, rounding(here.u))
-            owed = owed_by(known.operator, here, known.place)
-            return known.system.solve(moves, ACCURACY, owed), ""
+                known.refuse_moving_floats(moves, rounding(here.u))
+            return known.solve(moves, ACCURACY, known.owed(here)), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
-    def _is_linear(self, here: State, known: _Linearised) -> bool:
+    def _is_linear(self, here: State, known: System) -> bool:
         """Whether followers put elsewhere, at random and as far as the body has come, move by what
         the linearisation at rest says."""
         size = float(np.abs(here.u).max()) or spacing_of(self._scene)
@@ -151,7 +129,7 @@ class Foresight:
             here, known.place
         )
         with np.errstate(all="ignore"):
-            wrong = float(np.linalg.norm(change + known.system.times(put)))
+            wrong = float(np.linalg.norm(change + known.times(put)))
         return wrong <= LINEAR * float(np.linalg.norm(put))
 
 
