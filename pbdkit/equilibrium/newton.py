@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.certificate import Certificate, Moves, rounding
+from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.scene import Scene
@@ -17,12 +17,8 @@ from pbdkit.stepping.state import State
 
 Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
-LINEAR = 1e-9
-"""A correction that leaves less than this share of the moves came from the right linearisation."""
 SHORTEST = 2.0**-14
 """The shortest share of a correction that is tried."""
-FIRST_ORDER = 2.0
-"""What a bound is multiplied with that holds to first order only."""
 
 
 class UnconvergedError(Exception):

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import Certificate, scale_of
-from pbdkit.equilibrium.outlook import Foresight, Outlook
+from pbdkit.equilibrium.certificate import Certificate, Foresight, Outlook, scale_of
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
 from pbdkit.scene.scene import Scene
