@@ -14,7 +14,7 @@ from scene_strategies import calibrated_experiments, experiments
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.plane_waves import wave_bound
+from pbdkit.analysis.stencil import wave_bound
 from pbdkit.cli import program
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.scene.scene import build_scene

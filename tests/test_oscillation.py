@@ -19,7 +19,6 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.analysis.plane_waves import wave_bound
 from pbdkit.analysis.spectrum import (
     NEUTRAL,
     largest_stable_relaxation,
@@ -27,6 +26,7 @@ from pbdkit.analysis.spectrum import (
     slowest_swing,
     swings_below,
 )
+from pbdkit.analysis.stencil import wave_bound
 
 EIGENVALUES = {
     "real": st.builds(complex, st.floats(-3.0, 0.999)),

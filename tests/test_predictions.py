@@ -23,7 +23,7 @@ from scene_strategies import lattices, neighbours
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import prediction
-from pbdkit.analysis.plane_waves import wave_bound
+from pbdkit.analysis.stencil import wave_bound
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

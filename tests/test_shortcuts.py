@@ -1,6 +1,6 @@
 """What is done at once, once, or not at all, with the same result.
 
-Orders of elimination, derivatives, cut cells, kernels.
+Derivatives, cut cells, kernels.
 """
 
 import numpy as np
@@ -10,14 +10,10 @@ from finite_elements.problems import HEXAGONAL_BAR
 from scipy import sparse
 
 import pbdkit
-from pbdkit.analysis import linear_response
-from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.stencil import derivative, derivatives
+from pbdkit.analysis.stencil import derivative
 from pbdkit.equilibrium import linear_solver as linear
-from pbdkit.equilibrium.linear_solver import FEWEST, dissected
 from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.state import initial_state
 
 
 def plane(columns, rows, far=1):
@@ -36,96 +32,19 @@ def plane(columns, rows, far=1):
     return sparse.csr_array((value, (row, column))), np.stack([i, j], axis=1) * 0.1
 
 
-@pytest.mark.parametrize("far", [1, 2])
-def test_dissection_puts_strips_last_that_nothing_leaps_over(far):
-    matrix, places = plane(60, 25, far)
-    order = dissected(matrix, places)
-    assert np.array_equal(np.sort(order), np.arange(len(places)))
-    rank = np.argsort(order)
-    # The first strip lies across the long side, in the middle: to its left and right nothing
-    # couples with what lies on the other side.
-    strip = order[-25 * far :]
-    x = places[:, 0]
-    low, high = x[strip].min(), x[strip].max()
-    assert high - low == pytest.approx(0.1 * (far - 1))
-    assert 2.5 < low < 3.5
-    left, right = np.flatnonzero(x < low - 1e-9), np.flatnonzero(x > high + 1e-9)
-    assert matrix[left][:, right].nnz == 0
-    assert rank[strip].min() > max(rank[left].max(), rank[right].max())
-
-
-def test_unknowns_of_one_place_stay_together():
-    matrix, places = plane(40, 30)
-    both = sparse.csr_array(sparse.kron(matrix, np.ones((2, 2))))
-    order = dissected(both, np.repeat(places, 2, axis=0))
-    assert np.array_equal(order[0::2] + 1, order[1::2])
-    assert np.array_equal(order[0::2] // 2, dissected(matrix, places))
-
-
-def test_few_places_and_couplings_that_reach_far_are_not_dissected():
-    assert dissected(*plane(FEWEST // 10, 10)) is None
-    matrix, places = plane(60, 25)
-    matrix = matrix.tolil()
-    matrix[0, len(places) - 1] = 0.1
-    assert dissected(matrix.tocsr(), places) is None
-
-
-@pytest.mark.parametrize("shift", [0.0, 1e6], ids=["here", "far away"])
-def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
-    scene = build_scene(pbdkit.Experiment(**experiment(HEXAGONAL_BAR, 40)))
-    operator = step_operator(scene)
-    both = sparse.csr_array(sparse.eye_array(operator.now.shape[0]) - operator.now)
-    places = np.repeat(scene.raster.reference(operator.followers) + shift, 2, axis=0)
-    plain = linear.SparseLU(both, symmetric=False)
-    found = linear.SparseLU(both, symmetric=False, places=places)
-    assert found._factors.nnz < 0.7 * plain._factors.nnz
-    b = np.random.default_rng(0).normal(size=len(places))
-    for x, of in ((found.solve(b, 0.0), both), (found.solve_transposed(b, 0.0), both.T)):
-        assert np.abs(of @ x - b).max() < 1e-10
-
-
 def test_matrices_without_a_symmetric_pattern_are_told_apart():
     matrix, _ = plane(30, 20)
     assert linear.is_nearly_symmetric(matrix)
     assert not linear.is_nearly_symmetric(sparse.csr_array(sparse.triu(matrix)))
 
 
-def test_derivatives_at_once_are_those_one_by_one_to_the_last_bit():
-    at = np.array([0.3, -0.7, 2.0])
-
-    def moved(x, y):
-        return np.sqrt(x * x + y * y) * x, np.abs(y) + x / y  # |y| is not analytic
-
-    along = np.array([[1.0, 0.0], [0.0, 1.0], [0.6, -0.8]])
-    together = derivatives(
-        lambda step: moved(at + step * along[:, :1], 1.5 + at + step * along[:, 1:]), 3, at.shape
-    )
-    for n, (x, y) in enumerate(along):
-        alone = derivative(lambda s, x=x, y=y: moved(at + s * x, 1.5 + at + s * y), at.shape)
-        assert np.array_equal(alone, together[n])
-
-
-@pytest.mark.parametrize("rule", [{"type": "elastic", "poisson_ratio": 0.3}, {"type": "springs"}])
-def test_operators_do_not_depend_on_how_many_directions_go_together(rule, monkeypatch):
-    given = {
-        "name": "noisy",
-        "lattice": {"type": "square", "a": 0.5},
-        "neighbours": {"type": "chebyshev", "shells": 1},
-        "body": {"type": "grid", "columns": 7, "rows": 5},
-        "rule": rule,
-        "frame": {"type": "natural"},
-        "initial": {"type": "noise", "amplitude": 0.05},
-        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
-        "steps": 1,
-    }
-    scene = build_scene(pbdkit.Experiment(**given))
-    found = []
-    for values in (1, 150, 10**6):
-        monkeypatch.setattr(linear_response, "VALUES_AT_ONCE", values)
-        found.append(step_operator(scene, initial_state(scene)))
-    for other in found[1:]:
-        assert np.array_equal(found[0].entries_now.values, other.entries_now.values)
-        assert np.array_equal(found[0].source, other.source)
+def test_derivatives_are_exact_where_functions_are_analytic_and_to_nine_digits_elsewhere():
+    x, y = np.array([0.3, -0.7, 2.0]), np.array([1.5, -0.4, 0.9])
+    root = np.sqrt(x * x + y * y)
+    exact = derivative(lambda s: (np.sqrt((x + s) ** 2 + y * y), x / (y - 2 * s)), x.shape)
+    np.testing.assert_allclose(exact, [x / root, 2 * x / (y * y)], rtol=1e-15)
+    close = derivative(lambda s: (np.abs(x + s), np.hypot(x, y + s)), x.shape)
+    np.testing.assert_allclose(close, [np.sign(x), y / root], rtol=1e-9)
 
 
 BODIES = [

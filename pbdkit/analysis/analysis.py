@@ -58,7 +58,7 @@ class Analysis:
         """Of the step as the solver makes it, with relaxation, memory and lag."""
         own, solver = self._rule_spectrum, self.scene.experiment.stepping
         if own is None:
-            return self._spectrum_of(lambda: self.operator.augmented().matrix(), self._lags)
+            return self._spectrum_of(lambda: self.operator.augmented().matrix(), self.scene.lag > 0)
         if solver.relaxation == 1.0 and solver.memory == 0.0:
             return own
         # Radius and ends of what it is taken to are met at the ends of a real spectrum.
@@ -80,14 +80,10 @@ class Analysis:
             why = "eigenvalues lie too close together, as in long bodies; a shorter one shows more"
         return [f"analysis: the spectrum and the lag are left out, {why}"] if why else []
 
-    @property
-    def _lags(self) -> bool:
-        return bool(self.scene.frame and self.scene.frame.map.lag)
-
     @cached_property
     def _rule_spectrum(self) -> Spectrum | None:
         """Of the rule's own step, with neither relaxation nor memory; None where the frame lags."""
-        return self._spectrum_of(self._rule_matrix, not self._lags)
+        return self._spectrum_of(self._rule_matrix, self.scene.lag == 0)
 
     def _spectrum_of(self, matrix: Callable[[], Any], asked: bool) -> Spectrum | None:
         """None where it is not asked for, cannot be had, or not soon."""
@@ -101,10 +97,10 @@ class Analysis:
     def _rule_matrix(self) -> Any:
         """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
         no memory left."""
-        now, before = self.operator.entries_now, self.operator.entries_before
-        share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(now.shape[0])
-        rest = Entries(every, every, np.full(len(every), 1.0 - share), now.shape)
-        return rest.plus(now.plus(before), share).matrix()
+        both = self.operator.couplings_both.entries()
+        share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(both.shape[0])
+        rest = Entries(every, every, np.full(len(every), 1.0 - share), both.shape)
+        return rest.plus(both, share).matrix()
 
     @property
     def spectral_radius(self) -> float | None:
@@ -178,10 +174,8 @@ class Analysis:
 
         None where no leader moves steadily, steps do not settle or are not made, or it would cost
         too much."""
-        straight = not self.scene.experiment.solver.makes_steps
-        if straight or not self._within_reach or not self.stable:
-            return None
-        return lag_of(self.scene)
+        makes_steps = self.scene.experiment.solver.makes_steps
+        return lag_of(self.scene) if makes_steps and self._within_reach and self.stable else None
 
     @property
     def lag(self) -> float | None:
@@ -195,32 +189,28 @@ class Analysis:
         if not self._within_reach:
             return []
         operator = self.operator
-        both = operator.entries_now.plus(operator.entries_before)
+        both = operator.couplings_both.entries()
         graph = Entries(both.rows, both.columns, np.ones(len(both.rows)), both.shape)
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
-        led[label[np.unique(operator.entries_led.rows)]] = True
+        led[label[np.unique(operator.couplings_led.entries().rows)]] = True
         numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)
 
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
-        found = []
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored else self.parts_without_leader
         if len(parts) > 3:
-            found.append(
-                f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"
-            )
-            parts = []
-        for part in parts:
-            found.append(
+            found = [f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"]
+        else:
+            found = [
                 f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
                 "nothing holds it"
-            )
-        straight = not self.scene.experiment.solver.makes_steps
-        if straight and self.largest_stable_relaxation:
+                for part in parts
+            ]
+        if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
             pass  # it makes no steps, and steps with that relaxation would lead there too
         elif self.stable is False:
             bound = self.largest_stable_relaxation
@@ -230,20 +220,10 @@ class Analysis:
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"
             )
         elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
-            what = "a mode that changes its sign in every step never decays"
-            found.append(f"solver.relaxation: {what}; take a relaxation below 1")
-        return found + self._late() + self.left_out
-
-    def _late(self) -> list[str]:
-        """Whether the body is left behind its equilibrium by more than a bond."""
-        trailing, shells = self.trailing, self.scene.neighbourhood.shells()
-        bond = min(map(min, shells))
-        if trailing is None or trailing.size <= bond:
-            return []
-        return [
-            f"leaders: in steps {trailing.first} to {trailing.last} the fastest moves by "
-            f"{trailing.speed:.4g} a step and leaves the body {trailing.size:.3g} behind its "
-            f"equilibrium, more than a bond ({bond:.3g}): its speed decides how far bonds stretch; "
-            f"move by less than {trailing.speed * bond / trailing.steady:.2g} a step, or take "
-            "solver: {type: equilibrium}"
-        ]
+            found.append(
+                "solver.relaxation: a mode that changes its sign in every step never decays; take "
+                "a relaxation below 1"
+            )
+        bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
+        late = self.trailing.late(bond) if self.trailing else []
+        return [*found, *late, *self.left_out]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -48,6 +50,15 @@ class Entries:
         return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()
 
 
+def one_minus(matrix: Any) -> Any:
+    """1 - a matrix, dense or sparse as it is."""
+    if isinstance(matrix, np.ndarray):
+        return np.eye(len(matrix)) - matrix
+    from scipy.sparse import eye_array
+
+    return (eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
+
+
 def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
     """(count, label): the groups of unknowns that reach one another, along arrows or either way."""
     if not matrix.shape[0]:
@@ -58,9 +69,9 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         kind = "strong" if strongly else "weak"
         count, label = connected_components(matrix, connection=kind)
         return count, label
-    if not strongly:
-        return _connected_either_way(matrix)
     reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
+    if not strongly:
+        reach |= reach.T
     while True:
         further = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
         if (further == reach).all():
@@ -68,23 +79,6 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         reach = further
     first = np.argmax(reach & reach.T, axis=1)  # the lowest unknown of each group names it
     names, label = np.unique(first, return_inverse=True)
-    return len(names), label
-
-
-def _connected_either_way(matrix: NDArray[Any]) -> tuple[int, Indices]:
-    """Every unknown takes the lowest name of those that it is connected with, and that one's name,
-    until nothing changes."""
-    rows, columns = np.nonzero(matrix)
-    name = np.arange(len(matrix))
-    while True:
-        lower = name.copy()
-        np.minimum.at(lower, rows, name[columns])
-        np.minimum.at(lower, columns, name[rows])
-        lower = lower[lower]
-        if (lower == name).all():
-            break
-        name = lower
-    names, label = np.unique(name, return_inverse=True)
     return len(names), label
 
 
@@ -110,26 +104,23 @@ class Couplings:
         block = factor * np.eye(self.axes)
         self.add(rows, rows, np.broadcast_to(block, (len(rows), *block.shape)))
 
-    def entries(self) -> Entries:
-        """Of the matrix with the unknowns 2n (x) and 2n + 1 (y) of particle n in the plane, 3n to
-        3n + 2 in space."""
-        found: list[tuple[Indices, Indices, Floats]] = []
-        axes = self.axes
+    def entries(self, to: Sequence[int] = (), of: Sequence[int] = ()) -> Entries:
+        """Of the matrix from some axes `of` particles `to` others, (all of them, the same): with
+        unknowns 2n (x) and 2n + 1 (y) of particle n in the plane, 3n to 3n + 2 in space, n for one
+        axis."""
+        to = to or range(self.axes)
+        of = of or to
+        nothing = np.empty(0, np.intp)
+        found: list[tuple[Any, Any, Any]] = [(nothing, nothing, np.empty(0))]
         for rows, columns, blocks in self.parts:
-            for a, b in np.ndindex(axes, axes):
+            for (i, a), (j, b) in product(enumerate(to), enumerate(of)):
+                if not _of_one(blocks)[:, a, b].any():
+                    continue
                 value = blocks[:, a, b]
-                kept = value != 0.0
-                found.append((axes * rows[kept] + a, axes * columns[kept] + b, value[kept]))
-        return _joined(found, (axes * self.shape[0], axes * self.shape[1]))
-
-    def between(self, a: int, b: int) -> Entries:
-        """Of the matrix from axis b to axis a alone, an unknown a particle."""
-        parts = [
-            (rows, columns, blocks[:, a, b])
-            for rows, columns, blocks in self.parts
-            if _of_one(blocks)[:, a, b].any()
-        ]
-        return _joined(parts, self.shape)
+                kept = slice(None) if is_one(blocks) else value != 0.0
+                found.append((len(to) * rows[kept] + i, len(of) * columns[kept] + j, value[kept]))
+        rows, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
+        return Entries(rows, columns, values, (len(to) * self.shape[0], len(of) * self.shape[1]))
 
     def couples(self, a: int, b: int) -> bool:
         """Whether anything leads from axis b to axis a."""
@@ -143,12 +134,12 @@ class Couplings:
 
     def times(self, vectors: Floats) -> Floats:
         """The product with vectors, (particle, axis)."""
-        product = np.zeros((self.shape[0], self.axes))
+        found = np.zeros((self.shape[0], self.axes))
         for rows, columns, blocks in self.parts:
             terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
             for axis in range(self.axes):
-                product[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
-        return product
+                found[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
+        return found
 
 
 def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
@@ -156,6 +147,11 @@ def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
     if is_one(blocks):
         return blocks[: np.count_nonzero(chosen)]
     return blocks[chosen]
+
+
+def scaled(factor: float, blocks: Floats) -> Floats:
+    """The multiple; still a view where all are one."""
+    return np.broadcast_to(factor * blocks[:1], blocks.shape) if is_one(blocks) else factor * blocks
 
 
 def is_one(blocks: Floats) -> bool:
@@ -170,11 +166,3 @@ def frame_matrices(weights: Floats, axes: int) -> Floats:
 
 def _of_one(blocks: Floats) -> Floats:
     return blocks[:1] if is_one(blocks) else blocks
-
-
-def _joined(parts: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> Entries:
-    if not parts:
-        nothing = np.empty(0, np.intp)
-        return Entries(nothing, nothing, np.empty(0), shape)
-    rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Entries(rows, columns, values, shape)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pbdkit.analysis.analysis import NO_REMEDY, Analysis
-from pbdkit.analysis.plane_waves import bounds_the_body, wave_bound
 from pbdkit.analysis.spectrum import NEUTRAL
+from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leader_groups import kinds_at

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import connected
+from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.experiment.motions import Oscillation
 from pbdkit.scene.leader_groups import Leading
@@ -57,6 +57,18 @@ class Lag:
         """What is reached, as far as that is known."""
         return self.steady if self.reached is None else self.reached
 
+    def late(self, bond: float) -> list[str]:
+        """A warning where the body is left behind its equilibrium by more than a bond."""
+        if self.size <= bond:
+            return []
+        return [
+            f"leaders: in steps {self.first} to {self.last} the fastest moves by "
+            f"{self.speed:.4g} a step and leaves the body {self.size:.3g} behind its "
+            f"equilibrium, more than a bond ({bond:.3g}): its speed decides how far bonds stretch; "
+            f"move by less than {self.speed * bond / self.steady:.2g} a step, or take "
+            "solver: {type: equilibrium}"
+        ]
+
 
 def lag_of(scene: Scene) -> Lag | None:
     """The lag in the fastest interval of two steps or more: a jump of one step has no speed, nor
@@ -74,19 +86,19 @@ def lag_of(scene: Scene) -> Lag | None:
             v[np.searchsorted(operator.leaders, leading.rows)] = _velocity(leading, first)
     pull = operator.couplings_led.times(v).ravel()
     shown = operator.couplings_shown.times(v).ravel()
-    both = operator.entries_now.plus(operator.entries_before).matrix()
+    both = operator.couplings_both.entries().matrix()
     _, label = connected(both, strongly=False)
     who = np.flatnonzero(np.isin(label, label[pull != 0.0]))
     solve = _solver(both[who][:, who]) if len(who) else None
     if solve is None:
         return None
     now, before = (
-        entries.matrix()[who][:, who] for entries in (operator.entries_now, operator.entries_before)
+        couplings.entries().matrix()[who][:, who]
+        for couplings in (operator.couplings_now, operator.couplings_before)
     )
     delta = solve(pull[who])
     first_push = delta - (pull - shown)[who]
-    lags = scene.frame.map.lag if scene.frame else 0
-    push = first_push + before @ delta + lags * shown[who]
+    push = first_push + before @ delta + scene.lag * shown[who]
 
     def largest(error: Floats) -> float:
         return float(np.sqrt(np.bincount(who // 2, error * error).max()))
@@ -135,17 +147,15 @@ def _velocity(leading: Leading, step: int) -> Floats:
 
 def _solver(step: Any) -> Solve | None:
     """What solves (1 - step) x = b; None for a singular matrix."""
-    size = step.shape[0]
-    if isinstance(step, np.ndarray):
-        matrix = np.eye(size) - step
+    matrix = one_minus(step)
+    if isinstance(matrix, np.ndarray):
         if not np.linalg.cond(matrix) < WORST:
             return None
         return lambda b: np.asarray(np.linalg.solve(matrix, b))
-    from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
     try:
-        factors = splu((eye_array(size) - step).tocsc(), permc_spec="MMD_AT_PLUS_A")
+        factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A")
     except RuntimeError:  # "Factor is exactly singular"
         return None
     pivots = np.abs(factors.U.diagonal())

@@ -6,7 +6,7 @@ particles with the same neighbours present answer alike, and one of each kind is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.stencil import derivatives
+from pbdkit.analysis.stencil import derivative
 from pbdkit.interfaces import Components, Slot, Softens
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
@@ -28,9 +28,6 @@ from pbdkit.stepping.surroundings import Surroundings
 
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
-VALUES_AT_ONCE = 6000
-"""Derivatives are taken in several directions at once for up to so many values together: fewer
-calls, as long as what stands still costs nothing beside them."""
 
 
 @dataclass(frozen=True)
@@ -60,32 +57,37 @@ def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Resp
 
     Raises PluginError where the rule's functions fail, or are not finite at rest.
     """
-    with blaming(scene.experiment.rule, "when linearised"):
-        response = _respond(scene, state, sublattice, place)
-        values = [response.move, response.own, *response.neighbours.values()]
-        if not state.u.any() and not all(np.isfinite(v).all() for v in values):
-            raise ValueError("its move at rest, or a derivative of it, is not finite")
-    return response
-
-
-def _respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
     slots = scene.neighbourhood.slots[sublattice]
     steps = {slot: slot_step(scene.raster.shape, slot) for slot in slots}
     kinds = np.arange(len(place))
     same = not scene.experiment.rule.uses_reference and not _differ(scene, state)
-    if same and not state.u.any():
-        kinds, place = _alike(scene, state, sublattice, place)
-    some = _Followers(scene, state, sublattice, place)
-    answers = some.derivatives()
-    neighbours = {slot: answers[slot] for slot in slots}
-    return Response(neighbours, answers[None], some.move(), kinds, steps)
+    at_rest = not state.u.any()
+    with blaming(scene.experiment.rule, "when linearised"):
+        if same and at_rest:
+            kinds, place = _alike(scene, state, sublattice, place)
+        some = _Followers(scene, state, sublattice, place)
+        answers, move = some.derivatives(), some.move()
+        if at_rest and not all(np.isfinite(v).all() for v in (move, *answers.values())):
+            raise ValueError("its move at rest, or a derivative of it, is not finite")
+    return Response({slot: answers[slot] for slot in slots}, answers[None], move, kinds, steps)
 
 
-def has_neighbours(scene: Scene, sublattice: int, place: Indices) -> Present:
-    """Which particles have any; others stay, whatever the rule makes of nothing."""
-    found = np.zeros(len(place), bool)
-    for slot in scene.neighbourhood.slots[sublattice]:
-        found |= scene.raster.kind.ravel()[place + slot_step(scene.raster.shape, slot)] != EMPTY
+def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
+    """Every sublattice with those of the flat places that are its, by their number."""
+    sublattices = scene.raster.shape[0]
+    of = place // (scene.raster.kind.size // sublattices)
+    for s in range(sublattices):
+        some = np.flatnonzero(of == s)
+        if len(some):
+            yield s, some
+
+
+def has_neighbours(scene: Scene, place: Indices) -> Present:
+    """Which particles at flat places have any."""
+    found, kind = np.zeros(len(place), bool), scene.raster.kind.ravel()
+    for s, some in by_sublattice(scene, place):
+        for slot in scene.neighbourhood.slots[s]:
+            found[some] |= kind[place[some] + slot_step(scene.raster.shape, slot)] != EMPTY
     return found
 
 
@@ -141,26 +143,22 @@ class _Followers:
 
     def derivatives(self) -> dict[Slot | None, Floats]:
         """∂move/∂u_k through every slot and, under None, ∂move/∂u_j with all neighbours where they
-        are; (place, axis of the move, axis of u). Few places are asked for many at once."""
-        movers, axes, shape = (*self._slots, None), self._axes, self._here.u.x.shape
-        at_once = max(1, VALUES_AT_ONCE // (axes * self._here.u.x.size))
-        found = {}
-        for first in range(0, len(movers), at_once):
-            some = movers[first : first + at_once]
-            moved = partial(self._moved, _Nudges(some, self._slots, axes))
-            answers = derivatives(moved, axes * len(some), shape)
-            for n, mover in enumerate(some):
-                found[mover] = np.moveaxis(answers[axes * n : axes * (n + 1)], (0, 1), (2, 1))
+        are; (place, axis of the move, axis of u)."""
+        found, shape, unit = {}, self._here.u.x.shape, np.eye(self._axes)
+        for mover in (*self._slots, None):
+            columns = [derivative(partial(self._moved, mover, e), shape) for e in unit]
+            found[mover] = np.moveaxis(np.array(columns), (0, 1), (2, 1))
         return found
 
-    def _moved(self, nudges: _Nudges, step: complex) -> Any:
-        """The moves (direction, place) after steps of neighbours, or of one's own."""
-        here, contributions = self._here.u, dict(self._still)
-        if nudges.own:
-            here = here + step * nudges.own
-        for slot, nudge in nudges.along.items():
-            contributions[slot] = self._contribution(slot, here, step * nudge)
-        return self._applied(contributions, here)
+    def _moved(self, mover: Slot | None, along: Floats, step: complex) -> Any:
+        """The moves (place) after a step of the neighbour at a slot, or of one's own."""
+        here, nudge = self._here.u, vector(step * component for component in along)
+        if mover is not None:
+            contributions = self._still | {mover: self._contribution(mover, here, nudge)}
+            return self._applied(contributions, here)
+        here = here + nudge
+        stepped = {slot: self._contribution(slot, here, -nudge) for slot in self._slots}
+        return self._applied(stepped, here)
 
     def _contribution(
         self, slot: Slot, here: Components, nudge: Components | None = None
@@ -172,23 +170,3 @@ class _Followers:
         parts = [(contributions[slot], to.present) for slot, to in self._neighbours.items()]
         with np.errstate(all="ignore"):
             return self._evaluator.move(summed(parts), self._here._replace(u=here))
-
-
-class _Nudges:
-    """What unit steps of some neighbours, by slot, or of oneself (None) along each axis do: to
-    oneself, `own`, and to the differences `along` slots, (direction, 1) each. What stays as it is
-    has none."""
-
-    def __init__(self, movers: Sequence[Slot | None], slots: Sequence[Slot], axes: int) -> None:
-        def unit(n: int, length: float) -> Any:
-            planes = np.zeros((axes, axes * len(movers), 1))
-            for axis in range(axes):
-                planes[axis, axes * n + axis] = length
-            return vector(planes)
-
-        self.own = unit(movers.index(None), 1.0) if None in movers else None
-        self.along = {slot: unit(n, 1.0) for n, slot in enumerate(movers) if slot is not None}
-        if self.own:
-            back = unit(movers.index(None), -1.0)
-            for slot in slots:
-                self.along[slot] = back + self.along[slot] if slot in self.along else back

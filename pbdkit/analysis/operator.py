@@ -6,16 +6,15 @@ an unknown a particle and axis. `before` is empty but for frames with lag and fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.composition import moves_and_couplings
-from pbdkit.analysis.couplings import Couplings, Entries, frame_matrices, some_of
-from pbdkit.analysis.linear_response import Response, has_neighbours, respond
+from pbdkit.analysis.couplings import Couplings, Entries, frame_matrices, scaled, some_of
+from pbdkit.analysis.linear_response import by_sublattice, has_neighbours, respond
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import kinds_at
@@ -47,39 +46,30 @@ class StepOperator:
     couplings_shown: Couplings
     source: Floats
 
-    @cached_property
-    def entries_now(self) -> Entries:
-        """The entries of `now`."""
-        return self.couplings_now.entries()
-
-    @cached_property
-    def entries_before(self) -> Entries:
-        """The entries of `before`."""
-        return self.couplings_before.entries()
-
-    @cached_property
-    def entries_led(self) -> Entries:
-        """The entries of `led`."""
-        return self.couplings_led.entries()
+    @property
+    def couplings_both(self) -> Couplings:
+        """`now` + `before`: the step where displacements stay as they are."""
+        now = self.couplings_now
+        return Couplings(now.shape, now.axes, now.parts + self.couplings_before.parts)
 
     @cached_property
     def now(self) -> scipy.sparse.csr_array:
         """What u(t) is multiplied with."""
-        return self.entries_now.sparse()
+        return self.couplings_now.entries().sparse()
 
     @cached_property
     def before(self) -> scipy.sparse.csr_array:
         """What u(t-1) is multiplied with."""
-        return self.entries_before.sparse()
+        return self.couplings_before.entries().sparse()
 
     @cached_property
     def led(self) -> scipy.sparse.csr_array:
         """What the leaders' displacements are multiplied with."""
-        return self.entries_led.sparse()
+        return self.couplings_led.entries().sparse()
 
     def augmented(self) -> Entries:
         """The operator on (u(t), u(t-1)); that on u(t) where the step does not look back."""
-        now, before = self.entries_now, self.entries_before
+        now, before = self.couplings_now.entries(), self.couplings_before.entries()
         if not len(before.values):
             return now
         size = now.shape[0]
@@ -109,9 +99,62 @@ def step_operator(
     ).operator()
 
 
+def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
+    """The moves (particle, axis) of the particles at some flat places, and ∂move/∂u: rows in the
+    order of the places, columns by flat place."""
+    if scene.inner is None:
+        return _directly(scene, state, place)
+    body = scene.raster.place_of(scene.raster.body_rows)
+    z, inner = moves_and_couplings(scene.inner, state, body)
+    field = np.zeros(state.u.shape)
+    flat = field.reshape(len(field), -1)
+    flat[:, body] = z.T
+    if scene.frame:
+        scene.frame.follow(flat, flat)
+    moves, outer = _directly(scene, replace(state, u=field), place)
+    seen = _followed(scene).entries().sparse() @ inner.entries().sparse()
+    product = (outer.entries().sparse() @ seen).tobsr((scene.axes, scene.axes))
+    product.sum_duplicates()
+    rows = np.repeat(np.arange(len(place)), np.diff(product.indptr))
+    couplings = Couplings(outer.shape, scene.axes)
+    couplings.add(rows, product.indices, product.data)
+    return moves, couplings
+
+
+def _followed(scene: Scene) -> Couplings:
+    """What body and frame show of the body: rows by flat place, columns in the order of the body's
+    particles."""
+    raster = scene.raster
+    body, place = raster.body_rows, raster.place_of(np.arange(raster.count))
+    followed = Couplings((raster.kind.size, len(body)), scene.axes)
+    identity = np.broadcast_to(np.eye(scene.axes), (len(body), scene.axes, scene.axes))
+    followed.add(place[body], np.arange(len(body)), identity)
+    if scene.frame:
+        point = np.setdiff1d(np.arange(raster.count), body)[scene.frame.map.point]
+        column = np.searchsorted(body, scene.frame.map.body)
+        followed.add(place[point], column, frame_matrices(scene.frame.map.weight, scene.axes))
+    return followed
+
+
+def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
+    """By the scene's own rule; who has no neighbours stays, whatever it makes of nothing."""
+    kind, moves = scene.raster.kind.ravel(), np.zeros((len(place), scene.axes))
+    couplings = Couplings((len(place), kind.size), scene.axes)
+    moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)
+    for s, own in by_sublattice(scene, place[moving]):
+        some = moving[own]
+        response = respond(scene, state, s, place[some])
+        moves[some] = response.of_each(response.move)
+        couplings.add(some, place[some], response.of_each(response.own))
+        for slot, derivative in response.neighbours.items():
+            there = place[some] + response.steps[slot]
+            has = kind[there] != EMPTY
+            couplings.add(some[has], there[has], some_of(response.of_each(derivative), has))
+    return moves, couplings
+
+
 class _Assembly:
-    """Collects the couplings, looking particles up by their flat place on the raster: the
-    neighbour at a slot is a constant step away."""
+    """Collects the couplings, looking particles up by their flat place on the raster."""
 
     def __init__(self, scene: Scene, state: State, step: int) -> None:
         self._scene, self._state = scene, state
@@ -128,24 +171,23 @@ class _Assembly:
         axes = scene.axes
         self._now, self._before = Couplings((free, free), axes), Couplings((free, free), axes)
         self._led, self._shown = Couplings((free, led), axes), Couplings((free, led), axes)
-        self._source = np.zeros((free, axes))
 
     def operator(self) -> StepOperator:
-        memory = self._scene.experiment.stepping.memory
-        self._now.add_scaled_identity(np.arange(len(self._followers), dtype=np.int32), 1.0)
-        place = self._scene.raster.place_of(self._followers)
-        cells = self._kind.size // self._scene.raster.shape[0]
-        for s in range(self._scene.raster.shape[0]):
-            own = place if self._scene.raster.shape[0] == 1 else place[place // cells == s]
-            own = own[has_neighbours(self._scene, s, own)]
-            if len(own):
-                if self._scene.inner:
-                    self._add_nested(own)
-                else:
-                    self._add(own, respond(self._scene, self._state, s, own))
-                if memory:
-                    self._now.add_scaled_identity(self._unknown[own], memory)
-                    self._before.add_scaled_identity(self._unknown[own], -memory)
+        solver, place = (
+            self._scene.experiment.stepping,
+            self._scene.raster.place_of(self._followers),
+        )
+        moves, couplings = moves_and_couplings(self._scene, self._state, place)
+        self._now.add_scaled_identity(np.arange(len(place), dtype=np.int32), 1.0)
+        for rows, there, blocks in couplings.parts:
+            self._see(rows, there, scaled(solver.relaxation, blocks))
+        if solver.memory:
+            moving = np.flatnonzero(has_neighbours(self._scene, place))
+            self._now.add_scaled_identity(moving, solver.memory)
+            self._before.add_scaled_identity(moving, -solver.memory)
+        if self._state.u.any():
+            u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
+            moves = moves - couplings.times(u.T)
         return StepOperator(
             self._followers,
             self._leaders,
@@ -153,38 +195,8 @@ class _Assembly:
             self._before,
             self._led,
             self._shown,
-            self._source.ravel(),
+            (solver.relaxation * moves).ravel(),
         )
-
-    def _add(self, place: Indices, response: Response) -> None:
-        """The rows of the followers at some places of one sublattice."""
-        relaxation = self._scene.experiment.stepping.relaxation
-        u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
-        rows = self._unknown[place]
-        own = response.of_each(relaxation * response.own)
-        self._now.add(rows, rows, own)
-        at_rest = not u.any()
-        constant: Floats = relaxation * response.of_each(response.move)
-        if not at_rest:
-            constant = constant - _times(own, u[:, place].T)
-        for slot, derivative in response.neighbours.items():
-            there = place + response.steps[slot]
-            weight = response.of_each(relaxation * derivative)
-            if not at_rest:
-                present = (self._kind[there] != EMPTY)[:, None]
-                constant = constant - np.where(present, _times(weight, u[:, there].T), 0.0)
-            self._see(rows, there, weight)
-        self._source[rows] = constant
-
-    def _add_nested(self, place: Indices) -> None:
-        """The rows of followers whose rule works on the moves of another."""
-        relaxation, rows = self._scene.experiment.stepping.relaxation, self._unknown[place]
-        moves, couplings = moves_and_couplings(self._scene, self._state, place)
-        everybody = self._scene.raster.place_of(np.arange(self._scene.raster.count))
-        u = self._state.u.reshape(self._scene.axes, -1)[:, everybody].T.astype(float, copy=False)
-        self._source[rows] = relaxation * (moves - couplings.times(u))
-        for own, column, blocks in couplings.parts:
-            self._see(rows[own], everybody[column], relaxation * blocks)
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
@@ -212,8 +224,3 @@ class _Assembly:
             sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
             for couplings, those in sums:
                 couplings.add(rows[has][those], self._unknown[body[those]], product[those])
-
-
-def _times(matrices: Floats, vectors: Floats) -> Floats:
-    product: Floats = np.einsum("eab,eb->ea", matrices, vectors)
-    return product

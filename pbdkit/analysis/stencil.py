@@ -1,21 +1,30 @@
-"""Derivatives of elementwise functions: by a complex step where that serves, else by differences.
+"""How a rule at rest answers on the infinite lattice: derivatives, and what they do to waves.
 
-Where functions keep to arithmetic and roots they are analytic, and ∂f = Im f(x + ih) / h is exact
-to rounding. Others (an absolute value, a hypotenuse) drop the imaginary part or refuse it: a
-central difference finds that out, and takes its place with nine digits or so.
+Derivatives of elementwise functions are taken by a complex step where that serves, else by
+differences. Where functions keep to arithmetic and roots they are analytic, and ∂f = Im f(x + ih)
+/ h is exact to rounding. Others (an absolute value, a hypotenuse) drop the imaginary part or refuse
+it: a central difference finds that out, and takes its place with nine digits or so.
+
+A displacement exp(iθ·c) over repeat cells c is multiplied in a step by the symbol, a matrix of
+blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as
+long as its frame copies or mirrors: a bound that costs milliseconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import add
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.analysis.spectrum import Complex, modes
 from pbdkit.interfaces import Here, Slot
+from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.vector import vector
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
 
@@ -26,29 +35,17 @@ Moved = Callable[[complex], tuple[Any, Any]]
 
 def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
     """(component, *shape): the derivative at a step of zero."""
-    found: NDArray[np.float64] = derivatives(moved, 1, shape)[0]
-    return found
-
-
-def derivatives(moved: Moved, directions: int, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """(direction, component, *shape): the derivatives of a function that steps along several
-    directions at once, (direction, *shape) in each component."""
-    whole = (directions, *shape)
     with np.errstate(all="ignore"):
-        ahead, behind = _array(moved(SMALL), whole), _array(moved(-SMALL), whole)
+        ahead, behind = _array(moved(SMALL), shape), _array(moved(-SMALL), shape)
         difference: NDArray[np.float64] = (ahead - behind).real / (2 * SMALL)
-        difference = difference.swapaxes(0, 1)
         try:
-            exact: NDArray[np.float64] = _array(moved(1j * TINY), whole).imag / TINY
+            exact: NDArray[np.float64] = _array(moved(1j * TINY), shape).imag / TINY
         except (TypeError, ValueError):  # a function that takes no complex numbers
             return difference
-    exact = exact.swapaxes(0, 1)
     known = np.isfinite(exact) & np.isfinite(difference)
-    within = tuple(range(1, exact.ndim))
-    scale = np.abs(difference).max(axis=within, initial=1.0, where=known)
-    off = np.abs(exact - difference).max(axis=within, initial=0.0, where=known)
-    agree = (off <= 1e-4 * scale).reshape(-1, *(1 for _ in within))
-    return np.where(agree, exact, difference)
+    scale = np.abs(difference).max(initial=1.0, where=known)
+    off = np.abs(exact - difference).max(initial=0.0, where=known)
+    return exact if off <= 1e-4 * scale else difference
 
 
 def _array(components: tuple[Any, Any], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -100,3 +97,143 @@ def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Here) 
 
         columns.append(derivative(moved))
     return np.array(columns).T
+
+
+def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
+    """The stencil of the scene's rule, of all its rules together where it works on the moves of
+    another; `at` says where for rules that ask."""
+    stencil = stencil_of(scene, at)
+    return _composed(stencil, linearised(scene.inner, at)) if scene.inner else stencil
+
+
+def _composed(outer: Stencil, inner: Stencil) -> Stencil:
+    """The stencil of a rule that works on the moves of another."""
+    own = np.zeros_like(outer.own)
+    neighbours: dict[Slot, Floats] = {}
+    known: dict[tuple[int, int, Index], Slot] = {}
+    for first, W in _with_itself(outer):
+        for second, V in _with_itself(inner):
+            if first.target != second.source:
+                continue
+            slot = _after(first, second)
+            key = slot.source, slot.target, slot.cell
+            if slot.source == slot.target and not any(slot.cell):
+                own[slot.source] += W @ V
+            else:
+                slot = known.setdefault(key, slot)
+                neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
+    return Stencil(own, neighbours)
+
+
+def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
+    for s, own in enumerate(stencil.own):
+        nowhere = (0,) * len(own)
+        yield Slot(s, s, nowhere, nowhere, vector(np.zeros(len(own))), 0), own
+    yield from stencil.neighbours.items()
+
+
+def _after(first: Slot, second: Slot) -> Slot:
+    """Where two slots lead, one after the other."""
+    return Slot(
+        first.source,
+        second.target,
+        tuple(map(add, first.cell, second.cell)),
+        tuple(map(add, first.site, second.site)),
+        first.rest + second.rest,
+        first.shell + second.shell,
+    )
+
+
+WAVES = 48
+"""Wave numbers along each axis; an even number, so that the shortest waves are among them."""
+
+MOST_ANSWERS = 100_000
+"""Of a rule that is asked what each neighbour does to each: about half a second."""
+LITTLE_MEMORY = 0.9
+"""Up to which plane waves were seen to bound random bodies (tests/test_predictions.py)."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Over all waves: the smallest and largest real part and the largest imaginary part of the
+    eigenvalues of the rule's step without relaxation and memory, and the largest modulus of the
+    solver's step with them."""
+
+    smallest: float
+    largest: float
+    imaginary: float
+    radius: float
+
+    def largest_stable_relaxation(self, memory: float) -> float | None:
+        """2 (1 + memory) / (1 - λ_min); None where eigenvalues are complex or above 1, or the
+        memory grows by itself: no such bound exists there."""
+        if self.imaginary > 1e-9 or self.largest > 1.0 + 1e-9 or abs(memory) >= 1.0:
+            return None
+        return 2.0 * (1.0 + memory) / (1.0 - self.smallest) if self.smallest < 1.0 - 1e-9 else None
+
+
+def wave_bound(scene: Scene) -> Bound | None:
+    """The bound for the scene's rule at rest.
+
+    None for rules that depend on the place or take no single numbers, where neighbours are found
+    anew or are more than some 300, and where the frame lags: its delay can make modes grow that no
+    plane wave knows.
+    """
+    if sum(len(slots) ** 2 for slots in scene.neighbourhood.slots) > MOST_ANSWERS:
+        return None
+    solver = scene.experiment.stepping
+    if scene.lag or scene.experiment.rule.uses_reference or scene.experiment.neighbours.nearness():
+        return None
+    try:
+        with blaming(scene.experiment.rule, "when asked about plane waves"):
+            eigenvalues = _eigenvalues(_symbols(scene)).ravel()
+    except (Exception, SystemExit):  # a prediction stops no run; the run names the rule at fault
+        return None
+    if not np.isfinite(eigenvalues).all():
+        return None
+    return Bound(
+        float(eigenvalues.real.min()),
+        float(eigenvalues.real.max()),
+        float(np.abs(eigenvalues.imag).max()),
+        float(np.abs(modes(eigenvalues, solver.relaxation, solver.memory)).max()),
+    )
+
+
+def bounds_the_body(scene: Scene) -> bool:
+    """Whether no mode of the body can grow where no wave does: particles with fewer neighbours have
+    modes of their own, and with much memory so have frames on leaning lattices."""
+    reach = scene.neighbourhood.reach
+    whole = scene.experiment.frame.depth(reach) >= reach
+    return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY
+
+
+def _eigenvalues(matrices: Complex) -> Complex:
+    """Of (wave, n, n) matrices; two by two in closed form."""
+    if matrices.shape[-1] > 2:
+        found: Complex = np.linalg.eigvals(matrices)
+        return found
+    (a, b), (c, d) = np.moveaxis(matrices, 0, -1)
+    middle, half = (a + d) / 2, (a - d) / 2
+    root = np.sqrt(half * half + b * c)
+    return np.stack([middle + root, middle - root])
+
+
+def _symbols(scene: Scene) -> Complex:
+    """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
+    alike."""
+    stencil = linearised(scene)
+    angle = 2 * np.pi * np.arange(WAVES) / WAVES
+    half = angle[: WAVES // 2 + 1]
+    axes, waves = scene.axes, [half, *[angle] * (scene.axes - 1)]
+    theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
+    size = axes * len(stencil.own)
+    symbols: Complex = np.zeros((len(theta), size, size), complex)
+    symbols += np.eye(size)
+    of = [slice(axes * s, axes * (s + 1)) for s in range(len(stencil.own))]
+    for s, own in enumerate(stencil.own):
+        symbols[:, of[s], of[s]] += own
+    for slot, matrix in stencil.neighbours.items():
+        here, there = of[slot.source], of[slot.target]
+        phase = np.exp(1j * theta @ np.array(slot.cell, float))
+        symbols[:, here, there] += phase[:, None, None] * matrix
+    return symbols

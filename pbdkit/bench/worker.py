@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import step_operator
 from pbdkit.api import load
 from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.increments import settle
@@ -227,9 +226,7 @@ def decay_of(scene: Scene, exact: NDArray[np.float64]) -> Decay:
         return Decay(0.0, 0.0)
     resting = initial_state(scene)
     resting.u[...] = 0.0
-    operator = step_operator(scene, resting, scene.experiment.steps)
-    X = scene.raster.reference(operator.followers)
-    system, mode, slowness = System(operator, "auto", X, Watch()), way, 0.0
+    system, mode, slowness = System(scene, resting, "auto", Watch()), way, 0.0
     for _ in range(TURNS):
         mode = mode / np.abs(mode).max()
         after = system.solve(mode, ROUGH)

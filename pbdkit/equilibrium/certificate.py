@@ -1,17 +1,19 @@
-"""What is known of the distance between a state and its equilibrium."""
+"""What is known of the distance between a state and its equilibrium, and where that lies."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import StepOperator
+from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.watch import Watch
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
@@ -72,11 +74,6 @@ def spacing_of(scene: Scene) -> float:
     return min(min(lengths) for lengths in scene.neighbourhood.shells())
 
 
-def never_rests(leading: Leading, steps: int) -> bool:
-    """Whether a group still leads in the last step, in a motion that has no end."""
-    return leading.group.leads(steps) and leading.group.motion.rests_after() is None
-
-
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -106,15 +103,131 @@ class Moves:
         return moved.astype(float)
 
 
-def owed_by(operator: StepOperator, state: State, place: Indices) -> NDArray[np.float64] | None:
-    """What followers at their flat places have yet to get, (follower, axis), where the step looks
-    back: before · (u(t-1) - u(t)), None elsewhere."""
-    if not operator.couplings_before.parts:
-        return None
-    u, previous = (p.reshape(len(p), -1)[:, place] for p in (state.u, state.previous))
-    return operator.couplings_before.times((previous - u).T.astype(float))
-
-
 def rounding(u: Floats) -> float:
     """How far rounding alone may put a move off at displacements u."""
     return ROUNDING * float(np.abs(u).max())
+
+
+LINEAR = 1e-9
+"""A correction that leaves less than this share of the moves came from the right linearisation."""
+FIRST_ORDER = 2.0
+"""What a bound is multiplied with that holds to first order only."""
+ACCURACY = 1e-8
+"""How well linear systems are solved; the bound takes in what that leaves."""
+
+CONTRACTION = 0.1
+"""The share of the moves that a correction may leave for its linearisation to be trusted: further
+ones, each that much smaller, then lie within a ninth of the first."""
+BENT = "the rule bends too much between there and equilibrium for a bound"
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """`u` is the equilibrium ahead as far as it is known, and the certificate says how far at most
+    any follower is from it; `obstacle` why there is no distance, where it is infinite."""
+
+    u: Floats
+    certificate: Certificate
+    obstacle: str
+
+
+class Foresight:
+    """The outlook from states of a scene with the roles of its last step.
+
+    The correction c, A c = move, leads from u to the equilibrium, and what it fails to do is seen
+    in the moves where it leads:
+
+        distance ≤ max |c| + (bound on |A⁻¹|) · |move(u + c)|,
+
+    for rules that are not linear with A linearised at u, the second term to first order, doubled,
+    and only where the correction leaves a tenth of the moves at most.
+    """
+
+    def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
+        self._scene, self._scale, self._watch = scene, scale, watch
+        self._moves = Moves(scene)
+        self._at_rest: System | None = None
+        self._broken = 0
+        self._linear = False
+        self._past_iterations = self._linearisations = 0
+
+    def from_(self, state: State) -> Outlook:
+        """The outlook from the end of a step, which is left as it is.
+
+        The distance is infinite where no bound is known: for what is pushed on for ever, and for
+        parts that nothing holds under rules that are not linear.
+        """
+        u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
+        here = replace(state, u=u, previous=previous)
+        broken = 0 if state.broken_step is None else int((state.broken_step >= 0).sum())
+        if self._at_rest is None or broken != self._broken:
+            self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
+            self._linear = self._is_linear(here, self._at_rest)
+        if self._linear:
+            return self._outlook(here, self._at_rest)
+        known = self._linearised(here, u)
+        found = self._outlook(here, known, anew=True)
+        self._past_iterations += known.iterations
+        return found
+
+    def _linearised(self, state: State, u: Floats) -> System:
+        self._linearisations += 1
+        return System(self._scene, replace(state, u=u), "auto", self._watch)
+
+    def _outlook(self, here: State, known: System, *, anew: bool = False) -> Outlook:
+        """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
+        moves = self._moves.at(here, known.place)
+        ahead, distance = here.u.copy(), math.inf
+        correction, obstacle = self._correction(here, known, moves, anew)
+        if correction is not None:
+            ahead.reshape(len(ahead), -1)[:, known.place] += correction.T
+            left = self._moves.at(replace(here, u=ahead), known.place)
+            bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
+            distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
+            if anew and not _smaller(left, moves, rounding(ahead)):
+                distance, obstacle = math.inf, BENT
+        distance = distance if math.isfinite(distance) else math.inf
+        assert self._at_rest is not None
+        own = known.iterations if anew else 0
+        certificate = Certificate(
+            method=known.methods,
+            iterations=self._linearisations,
+            inner_iterations=self._past_iterations + self._at_rest.iterations + own,
+            residual=float(np.abs(moves).max(initial=0.0)),
+            distance=distance,
+            share=distance / self._scale,
+            bound=CORRECTION + known.how,
+            linearised=anew,
+        )
+        return Outlook(ahead, certificate, obstacle)
+
+    def _correction(
+        self, here: State, known: System, moves: NDArray[np.float64], anew: bool
+    ) -> tuple[NDArray[np.float64] | None, str]:
+        """(follower, axis); None, and why, where there is no equilibrium, or none that is known."""
+        try:
+            if anew:
+                known.refuse_moving_floats(moves, rounding(here.u))
+            return known.solve(moves, ACCURACY, known.owed(here)), ""
+        except ExperimentError as error:
+            return None, str(error).partition("; ")[0] + "; let a leader hold it"
+
+    def _is_linear(self, here: State, known: System) -> bool:
+        """Whether followers put elsewhere, at random and as far as the body has come, move by what
+        the linearisation at rest says."""
+        size = float(np.abs(here.u).max()) or spacing_of(self._scene)
+        shape = (len(known.place), 2)
+        put = np.random.default_rng(0).uniform(-size, size, shape)
+        there = here.u.copy()
+        there.reshape(len(there), -1)[:, known.place] += put.T
+        change = self._moves.at(replace(here, u=there), known.place) - self._moves.at(
+            here, known.place
+        )
+        with np.errstate(all="ignore"):
+            wrong = float(np.linalg.norm(change + known.times(put)))
+        return wrong <= LINEAR * float(np.linalg.norm(put))
+
+
+def _smaller(left: NDArray[np.float64], moves: NDArray[np.float64], rounding: float) -> bool:
+    most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding
+    return bool(np.abs(left).max(initial=0.0) <= most)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import Certificate, never_rests, scale_of
+from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
 from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.errors import ExperimentError
@@ -33,7 +33,7 @@ def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificat
     watch = watch or Watch()
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
     for n, leading in enumerate(scene.leading):
-        if never_rests(leading, steps):
+        if leading.group.leads(steps) and leading.group.motion.rests_after() is None:
             raise ExperimentError(
                 "never comes to rest, so that there is no equilibrium; take solver: "
                 "{type: stepping}, or a motion that ends",

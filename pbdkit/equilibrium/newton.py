@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.operator import StepOperator, step_operator
-from pbdkit.equilibrium.certificate import Certificate, Moves, owed_by, rounding
-from pbdkit.equilibrium.krylov import product
+from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.scene.scene import Scene
@@ -18,12 +17,8 @@ from pbdkit.stepping.state import State
 
 Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
-LINEAR = 1e-9
-"""A correction that leaves less than this share of the moves came from the right linearisation."""
 SHORTEST = 2.0**-14
 """The shortest share of a correction that is tried."""
-FIRST_ORDER = 2.0
-"""What a bound is multiplied with that holds to first order only."""
 
 
 class UnconvergedError(Exception):
@@ -34,16 +29,21 @@ class UnconvergedError(Exception):
         self.certificate = certificate
 
 
+@dataclass(frozen=True)
 class Finder:
     """Looks for the equilibria of a scene, to a tolerance that is a length, by one of the solver's
     methods. `scale` is the length that shares are of."""
 
-    def __init__(
-        self, scene: Scene, tolerance: float, scale: float, method: str, watch: Watch
-    ) -> None:
-        self.scene, self.method, self.watch = scene, method, watch
-        self.tolerance, self.scale = tolerance, scale
-        self.moves = Moves(scene)
+    scene: Scene
+    tolerance: float
+    scale: float
+    method: str
+    watch: Watch
+
+    @cached_property
+    def moves(self) -> Moves:
+        """Of the scene's followers."""
+        return Moves(self.scene)
 
     def find(self, state: State, step: int) -> Certificate:
         """Moves the followers of `state`, in place, to where they rest, with the roles of `step`.
@@ -62,12 +62,9 @@ class _Search:
         self._linearisations = self._inner = 0
         self._linear = False
         at_rest = replace(state, u=np.zeros_like(state.u))
-        finder.watch.begin("assembling")
-        operator = step_operator(finder.scene, at_rest, step)
-        self._place = finder.scene.raster.place_of(operator.followers)
-        self._X = finder.scene.raster.reference(operator.followers)
-        self._system = self._systematised(operator)
-        self._owed = owed_by(operator, state, self._place)
+        self._system = self._linearised(at_rest, "assembling")
+        self._place = self._system.place
+        self._owed = self._system.owed(state)
         self._left = self._moves()
 
     def run(self) -> Certificate:
@@ -78,7 +75,7 @@ class _Search:
         if self._correct_linearly():
             return self._certified()
         if not self._linear:
-            if not self._is_better_than(moves):
+            if not _size(self._left) < _size(moves):
                 self._state.u[...], self._left = start, moves
             self._correct_anew()
         return self._certified()
@@ -104,9 +101,8 @@ class _Search:
     def _correct_anew(self) -> None:
         """Newton's iteration."""
         while self._linearisations < MOST_LINEARISATIONS:
-            self._finder.watch.begin(f"linearising for the {self._linearisations + 1}. time")
-            operator = step_operator(self._finder.scene, self._state, self._step)
-            self._system = self._systematised(operator)
+            what = f"linearising for the {self._linearisations + 1}. time"
+            self._system = self._linearised(self._state, what)
             self._system.refuse_moving_floats(self._left, self._rounding())
             if self._distance() <= self._finder.tolerance or not self._search_along(
                 self._system.solve(self._left, self._accuracy())
@@ -149,11 +145,13 @@ class _Search:
             return f"{MOST_LINEARISATIONS} linearisations did not get there"
         return "no correction makes the moves smaller"
 
-    def _systematised(self, operator: StepOperator) -> System:
+    def _linearised(self, at: State, what: str) -> System:
+        finder = self._finder
+        finder.watch.begin(what)
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return System(operator, self._finder.method, self._X, self._finder.watch)
+        return System(finder.scene, at, finder.method, finder.watch, self._step)
 
     def _shift(self, correction: Vectors, share: float) -> None:
         self._state.u.reshape(len(self._state.u), -1)[:, self._place] += share * correction.T
@@ -161,9 +159,6 @@ class _Search:
 
     def _moves(self) -> Vectors:
         return self._finder.moves.at(self._state, self._place)
-
-    def _is_better_than(self, moves: Vectors) -> bool:
-        return _size(self._left) < _size(moves)
 
     def _distance(self) -> float:
         bound = self._system.distance(self._left, self._rounding())
@@ -188,7 +183,4 @@ class _Search:
 
 def _size(moves: Vectors) -> float:
     with np.errstate(over="ignore"):
-        return math.sqrt(product(moves.ravel(), moves.ravel()))
-
-
-Floats = NDArray[np.float64]
+        return float(np.linalg.norm(moves))

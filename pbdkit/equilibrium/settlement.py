@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import CORRECTION, Certificate, scale_of
-from pbdkit.equilibrium.outlook import Foresight, Outlook
+from pbdkit.equilibrium.certificate import Certificate, Foresight, Outlook, scale_of
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
 from pbdkit.scene.scene import Scene
@@ -122,7 +121,7 @@ class Settling:
         ends = not any(is_cut_short(group, steps) for group in leading)
         first = max(last_event(scene), start.step + 1) if ends else NEVER
         self.pace = Pace(first, self._tolerance, first - 1)
-        self._foresight = Foresight(scene, watch)
+        self._foresight = Foresight(scene, self._scale, watch)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
         self.obstacle = (
@@ -140,10 +139,11 @@ class Settling:
             self.obstacle = f"in step {state.step} particles still moved by up to {longest:.2g}"
             return None
         outlook = self._foresight.from_(state)
-        distance = outlook.distance + self._carrying * longest
+        distance = outlook.certificate.distance + self._carrying * longest
         self.obstacle = self._obstacle(state, outlook, distance)
         if not self.obstacle:
-            return self._certificate(outlook, distance)
+            share = distance / self._scale
+            return replace(outlook.certificate, distance=distance, share=share)
         self.pace.note_distance(state.step, distance)
         return None
 
@@ -153,32 +153,14 @@ class Settling:
             return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"
         if distance > self._tolerance:
             return f"{at} within {distance:.2g} of equilibrium, not within {self._tolerance:.2g}"
-        if self._may_break(state, outlook):
+        ahead = 2.0 * outlook.certificate.distance  # at both ends of a bond
+        if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
             return f"{at} a bond may break on the last {distance:.2g} to equilibrium"
         return ""
-
-    def _may_break(self, state: State, outlook: Outlook) -> bool:
-        """Whether a bond might break within the distance of the equilibrium at both its ends."""
-        if self._fracturing is None:
-            return False
-        return self._fracturing.may_break(outlook.u, state, 2.0 * outlook.distance)
-
-    def _certificate(self, outlook: Outlook, distance: float) -> Certificate:
-        return Certificate(
-            method=outlook.method,
-            iterations=self._foresight.linearisations,
-            inner_iterations=self._foresight.iterations,
-            residual=outlook.residual,
-            distance=distance,
-            share=distance / self._scale,
-            bound=CORRECTION + outlook.bound,
-            linearised=outlook.linearised,
-        )
 
 
 def _carrying(scene: Scene) -> float:
     """How many times the last step a body may be carried on: |b| / (1 - |b|) by memory b, which
     makes each step b times the last, and once by a frame that lags."""
     memory = abs(scene.experiment.stepping.memory)
-    lag = scene.frame.map.lag if scene.frame else 0
-    return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + lag
+    return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.lag

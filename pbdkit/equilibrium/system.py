@@ -7,18 +7,20 @@ only (mixed coordinates), it is solved first. Parts of the body that nothing hol
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import DENSE, Couplings, connected
-from pbdkit.analysis.operator import StepOperator
-from pbdkit.equilibrium.floating_parts import Floating
-from pbdkit.equilibrium.system_parts import DriftingError, Held, Part
+from pbdkit.analysis.couplings import connected, one_minus
+from pbdkit.analysis.operator import step_operator
+from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -27,32 +29,34 @@ Indices = NDArray[np.intp]
 @dataclass
 class _Stage:
     """The unknowns of one axis, or of both where they move each other, with their parts: who
-    belongs to each, None for all. `into` is what the axis solved before adds to the moves."""
+    belongs to each. `into` is what the axis solved before adds to the moves."""
 
-    axes: tuple[int, ...]
-    parts: list[tuple[Indices | None, Part]]
+    axes: list[int]
+    parts: list[tuple[Indices, Part]]
     into: Any = None
 
 
 class System:
-    """A c = move for the followers of an operator, by one of the solver's methods.
+    """A c = move for the followers of a scene, linearised at a state with the roles of a step
+    (default: the last), by one of the solver's methods; `place` is where they are on the flat
+    raster."""
 
-    `X` are their reference positions (follower, axis), which solvers for both axes go by."""
-
-    def __init__(self, operator: StepOperator, method: str, X: Floats, watch: Watch) -> None:
-        self._operator, self._method, self._X = operator, method, X
-        self._watch = watch
-        now, before = operator.couplings_now, operator.couplings_before
-        both = Couplings(now.shape, now.axes, now.parts + before.parts)
-        self._both = both
+    def __init__(
+        self, scene: Scene, state: State, method: str, watch: Watch, step: int | None = None
+    ) -> None:
+        self._operator = operator = step_operator(scene, state, step)
+        self._method, self._watch = method, watch
+        self._X = scene.raster.reference(operator.followers)
+        self.place = scene.raster.place_of(operator.followers)
+        self._both = both = operator.couplings_both
         self.amplification = 1.0
         """How much larger moves are, in rounding too, than the displacements that make them."""
         first = 1 if both.couples(0, 1) else 0
-        self._stages = [] if both.couples(first, 1 - first) else [self._stage((first,))]
+        self._stages = [] if both.couples(first, 1 - first) else [self._stage([first])]
         # One axis has a share in the invariants of the other, where it moves it.
         coupled = both.couples(1 - first, first)
         if not self._stages or (coupled and self._has_floating(self._stages[0])):
-            self._stages = [self._stage((0, 1))]
+            self._stages = [self._stage([0, 1])]
         else:
             self._stages.append(self._following(first))
 
@@ -83,15 +87,13 @@ class System:
         """Raises ExperimentError where a part that nothing holds has moves left: only linear rules
         tell where it ends."""
         for stage in self._stages:
-            r = np.abs(moves[:, list(stage.axes)].ravel())
             for unknowns, part in stage.parts:
-                some = slice(None) if unknowns is None else unknowns
-                if isinstance(part, Floating) and r[some].max(initial=0.0) > rounding:
-                    numbers = self._numbers(stage, unknowns)
+                r = moves[:, stage.axes].ravel()[unknowns]
+                if isinstance(part, Floating) and np.abs(r).max(initial=0.0) > 8 * rounding:
                     raise ExperimentError(
-                        f"there is no unique equilibrium: leaders do not hold a part of "
-                        f"{len(numbers)} particles (with number {numbers[0]}); let one hold it, "
-                        "or take solver: {type: stepping}",
+                        "there is no unique equilibrium: leaders do not hold a part of "
+                        f"{self._named(stage, unknowns)}; let one hold it, or take solver: "
+                        "{type: stepping}",
                         ("leaders",),
                     )
 
@@ -103,20 +105,31 @@ class System:
         """
         found = np.zeros_like(moves)
         for stage in self._stages:
-            axes = list(stage.axes)
-            r = moves[:, axes].ravel()
+            r = moves[:, stage.axes].ravel()
             if stage.into is not None:
-                r = r + stage.into @ found[:, 1 - axes[0]]
-            x = np.zeros_like(r)
-            for unknowns, part in stage.parts:
-                some = slice(None) if unknowns is None else unknowns
-                if isinstance(part, Floating):
-                    back = None if owed is None else owed[:, axes].ravel()[some]
-                    x[some] = self._floated(stage, unknowns, part, r[some], back)
-                elif r[some].any():
-                    x[some] = part.solve(r[some], accuracy)
-            found[:, axes] = x.reshape(-1, len(axes))
+                r = r + stage.into @ found[:, 1 - stage.axes[0]]
+            back = None if owed is None else owed[:, stage.axes].ravel()
+            x = np.empty_like(r)
+            for some, part in stage.parts:
+                try:
+                    x[some] = part.solve(r[some], accuracy, None if back is None else back[some])
+                except DriftingError:
+                    raise ExperimentError(
+                        "there is no equilibrium: nothing holds a part of "
+                        f"{self._named(stage, some)}, and it is pushed on for ever; let a leader "
+                        "hold it",
+                        ("leaders",),
+                    ) from None
+            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
         return found
+
+    def owed(self, state: State) -> Floats | None:
+        """What followers have yet to get, (follower, axis), where the step looks back:
+        before · (u(t-1) - u(t)), None elsewhere."""
+        if not self._operator.couplings_before.parts:
+            return None
+        u, previous = (p.reshape(len(p), -1)[:, self.place] for p in (state.u, state.previous))
+        return self._operator.couplings_before.times((previous - u).T.astype(float))
 
     def times(self, c: Floats) -> Floats:
         """A c, (follower, axis)."""
@@ -127,102 +140,52 @@ class System:
         rounding may have done to them."""
         bounds = np.zeros(2)
         for stage in self._stages:
-            axes = list(stage.axes)
-            r = np.abs(moves[:, axes].ravel()) + rounding
+            r = np.abs(moves[:, stage.axes].ravel()) + rounding
             if stage.into is not None:
-                r = r + abs(stage.into).sum(axis=1) * bounds[1 - axes[0]]
-            for unknowns, part in stage.parts:
-                some = slice(None) if unknowns is None else unknowns
-                bounds[axes] = np.maximum(bounds[axes], part.farthest(r[some]))
+                r = r + abs(stage.into).sum(axis=1) * bounds[1 - stage.axes[0]]
+            bounds[stage.axes] = max((p.farthest(r[some]) for some, p in stage.parts), default=0.0)
         return math.hypot(*bounds)
 
-    def _floated(
-        self,
-        stage: _Stage,
-        unknowns: Indices | None,
-        part: Floating,
-        r: Floats,
-        owed: Floats | None,
-    ) -> Floats:
-        try:
-            return part.solve(r, 0.0, owed)
-        except DriftingError:
-            numbers = self._numbers(stage, unknowns)
-            raise ExperimentError(
-                f"there is no equilibrium: nothing holds a part of {len(numbers)} particles (with "
-                f"number {numbers[0]}), and it is pushed on for ever; let a leader hold it",
-                ("leaders",),
-            ) from None
-
-    def _numbers(self, stage: _Stage, unknowns: Indices | None) -> Indices:
-        size = len(self._operator.followers) * len(stage.axes)
-        every = np.arange(size) if unknowns is None else unknowns
-        return np.unique(self._operator.followers[every // len(stage.axes)]) + 1
+    def _named(self, stage: _Stage, unknowns: Indices) -> str:
+        numbers = np.unique(self._operator.followers[unknowns // len(stage.axes)]) + 1
+        return f"{len(numbers)} particles (with number {numbers[0]})"
 
     def _following(self, first: int) -> _Stage:
         """The stage of the other axis; it shares the solvers of the first where both are alike."""
         other, led = 1 - first, self._operator.couplings_led
         coupled = self._both.couples(other, first)
-        into = _sparse_or_dense(self._both.between(other, first)) if coupled else None
+        into = self._both.entries([other], [first]).matrix() if coupled else None
         if self._both.is_isotropic() and led.is_isotropic():
-            return _Stage((other,), self._stages[0].parts, into)
-        stage = self._stage((other,))
+            return _Stage([other], self._stages[0].parts, into)
+        stage = self._stage([other])
         stage.into = into
         return stage
 
-    def _stage(self, axes: tuple[int, ...]) -> _Stage:
-        matrix = _one_minus(self._of(self._both, axes))
+    def _stage(self, axes: list[int]) -> _Stage:
+        matrix = one_minus(self._both.entries(axes).matrix())
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
         self.amplification = max(self.amplification, largest)
-        held = self._held(axes)
+        led = self._operator.couplings_led.entries(axes)
         count, label = connected(matrix, strongly=False)
-        led = np.zeros(count, bool)
-        led[label[held]] = True
-        if count and led.all():
-            return _Stage(axes, [(None, self._part(matrix, axes, None))])
+        held = np.zeros(count, bool)
+        held[label[led.rows[led.values != 0.0]]] = True
+        # What leaders move directly or not is solved together, each part that floats by itself.
+        groups = [np.flatnonzero(held[label])] if held.any() else []
         stage = _Stage(axes, [])
-        together = np.flatnonzero(led[label])
-        if len(together):
-            part = self._part(_within(matrix, together), axes, together)
-            stage.parts.append((together, part))
-        for n in np.flatnonzero(~led):
-            unknowns = np.flatnonzero(label == n)
-            stage.parts.append((unknowns, self._floating(matrix, axes, unknowns)))
+        for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held)]:
+            part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
+            stage.parts.append((some, part))
         return stage
 
-    def _part(self, matrix: Any, axes: tuple[int, ...], unknowns: Indices | None) -> Part:
+    def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
         """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
-        kernel = places = None
-        if len(axes) == 2:
-            some = slice(None) if unknowns is None else unknowns
-            kernel, places = (v[some] for v in (self._rigid_modes(), self._X.repeat(2, axis=0)))
-        try:
-            part = Held(matrix, self._method, kernel, self._watch, places)
-            if part.conditioned:
-                return part
-        except np.linalg.LinAlgError:
-            pass
-        every = np.arange(matrix.shape[0]) if unknowns is None else unknowns
-        return Floating(matrix, self._looking_back(axes, every))
-
-    def _floating(self, matrix: Any, axes: tuple[int, ...], unknowns: Indices) -> Part:
-        return Floating(_within(matrix, unknowns), self._looking_back(axes, unknowns))
-
-    def _looking_back(self, axes: tuple[int, ...], unknowns: Indices) -> Any:
+        if held:
+            kernel = self._rigid_modes()[some] if len(axes) == 2 else None
+            with suppress(np.linalg.LinAlgError):
+                return Held(matrix, self._method, kernel, self._watch)
         before = self._operator.couplings_before
-        if not before.parts:
-            return None
-        return _within(self._of(before, axes), unknowns)
-
-    def _of(self, couplings: Couplings, axes: tuple[int, ...]) -> Any:
-        entries = couplings.entries() if len(axes) == 2 else couplings.between(axes[0], axes[0])
-        return _sparse_or_dense(entries)
-
-    def _held(self, axes: tuple[int, ...]) -> Indices:
-        """The unknowns that a leader moves directly."""
-        led = self._operator.couplings_led
-        entries = led.entries() if len(axes) == 2 else led.between(axes[0], axes[0])
-        return np.unique(entries.rows[entries.values != 0.0])
+        back = _within(before.entries(axes).matrix(), some) if before.parts else None
+        return Floating(matrix, back, self._watch)
 
     def _rigid_modes(self) -> Floats:
         """(unknown, mode): two translations and a rotation."""
@@ -233,17 +196,5 @@ class System:
         return modes / max(1.0, float(np.abs(centred).max()))
 
 
-def _sparse_or_dense(entries: Any) -> Any:
-    return entries.matrix() if entries.shape[1] <= DENSE else entries.sparse()
-
-
-def _one_minus(matrix: Any) -> Any:
-    if isinstance(matrix, np.ndarray):
-        return np.eye(len(matrix)) - matrix
-    from scipy.sparse import eye_array
-
-    return (eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
-
-
 def _within(matrix: Any, unknowns: Indices) -> Any:
-    return matrix[unknowns][:, unknowns]
+    return matrix if len(unknowns) == matrix.shape[0] else matrix[unknowns][:, unknowns]

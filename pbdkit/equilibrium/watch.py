@@ -9,22 +9,14 @@ class StoppedError(Exception):
     """The run, or the search for an equilibrium, was asked to stop."""
 
 
-def _never() -> bool:
-    return False
-
-
-def _nothing(what: str, share: float) -> None:
-    pass
-
-
 class Watch:
     """Tells `show` what is being done and which share of it is, and asks `stopping` whether to go
     on. `load` names the increment of load, where there are several."""
 
     def __init__(
         self,
-        stopping: Callable[[], bool] = _never,
-        show: Callable[[str, float], None] = _nothing,
+        stopping: Callable[[], bool] = lambda: False,
+        show: Callable[[str, float], None] = lambda what, share: None,
     ) -> None:
         self.load, self._what = "", ""
         self.stopping, self._show = stopping, show

@@ -9,8 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.composition import linearised
-from pbdkit.analysis.stencil import NOWHERE, Stencil, move
+from pbdkit.analysis.stencil import NOWHERE, Stencil, linearised, move
 from pbdkit.interfaces import Here, Slot
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.scene import Scene, body_box

@@ -56,6 +56,11 @@ class Scene:
         return self.experiment.fracture.can_break
 
     @property
+    def lag(self) -> int:
+        """By how many steps the frame trails whom it follows."""
+        return self.frame.map.lag if self.frame else 0
+
+    @property
     def axes(self) -> int:
         """How many axes space has: the lattice says so."""
         return len(self.raster.lattice.cell().vectors)
@@ -138,8 +143,7 @@ def _build(experiment: Experiment) -> Scene:
 
 def with_inner(scene: Scene) -> Scene:
     """The scene with that of its inner rule, where the rule works on the moves of another."""
-    lags = scene.frame is not None and scene.frame.map.lag == 1
-    inner = inner_experiment(scene.experiment, lags=lags)
+    inner = inner_experiment(scene.experiment, lags=scene.lag > 0)
     if inner is None:
         return scene
     constants = ask_for_constants(inner, setting_of(scene.raster, scene.neighbourhood))
