@@ -18,7 +18,7 @@ from pbdkit.interfaces import (
     Softens,
     Vector,
 )
-from pbdkit.interfaces.answers import as_vector
+from pbdkit.interfaces.component import as_vector
 from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
