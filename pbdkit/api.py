@@ -14,9 +14,8 @@ from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
-from pbdkit.experiment.source import Source
+from pbdkit.experiment.source import Source, with_setting
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.progress import progress_bar

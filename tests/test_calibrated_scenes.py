@@ -5,7 +5,7 @@ from typing import Literal
 import pytest
 
 import pbdkit
-from pbdkit.components.strain_gradient import StrainGradient
+from pbdkit.components.elasticity import StrainGradient
 from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 

@@ -19,8 +19,8 @@ from pbdkit.components.rules import (
     DistanceWeighted,
     MeanDisplacement,
     MixedCoordinate,
+    Springs,
 )
-from pbdkit.components.springs import Springs
 from pbdkit.components.strain_fracture import StrainFracture
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting

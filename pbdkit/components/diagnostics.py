@@ -169,10 +169,9 @@ class CrackPath(Diagnostic):
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """A row a broken bond."""
         bonds = now.bonds()
-        order = breaking_order(bonds.broken_step, bonds.broken_strain)
-        return order, *(
-            values[order] for values in (bonds.broken_step, bonds.broken_strain, bonds.midpoint)
-        )
+        step, strain = bonds.broken_step, bonds.broken_strain
+        order = breaking_order(step, strain)
+        return order, step[order], strain[order], bonds.midpoint[order]
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:

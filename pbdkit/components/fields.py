@@ -98,11 +98,7 @@ class Stress(Diagnostic):
         """(xx, yy, xy)."""
         c, E = now.forces.stiffness, self.youngs_modulus
         xx, yy, xy = strain(now.cells.gradient(), self.measure_)
-        return (
-            E * (c.xx * xx + c.xy * yy),
-            E * (c.xy * xx + c.yy * yy),
-            E * (2 * c.shear * xy),
-        )
+        return E * (c.xx * xx + c.xy * yy), E * (c.xy * xx + c.yy * yy), E * (2 * c.shear * xy)
 
 
 def strain(H: Floats, measure: Measure) -> tuple[Floats, Floats, Floats]:

@@ -1,20 +1,25 @@
-"""Frames that copy or mirror the body particles next to them (model.md, section 7)."""
+"""Frames that copy, mirror or balance (model.md, section 7), and bodies without one."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Anchors, FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import Anchors, FrameMap, FramePolicy, FrameSites, Stiffness
+from pbdkit.interfaces.rule import material_of
+
+NEGLIGIBLE = 1e-17
+"""Weights below this, of body particles far along an edge, are left out."""
+COLUMNS = 256
+"""To how many displacements of the body the frame's answers are held at once."""
 
 
-class NoFrame(FramePolicy):
-    """No frame: neighbours outside the body are missing."""
-
-    type: Literal["none"] = "none"
+class Frameless(FramePolicy):
+    """Common to bodies without frame points."""
 
     def depth(self, reach: int) -> int:
         """No layer."""
@@ -24,6 +29,12 @@ class NoFrame(FramePolicy):
         """Nothing follows."""
         nothing = np.empty(0, np.intp)
         return FrameMap(nothing, nothing, np.empty(0))
+
+
+class NoFrame(Frameless):
+    """No frame: neighbours outside the body are missing."""
+
+    type: Literal["none"] = "none"
 
 
 class LayeredFrame(FramePolicy):
@@ -39,10 +50,7 @@ class LayeredFrame(FramePolicy):
 
 
 class CopyingFrame(LayeredFrame):
-    """Common to the frames that copy the body particles nearest to them.
-
-    With `lag` 1 they copy the displacements of the step before.
-    """
+    """Common to the frames that copy the body particles nearest to them."""
 
     lag: Annotated[int, Field(ge=0, le=1)] = Field(
         0, description="1 copies the displacements of the step before.", examples=[1]
@@ -87,14 +95,156 @@ class MirrorFrame(Anchors, LayeredFrame):
         a, b = frame.cell.vectors
         if frame.cell.period != (1, 1) or a.y != 0.0 or b.x != 0.0:
             raise ExperimentError("a mirror frame needs a square or rectangular lattice")
-        low, high = np.array(frame.low), np.array(frame.high)
-        outside = (frame.site < low) | (frame.site > high)
-        mirrored = np.where(frame.site < low, 2 * low - frame.site, frame.site)
-        mirrored = np.where(frame.site > high, 2 * high - frame.site, mirrored)
-        body = frame.body_at(mirrored)
+        edge = np.clip(frame.site, frame.low, frame.high)
+        outside, body = frame.site != edge, frame.body_at(2 * edge - frame.site)
         if (body < 0).any() or not outside.any(axis=1).all():
             raise ExperimentError(
                 "a mirror frame needs a body that fills a rectangle of sites wider than the frame"
             )
         flips = np.where(outside, -1.0, 1.0)
         return FrameMap(np.arange(len(body)), body, flips[:, :, None] * np.eye(2))
+
+
+class Natural(Frameless):
+    """No frame: the body is the lattice's cells, and what is not there is dropped.
+
+    Cells that the outline cuts count with the share of their area inside, and all their corners are
+    particles of the body, so that curved bodies converge at second order. Edges are free of stress.
+    """
+
+    type: Literal["natural"] = "natural"
+
+    weighs_cells: ClassVar[bool] = True
+    edges_are_free: ClassVar[bool] = True
+
+
+class TractionFree(FramePolicy):
+    """One layer of points that stand where no traction crosses the edge, half a cell outside the
+    outermost particles, for bodies that fill a rectangle of a square or rectangular lattice.
+
+    Above the upper edge, with the spacings a and b: u_g = u_f - b ∂v/∂x and
+    v_g = v_f - (xy/yy) b ∂u/∂x of the rule's stiffness (ν for an isotropic one in plane stress),
+    ∂/∂x being the central difference along the edge, the mean of both rows (one-sided where the
+    edge ends); other edges likewise, corners by extrapolation. Rotation, tension with free
+    contraction and pure bending are exact.
+    """
+
+    type: Literal["traction-free"] = "traction-free"
+
+    edges_are_free: ClassVar[bool] = True
+
+    def depth(self, reach: int) -> int:
+        """One layer."""
+        return 1
+
+    def follow(self, frame: FrameSites) -> FrameMap:
+        """The points depend on one another along the edge: the map is what their equations make of
+        a displacement of each body particle."""
+        stiffness = material_of(frame.rule)
+        if stiffness is None:
+            raise ExperimentError(
+                f"'{self.type}' needs a rule that is calibrated to a material ('elastic', "
+                f"'orthotropic'), which '{frame.rule.type}' is not"
+            )
+        equations = _Equations(frame)
+        equations.balance_edges(stiffness)
+        equations.extrapolate_corners()
+        return equations.solved()
+
+
+class _Equations:
+    """A g = B f for the displacements g of the points and f of the body particles next to them;
+    unknown 2n is x of the n-th, 2n + 1 its y."""
+
+    def __init__(self, frame: FrameSites) -> None:
+        self._frame = frame
+        a, b = frame.cell.vectors
+        low, high = np.array(frame.low), np.array(frame.high)
+        self._site, self._spacings = frame.site, (a.x, b.y)
+        self._beyond = (frame.site > high).astype(int) - (frame.site < low)
+        self._point = np.full(high - low + 3, -1)
+        if (
+            frame.cell.period != (1, 1)
+            or a.y != 0.0
+            or b.x != 0.0
+            or not self._beyond.any(axis=1).all()
+            or len(frame.site) != 2 * (high - low + 1).sum() + 4
+        ):
+            raise ExperimentError(
+                "a traction-free frame needs a body that fills a rectangle of sites of a square or "
+                "rectangular lattice; 'natural' takes every body"
+            )
+        self._first = low - 1
+        self._point[tuple((frame.site - self._first).T)] = np.arange(len(frame.site))
+        self._A: list[tuple[Any, Any, Any]] = []
+        self._B: list[tuple[Any, Any, Any]] = []
+        for axis in (0, 1):
+            self._add(np.arange(len(frame.site)), axis, frame.site, axis, 1.0)
+
+    def balance_edges(self, c: Stiffness) -> None:
+        """No shear and no tension across the edges."""
+        for along, contraction in ((0, c.xy / c.yy), (1, c.xy / c.xx)):
+            across = 1 - along
+            points = np.flatnonzero((self._beyond[:, across] != 0) & (self._beyond[:, along] == 0))
+            side, step = self._beyond[points, across], np.eye(2, dtype=int)[along]
+            inner = self._site[points] - side[:, None] * np.eye(2, dtype=int)[across]
+            slope = side * self._spacings[across] / (2 * self._spacings[along])
+            for axis in (0, 1):
+                self._add(points, axis, inner, axis, -1.0)
+            for some, steps in self._differences(self._site[points, along], along):
+                for n, weight in steps.items():
+                    for row in (self._site[points], inner):
+                        there, factor = row[some] + n * step, weight * slope[some]
+                        self._add(points[some], along, there, across, factor)
+                        self._add(points[some], across, there, along, contraction * factor)
+
+    def _differences(self, site: Any, along: int) -> Iterator[tuple[Any, dict[int, float]]]:
+        """Which sites take which difference along the edge, as weights by step: the central one,
+        and where the edge ends the one that is exact for parabolas."""
+        low, high = self._first[along] + 1, self._first[along] + self._point.shape[along] - 2
+        ends = {0: -1.5, 1: 2.0, 2: -0.5} if high - low > 1 else {0: -1.0, 1: 1.0}
+        if high > low:
+            yield (site > low) & (site < high), {-1: -0.5, 1: 0.5}
+            yield site == low, ends
+            yield site == high, {-n: -weight for n, weight in ends.items()}
+
+    def extrapolate_corners(self) -> None:
+        """A corner completes the parallelogram of the three sites next to it."""
+        points = np.flatnonzero(self._beyond.all(axis=1))
+        site, beyond = self._site[points], self._beyond[points]
+        for back, factor in (([1, 0], -1.0), ([0, 1], -1.0), ([1, 1], 1.0)):
+            for axis in (0, 1):
+                self._add(points, axis, site - beyond * back, axis, factor)
+
+    def solved(self) -> FrameMap:
+        """The points' weights of the body particles."""
+        from scipy.sparse import coo_array, vstack
+        from scipy.sparse.linalg import splu
+
+        size = 2 * len(self._site)
+        row, column, value = (np.concatenate(part) for part in zip(*self._A, strict=True))
+        A = coo_array((value, (row, column)), (size, size)).tocsc()
+        row, column, value = (np.concatenate(part) for part in zip(*self._B, strict=True))
+        body, column = np.unique(column, return_inverse=True)
+        B = coo_array((value, (row, column)), (size, len(body))).tocsc()
+        inverse, parts = splu(A), []
+        for first in range(0, len(body), COLUMNS):
+            answers = inverse.solve(B[:, first : first + COLUMNS].toarray())
+            answers[np.abs(answers) < NEGLIGIBLE] = 0.0
+            parts.append(coo_array(answers.T))
+        found = vstack(parts).T.tocoo()
+        point, body = found.row, body[found.col]
+        places = np.stack([point // 2, body // 2])
+        (points, bodies), entry = np.unique(places, axis=1, return_inverse=True)
+        weight = np.zeros((len(points), 2, 2))
+        weight[entry.ravel(), point % 2, body % 2] = found.data
+        return FrameMap(points, bodies, weight)
+
+    def _add(self, points: Any, row: int, site: Any, axis: int, factor: Any) -> None:
+        """Adds factor · (component `axis` at some sites) to the equations `row` of some points."""
+        factor = np.broadcast_to(factor, points.shape)
+        point = self._point[tuple((site - self._first).T)]
+        ours = point >= 0
+        self._A.append((2 * points[ours] + row, 2 * point[ours] + axis, factor[ours]))
+        body = self._frame.body_at(site[~ours].astype(np.int32))
+        self._B.append((2 * points[~ours] + row, 2 * body + axis, -factor[~ours]))

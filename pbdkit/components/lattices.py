@@ -54,9 +54,8 @@ class Oblique(Lattice):
     def cell(self) -> Cell:
         """One site."""
         angle = math.radians(self.angle)
-        return Cell(
-            (Vector(self.a, 0.0), Vector(self.b * math.cos(angle), self.b * math.sin(angle)))
-        )
+        slanted = Vector(self.b * math.cos(angle), self.b * math.sin(angle))
+        return Cell((Vector(self.a, 0.0), slanted))
 
 
 class CentredRectangular(Lattice):

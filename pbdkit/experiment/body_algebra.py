@@ -13,11 +13,20 @@ from pbdkit.experiment.outlines import Disc, Dogbone, Polygon, Rectangle, Ring
 from pbdkit.experiment.parts import closed_part
 
 
-class Union(Body):
+class Composed(Body):
+    """Common to the bodies that are made of others."""
+
+    of: Bodies
+
+    def exaggerates(self) -> bool:
+        """Where a part does."""
+        return any(part.exaggerates() for part in self.of)
+
+
+class Union(Composed):
     """All that lies in one of its parts."""
 
     type: Literal["union"] = "union"
-    of: Bodies
 
     def boxes(self) -> list[Box]:
         """Those of all parts."""
@@ -27,16 +36,11 @@ class Union(Body):
         """The smallest."""
         return reduce(np.minimum, (part.distance(at) for part in self.of))
 
-    def exaggerates(self) -> bool:
-        """Where a part does."""
-        return any(part.exaggerates() for part in self.of)
 
-
-class Intersection(Body):
+class Intersection(Composed):
     """All that lies in every part."""
 
     type: Literal["intersection"] = "intersection"
-    of: Bodies
 
     def boxes(self) -> list[Box]:
         """A grid's own where a part is one; else what the boxes of all parts share."""
@@ -53,16 +57,11 @@ class Intersection(Body):
         """The largest."""
         return reduce(np.maximum, (part.distance(at) for part in self.of))
 
-    def exaggerates(self) -> bool:
-        """Where a part does."""
-        return any(part.exaggerates() for part in self.of)
 
-
-class Difference(Body):
+class Difference(Composed):
     """The first part less the others; sites on the outline of what is cut out stay."""
 
     type: Literal["difference"] = "difference"
-    of: Bodies
 
     def boxes(self) -> list[Box]:
         """Those of the first part."""
@@ -72,10 +71,6 @@ class Difference(Body):
         """The largest of the first distance and the others' negatives."""
         first, *others = (part.distance(at) for part in self.of)
         return reduce(np.maximum, (-other for other in others), first)
-
-    def exaggerates(self) -> bool:
-        """Where a part does."""
-        return any(part.exaggerates() for part in self.of)
 
 
 def _hull(boxes: list[Box]) -> Box:
@@ -92,5 +87,5 @@ AnyBody = Annotated[
     ),
 ]
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]
-for _composed in (Union, Intersection, Difference):
+for _composed in (Composed, Union, Intersection, Difference):
     _composed.model_rebuild()

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny
 
@@ -13,6 +14,7 @@ from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
 
 Floats = NDArray[np.floating[Any]]
+Flags = NDArray[np.bool_]
 Share = Annotated[float, Field(ge=-1e100, le=1e100)]
 Shares = Annotated[tuple[Share, Share], Field(strict=False)]
 Gradient = Annotated[tuple[Shares, Shares], Field(strict=False)]
@@ -25,9 +27,7 @@ class Initial(Component):
     """Whether everything starts where it rests; `displacement` is then not asked."""
 
     @abstractmethod
-    def displacement(
-        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
         """u of the body particles at X, (particle, axis), in the order of their numbers; `leads`
         marks the leaders of step 1."""
 
@@ -39,9 +39,7 @@ class Reference(Initial):
 
     at_rest: ClassVar[bool] = True
 
-    def displacement(
-        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
         """Zeros."""
         return np.zeros_like(X)
 
@@ -53,9 +51,7 @@ class Noise(Initial):
     type: Literal["noise"] = "noise"
     amplitude: Annotated[float, Field(ge=0.0, le=1e100)]
 
-    def displacement(
-        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
         """Uniform in [-amplitude, amplitude)."""
         drawn = generator.uniform(-self.amplitude, self.amplitude, X.shape)
         return np.where(leads[:, None], 0.0, drawn)
@@ -68,9 +64,7 @@ class Affine(Initial):
     gradient: Gradient
     shift: Shares = (0.0, 0.0)
 
-    def displacement(
-        self, X: Floats, leads: NDArray[np.bool_], generator: np.random.Generator
-    ) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
         """u_a = Σ_b gradient[a][b] X_b + shift_a."""
         (xx, xy), (yx, yy) = self.gradient
         x, y = X.T

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from bisect import bisect_left
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ Steps = Annotated[int, Field(ge=1, le=2**62)]
 class Motion(Component):
     """A prescribed motion, counted from the position at which it starts."""
 
+    rests: ClassVar[bool] = True
+    """Whether the motion ends, at the last of its knots."""
+
     @abstractmethod
     def offset(self, n: int, start: Floats) -> Floats:
         """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1.
@@ -30,12 +33,12 @@ class Motion(Component):
         """
 
     @abstractmethod
-    def rests_after(self) -> int | None:
-        """The step n from which on the offset stays as it is; None where it never does."""
-
-    @abstractmethod
     def knots(self) -> tuple[int, ...]:
         """The steps n between which, and after which, the offset changes as one formula in n."""
+
+    def rests_after(self) -> int | None:
+        """The step n from which on the offset stays as it is; None where it never does."""
+        return max((1, *self.knots())) if self.rests else None
 
 
 class Hold(Motion):
@@ -46,10 +49,6 @@ class Hold(Motion):
     def offset(self, n: int, start: Floats) -> Floats:
         """None."""
         return np.zeros(start.shape[1])
-
-    def rests_after(self) -> int:
-        """At once."""
-        return 1
 
     def knots(self) -> tuple[int, ...]:
         """None."""
@@ -67,10 +66,6 @@ class Velocity(Motion):
         """velocity · min(n, steps)."""
         return np.array(self.velocity) * min(n, self.steps)
 
-    def rests_after(self) -> int:
-        """The last of its steps."""
-        return self.steps
-
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
         return (self.steps,)
@@ -85,10 +80,6 @@ class Displace(Motion):
     def offset(self, n: int, start: Floats) -> Floats:
         """The displacement, from the first step on."""
         return np.array(self.displacement)
-
-    def rests_after(self) -> int:
-        """The first step."""
-        return 1
 
     def knots(self) -> tuple[int, ...]:
         """The first step."""
@@ -126,10 +117,6 @@ class Path(Motion):
         ways = zip(before[1], self.displacements[after], strict=True)
         return np.array([np.interp(n, between, way) for way in ways])
 
-    def rests_after(self) -> int:
-        """The last of its steps."""
-        return self.steps[-1]
-
     def knots(self) -> tuple[int, ...]:
         """Its steps."""
         return self.steps
@@ -151,10 +138,6 @@ class Rotation(Motion):
         x, y = (np.asarray(start) - self.centre).T
         return np.stack([-less * x - sine * y, sine * x - less * y], axis=-1)
 
-    def rests_after(self) -> int:
-        """The last of its steps."""
-        return self.steps
-
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
         return (self.steps,)
@@ -164,15 +147,13 @@ class Oscillation(Motion):
     """Swings about its start: amplitude · sin(2πn / period), for ever."""
 
     type: Literal["oscillation"] = "oscillation"
+    rests: ClassVar[bool] = False
     amplitude: Pair
     period: Annotated[float, Field(ge=1e-6, le=1e12)]
 
     def offset(self, n: int, start: Floats) -> Floats:
         """amplitude · sin(2πn / period)."""
         return np.array(self.amplitude) * math.sin(2 * math.pi * n / self.period)
-
-    def rests_after(self) -> None:
-        """Never."""
 
     def knots(self) -> tuple[int, ...]:
         """None: it swings for ever."""

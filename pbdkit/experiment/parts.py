@@ -56,16 +56,12 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if fault["type"] == "value_error":
         return where, message
     message = _LONG.sub(lambda number: f"{_bound(context):g}", message)
-    hint = ""
-    if (
-        fault["type"] == "int_type"
-        and isinstance(fault["input"], float)
-        and fault["input"] % 1 == 0
-    ):
-        hint = f"; write {int(fault['input'])}"
-    if fault["type"] == "literal_error" and isinstance(fault["input"], str):
-        hint = did_you_mean(fault["input"], re.findall(r"'([^']*)'", context["expected"]))
-    return where, f"{message}, got {brief(fault['input'])}{hint}"
+    hint, given = "", fault["input"]
+    if fault["type"] == "int_type" and isinstance(given, float) and given % 1 == 0:
+        hint = f"; write {int(given)}"
+    if fault["type"] == "literal_error" and isinstance(given, str):
+        hint = did_you_mean(given, re.findall(r"'([^']*)'", context["expected"]))
+    return where, f"{message}, got {brief(given)}{hint}"
 
 
 def _bound(context: Any) -> float:
@@ -94,9 +90,8 @@ def open_part(interface: type[Component]) -> BeforeValidator:
         try:
             part.model_dump_json()
         except (Exception, SystemExit) as error:
-            raise _blame(
-                type(part), "when written as JSON, as datasets keep it", error, info
-            ) from error
+            when = "when written as JSON, as datasets keep it"
+            raise _blame(type(part), when, error, info) from error
         return part
 
     return BeforeValidator(build)

@@ -6,8 +6,9 @@ keys and tags are what makes YAML dangerous, and an experiment needs none of the
 
 from __future__ import annotations
 
+import copy
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -175,11 +176,8 @@ class _Reading:
 
     def _inner(self) -> Iterator[Any]:
         """The events in a collection, up to its end; whoever takes one takes what is in it too."""
-        return iter(lambda: self._unless_end(next(self._events)), None)
-
-    @staticmethod
-    def _unless_end(event: Any) -> Any:
-        return None if isinstance(event, CollectionEndEvent) else event
+        while not isinstance(event := next(self._events), CollectionEndEvent):
+            yield event
 
     def _place(self, event: Any) -> str:
         mark = event.start_mark
@@ -194,3 +192,55 @@ def _syntax_error(error: YAMLError, name: str) -> ExperimentError:
     place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
     what = getattr(error, "problem", None) or str(error).splitlines()[0]
     return ExperimentError(f"{place}: not valid YAML: {what}")
+
+
+LONGEST = 80
+"""So many characters of a setting are repeated in messages."""
+
+
+def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> Source:
+    """A copy of the source with one value set.
+
+    `setting` is ``path=value`` with a dotted path, list positions from 0 and a YAML value. A part
+    that the file leaves out starts from its entry in `defaults`.
+    """
+    label = f"--set {setting if len(setting) <= LONGEST else setting[:LONGEST] + '...'}"
+    path, equals, value = setting.partition("=")
+    if not equals or not path:
+        raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
+    where = _parsed(path)
+    changed = Source(source.name, copy.deepcopy(source.data), dict(source.places))
+    _place(changed.data, where, read_value(value, label), label, defaults)
+    for known in [k for k in changed.places if k[: len(where)] == where]:
+        del changed.places[known]
+    for depth in range(1, len(where) + 1):
+        changed.places.setdefault(where[:depth], label)
+    return changed
+
+
+def _parsed(path: str) -> Where:
+    parts = path.split(".")
+    return tuple(int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in parts)
+
+
+def _place(data: Any, where: Where, value: Any, label: str, defaults: Mapping[str, Any]) -> None:
+    *parents, last = where
+    for depth, part in enumerate(parents):
+        if isinstance(data, dict) and part not in data:
+            data[part] = copy.deepcopy(defaults.get(str(part), {})) if depth == 0 else {}
+        data = _entry(data, part, label)
+    if isinstance(data, dict):
+        data[str(last)] = value
+    else:
+        _entry(data, last, label)
+        data[last] = value
+
+
+def _entry(data: Any, part: str | int, label: str) -> Any:
+    if isinstance(data, dict):
+        return data[part if part in data else str(part)]
+    if not isinstance(data, list):
+        raise ExperimentError(f"{label}: '{part}' is looked for in a single value")
+    if not isinstance(part, int) or part >= len(data):
+        raise ExperimentError(f"{label}: '{part}' is no position in a list of {len(data)}, from 0")
+    return data[part]

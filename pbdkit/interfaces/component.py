@@ -1,4 +1,4 @@
-"""The nearest right name for a misspelt one."""
+"""What every component is, and what its functions may return."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from abc import ABC
 from collections.abc import Iterable
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import printable
+from pbdkit.interfaces.vector import Components
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -95,3 +97,39 @@ class Component(Strict, ABC):
         """The parameters that are numbers or switches, as they reach elementwise functions."""
         values: dict[str, Any] = {name: getattr(self, name) for name in type(self).model_fields}
         return {k: v for k, v in values.items() if isinstance(v, (int, float))}
+
+
+class AnswerError(TypeError):
+    """A function returned something of another kind; the text says what to return."""
+
+
+def as_vector(answer: Any, what: str, like: Any) -> Any:
+    """The answer of the function `what`; AnswerError where it is no vector of as many components as
+    another."""
+    if type(answer) is not type(like):
+        names = ", ".join(type(like)._fields)
+        raise AnswerError(
+            f"`{what}` returned {_kind(answer)}: return a vector, as "
+            f"`pbdkit.{_kind(like)}({names})`"
+        )
+    return answer
+
+
+def as_verdict(answer: Any) -> Any:
+    """The answer of `breaks`; AnswerError where it is neither yes nor no."""
+    if (dtype := np.asarray(answer).dtype).kind != "b":
+        what = "None" if answer is None else dtype
+        raise AnswerError(f"`breaks` returned {what}: compare, as in `... > c.limit`")
+    return answer
+
+
+def as_values(answer: Any, what: str) -> tuple[Any, ...]:
+    """The answer of a function that gives any number of values; AnswerError where it is one, as
+    where the comma of ``(value,)`` is forgotten."""
+    if isinstance(answer, Components) or not isinstance(answer, (tuple, list)):
+        raise AnswerError(f"`{what}` returned {_kind(answer)}, not a tuple: write `(value,)`")
+    return tuple(answer)
+
+
+def _kind(answer: Any) -> str:
+    return "None" if answer is None else type(answer).__name__

@@ -9,8 +9,7 @@ from importlib.metadata import entry_points
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.interfaces.answers import AnswerError
-from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.component import AnswerError, did_you_mean
 from pbdkit.registry.discovery import GROUP
 
 LONGEST = 400

@@ -52,14 +52,8 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
                 f"'{min(twice)}': leave one out"
             )
     of_particle = tuple(number.name for number in particle_numbers(experiment))
-    return SceneConstants(
-        of_rule,
-        weights,
-        of_fracture,
-        limits,
-        _kind("Constants", (*names, *own)),
-        _kind("Own", of_particle),
-    )
+    kinds = _kind("Constants", (*names, *own)), _kind("Own", of_particle)
+    return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:

@@ -7,7 +7,7 @@ from collections import Counter
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Diagnostic, FollowerRule, FractureModel, Remembered, Remembers
-from pbdkit.interfaces.answers import as_values
+from pbdkit.interfaces.component import as_values
 from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.cells import patches

@@ -29,7 +29,8 @@ class Frame:
     def follow(self, body: Floats, out: Floats) -> None:
         """Writes the frame's displacements into `out`; both are (axis, flat place)."""
         u = body[:, self.body_place]
-        weighted = self.map.weight * u if self.map.weight.ndim == 1 else _turned(self.map.weight, u)
+        weight = self.map.weight
+        weighted = weight * u if weight.ndim == 1 else np.einsum("eab,be->ae", weight, u)
         for plane, values in zip(out, weighted, strict=True):
             plane[self.place] = np.bincount(self.map.point, values, len(self.place))
 
@@ -58,20 +59,13 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     if not len(rows):
         return None
     inside = raster.site_of(raster.body_rows)
-    return RasterFrame(
-        raster,
-        rows,
-        raster.lattice.cell(),
-        raster.site_of(rows).astype(np.int32),
-        tuple(inside.min(axis=0).tolist()),
-        tuple(inside.max(axis=0).tolist()),
-        rule,
-    )
+    low, high = (tuple(end.tolist()) for end in (inside.min(axis=0), inside.max(axis=0)))
+    site = raster.site_of(rows).astype(np.int32)
+    return RasterFrame(raster, rows, raster.lattice.cell(), site, low, high, rule)
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
-    entries = len(follow.point)
-    axes = raster.sites.ndim
+    entries, axes = len(follow.point), raster.sites.ndim
     shapes = [(entries,), (entries, axes, axes)]
     if len(follow.body) != entries or np.shape(follow.weight) not in shapes:
         raise ExperimentError(
@@ -117,12 +111,11 @@ class RasterFrame(FrameSites):
         return point[order], body[order]
 
     def _nearest_of(self, sublattice: int, points: Indices) -> tuple[Indices, Indices]:
-        cell = self.raster.lattice.cell()
         nearest = np.full(len(points), np.inf)
-        searched, radius = 0.0, max(math.hypot(*v) for v in cell.vectors)
+        searched, radius = 0.0, max(math.hypot(*v) for v in self.cell.vectors)
         pairs = []
         while (_with_ties(nearest) > searched).any():
-            for offset in cell.offsets(sublattice, radius):
+            for offset in self.cell.offsets(sublattice, radius):
                 if offset.length > searched:
                     pairs.append(self._met_at(offset, points, nearest))
             searched, radius = radius, radius * 1.5
@@ -141,12 +134,6 @@ class RasterFrame(FrameSites):
         open_, there = open_[met], there[:, met]
         nearest[open_] = np.minimum(nearest[open_], offset.length)
         return points[open_], self.raster.rows_at(np.full(len(open_), offset.target), *there)
-
-
-def _turned(matrices: Floats, u: Floats) -> Floats:
-    """matrix · u for every entry, (axis, entry)."""
-    turned: Floats = np.einsum("eab,be->ae", matrices, u)
-    return turned
 
 
 def _with_ties(distance: Floats) -> Floats:

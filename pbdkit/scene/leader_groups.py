@@ -113,11 +113,8 @@ class Selecting:
 
     def far(self, points: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
         """The points that lie outside the body by more than the cell is wide."""
-        vectors = self.raster.lattice.cell().vectors
-        width = max(math.hypot(*v) for v in vectors)
-        for point in points:
-            if not np.hypot(*(self._x - point).T).min() <= width:
-                yield point
+        width = max(math.hypot(*v) for v in self.raster.lattice.cell().vectors)
+        return (p for p in points if not np.hypot(*(self._x - p).T).min() <= width)
 
     @cached_property
     def _x(self) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Cell, Components, Setting
+from pbdkit.interfaces import AppliesTwice, Cell, Components, Remembers, Setting
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
@@ -22,7 +22,6 @@ from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.nested import inner_experiment
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.sites import Mask, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
@@ -218,3 +217,30 @@ def _edge_effects(experiment: Experiment) -> list[str]:
         "(copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); take "
         "{type: natural} or {type: traction-free}"
     ]
+
+
+def inner_experiment(experiment: Experiment, *, lags: bool) -> Experiment | None:
+    """The same experiment with the rule's inner rule; None for rules that have none.
+
+    Raises ExperimentError for frames that `lags`, for bonds that break, neighbours that come and go
+    and rules that remember: what the moves of the inner rule are is not told there.
+    """
+    rule = experiment.rule
+    if not isinstance(rule, AppliesTwice):
+        return None
+    with blaming(rule, "when asked for its inner rule", "rule"):
+        inner = rule.inner()
+    remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
+    for unfit, part, remedy in (
+        (lags, "frame", "lag: 0"),
+        (experiment.fracture.can_break, "fracture", "{type: none}"),
+        (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
+        (remembers, "rule", "one that remembers nothing"),
+    ):
+        if unfit:
+            raise ExperimentError(
+                f"'{rule.type}' applies a rule to the moves of another, which does not go with "
+                f"this {part}; take {part}: {remedy}",
+                (part,),
+            )
+    return experiment.model_copy(update={"rule": inner})

@@ -94,25 +94,18 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     bonds, own = bond_numbers(experiment), particle_numbers(experiment)
     records = experiment.recording.count(experiment.steps)
     recorded = np.dtype(experiment.record.dtype).itemsize
-    entries = {
-        stepped: sum(
-            _bytes_an_entry(d, particles, recorded)
-            for d in experiment.diagnostics
-            if d.every_step == stepped and not d.at_end
-        )
-        for stepped in (False, True)
-    }
-    per_record, every_step = particles * (2 * recorded + 1) + entries[False], entries[True]
+    per_record, every_step = particles * (2 * recorded + 1), 0
+    for diagnostic in experiment.diagnostics:
+        entry = 0 if diagnostic.at_end else _bytes_an_entry(diagnostic, particles, recorded)
+        if diagnostic.every_step:
+            every_step += entry
+        else:
+            per_record += entry
     once = particles * (2 * 8 + 2 * 4 + 2 * 8)
     if experiment.shows_bonds:
         once += math.ceil(particles * planes * (2 * 8 + 1 + 12 * experiment.fracture.can_break))
-    of_bonds, of_particles = (
-        _recorded_bytes(numbers, renews, recorded)
-        for numbers, renews in (
-            (bonds, isinstance(experiment.fracture, RenewsBonds)),
-            (own, isinstance(experiment.rule, RenewsParticles)),
-        )
-    )
+    of_bonds = _recorded_bytes(bonds, isinstance(experiment.fracture, RenewsBonds), recorded)
+    of_particles = _recorded_bytes(own, isinstance(experiment.rule, RenewsParticles), recorded)
     once += math.ceil(particles * (planes * of_bonds[0] + of_particles[0]))
     per_record += math.ceil(particles * (planes * of_bonds[1] + of_particles[1]))
     return once + records * per_record + (experiment.steps + 1) * every_step

@@ -26,7 +26,7 @@ from pbdkit.interfaces import (
     StoresEnergy,
     where,
 )
-from pbdkit.interfaces.answers import as_values, as_vector, as_verdict
+from pbdkit.interfaces.component import as_values, as_vector, as_verdict
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers

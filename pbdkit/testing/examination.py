@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Component, Lattice, NeighbourMetric
-from pbdkit.interfaces.answers import AnswerError
+from pbdkit.interfaces.component import AnswerError
 from pbdkit.registry.blame import remedy
 from pbdkit.testing.properties import properties_of
 from pbdkit.testing.property import NotAskedError, Property, PropertyError

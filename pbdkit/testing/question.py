@@ -26,7 +26,7 @@ from pbdkit.interfaces import (
     RenewsParticles,
     Softens,
 )
-from pbdkit.interfaces.answers import as_vector
+from pbdkit.interfaces.component import as_vector
 from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.scene import Scene
