@@ -10,8 +10,10 @@ from finite_elements.problems import HEXAGONAL_BAR
 from scipy import sparse
 
 import pbdkit
+from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.stencil import derivative
 from pbdkit.equilibrium import linear_solver as linear
+from pbdkit.equilibrium.dissection import FEWEST, dissected
 from pbdkit.scene import cut_cells
 from pbdkit.scene.scene import build_scene
 
@@ -30,6 +32,54 @@ def plane(columns, rows, far=1):
                       (second, first, np.full(len(first), -0.9))]  # fmt: skip
     row, column, value = (np.concatenate(part) for part in zip(*found, strict=True))
     return sparse.csr_array((value, (row, column))), np.stack([i, j], axis=1) * 0.1
+
+
+@pytest.mark.parametrize("far", [1, 2])
+def test_dissection_puts_strips_last_that_nothing_leaps_over(far):
+    matrix, places = plane(60, 25, far)
+    order = dissected(matrix, places)
+    assert np.array_equal(np.sort(order), np.arange(len(places)))
+    rank = np.argsort(order)
+    # The first strip lies across the long side, in the middle: to its left and right nothing
+    # couples with what lies on the other side.
+    strip = order[-25 * far :]
+    x = places[:, 0]
+    low, high = x[strip].min(), x[strip].max()
+    assert high - low == pytest.approx(0.1 * (far - 1))
+    assert 2.5 < low < 3.5
+    left, right = np.flatnonzero(x < low - 1e-9), np.flatnonzero(x > high + 1e-9)
+    assert matrix[left][:, right].nnz == 0
+    assert rank[strip].min() > max(rank[left].max(), rank[right].max())
+
+
+def test_unknowns_of_one_place_stay_together():
+    matrix, places = plane(40, 30)
+    both = sparse.csr_array(sparse.kron(matrix, np.ones((2, 2))))
+    order = dissected(both, np.repeat(places, 2, axis=0))
+    assert np.array_equal(order[0::2] + 1, order[1::2])
+    assert np.array_equal(order[0::2] // 2, dissected(matrix, places))
+
+
+def test_few_places_and_couplings_that_reach_far_are_not_dissected():
+    assert dissected(*plane(FEWEST // 10, 10)) is None
+    matrix, places = plane(60, 25)
+    matrix = matrix.tolil()
+    matrix[0, len(places) - 1] = 0.1
+    assert dissected(matrix.tocsr(), places) is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e6], ids=["here", "far away"])
+def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
+    scene = build_scene(pbdkit.Experiment(**experiment(HEXAGONAL_BAR, 40)))
+    operator = step_operator(scene)
+    both = sparse.csr_array(sparse.eye_array(operator.now.shape[0]) - operator.now)
+    places = np.repeat(scene.raster.reference(operator.followers) + shift, 2, axis=0)
+    plain = linear.SparseLU(both, symmetric=False)
+    found = linear.SparseLU(both, symmetric=False, places=places)
+    assert found._factors.nnz < 0.7 * plain._factors.nnz
+    b = np.random.default_rng(0).normal(size=len(places))
+    for x, of in ((found.solve(b, 0.0), both), (found.solve_transposed(b, 0.0), both.T)):
+        assert np.abs(of @ x - b).max() < 1e-10
 
 
 def test_matrices_without_a_symmetric_pattern_are_told_apart():

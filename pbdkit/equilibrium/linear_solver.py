@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import DENSE
+from pbdkit.equilibrium.dissection import dissected
 from pbdkit.equilibrium.multigrid import aggregated, classical
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
@@ -69,21 +70,26 @@ class Dense(LinearSolver):
 
 
 class SparseLU(LinearSolver):
-    """SuperLU. Where the pattern is nearly symmetric, in an order that fills in little, by minimum
-    degree."""
+    """SuperLU. Where the pattern is nearly symmetric, in an order that fills in little: by nested
+    dissection where it is known where the many unknowns lie, else by minimum degree."""
 
     name = "lu"
 
-    def __init__(self, matrix: Any, symmetric: bool) -> None:
+    def __init__(self, matrix: Any, symmetric: bool, places: Floats | None = None) -> None:
         from scipy.sparse.linalg import splu
 
         how: dict[str, Any] = {}
+        self._order = None
         if symmetric:
             how = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
         elif is_nearly_symmetric(matrix):
             how = {"diag_pivot_thresh": STURDY}
         if how:
             how["permc_spec"] = "MMD_AT_PLUS_A"
+            self._order = None if places is None else dissected(matrix, places)
+        if self._order is not None:
+            how["permc_spec"] = "NATURAL"
+            matrix = matrix[self._order][:, self._order]
         try:
             self._factors = splu(matrix.tocsc(), **how)
         except RuntimeError as error:  # "Factor is exactly singular"
@@ -91,11 +97,18 @@ class SparseLU(LinearSolver):
 
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """By this method."""
-        return np.asarray(self._factors.solve(b))
+        return self._solved(b, "N")
 
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
         """By this method."""
-        return np.asarray(self._factors.solve(b, trans="T"))
+        return self._solved(b, "T")
+
+    def _solved(self, b: Floats, how: str) -> Floats:
+        if self._order is None:
+            return np.asarray(self._factors.solve(b, trans=how))
+        x = np.empty_like(b, dtype=float)
+        x[self._order] = self._factors.solve(b[self._order], trans=how)
+        return x
 
 
 class Krylov(LinearSolver):
@@ -169,13 +182,15 @@ def linear_solver(
     *,
     symmetric: bool,
     near_kernel: Floats | None = None,
+    places: Floats | None = None,
     watch: Watch | None = None,
 ) -> LinearSolver:
     """The solver for a sparse matrix by a method, or by what serves its size.
 
-    `near_kernel` (unknown, mode) are what the matrix hardly changes, for the coarser grids of
-    matrices that couple the axes. Raises LinAlgError where the matrix is found to be singular, and
-    ExperimentError where the method is not installed.
+    `places` (unknown, axis) says where the unknowns lie, those of one place next to each other:
+    then an order of elimination by them pays. `near_kernel` (unknown, mode) are what the matrix
+    hardly changes, for the coarser grids of matrices that couple the axes. Raises LinAlgError
+    where the matrix is found to be singular, and ExperimentError where the method is not installed.
     """
     size = matrix.shape[0]
     if method == "auto":
@@ -184,7 +199,7 @@ def linear_solver(
     if method == "lu":
         if size <= DENSE:
             return Dense(dense(matrix))
-        return SparseLU(matrix, symmetric)
+        return SparseLU(matrix, symmetric, places)
     if method == "conjugate-gradients":
         return Krylov(matrix, symmetric, watch or Watch())
     if find_spec("pyamg") is None:

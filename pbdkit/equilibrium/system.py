@@ -180,9 +180,11 @@ class System:
     def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
         """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
         if held:
-            kernel = self._rigid_modes()[some] if len(axes) == 2 else None
+            kernel = places = None
+            if len(axes) == 2:
+                kernel, places = self._rigid_modes()[some], self._X.repeat(2, axis=0)[some]
             with suppress(np.linalg.LinAlgError):
-                return Held(matrix, self._method, kernel, self._watch)
+                return Held(matrix, self._method, kernel, self._watch, places)
         before = self._operator.couplings_before
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
         return Floating(matrix, back, self._watch)

@@ -115,15 +115,28 @@ class Held(Part):
     """A part whose matrix has an inverse. Raises LinAlgError where it is worth nothing in double
     precision."""
 
-    def __init__(self, matrix: Any, method: str, near_kernel: Floats | None, watch: Watch) -> None:
+    def __init__(
+        self,
+        matrix: Any,
+        method: str,
+        near_kernel: Floats | None,
+        watch: Watch,
+        places: Floats | None = None,
+    ) -> None:
         if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
             from scipy.sparse import csr_array
 
             matrix = csr_array(matrix)
         self._matrix, self._symmetric = matrix, is_symmetric(matrix)
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
+        self._places = places
         solver = linear_solver(
-            matrix, method, symmetric=self._symmetric, near_kernel=near_kernel, watch=watch
+            matrix,
+            method,
+            symmetric=self._symmetric,
+            near_kernel=near_kernel,
+            places=places,
+            watch=watch,
         )
         super().__init__(matrix.shape[0], solver, watch)
         ones = np.ones(self._size)
@@ -141,7 +154,9 @@ class Held(Part):
         if isinstance(self._solver, Krylov) and self._has_choice:
             left = float(np.linalg.norm(r - self._matrix @ x))
             if not left <= 100 * accuracy * float(np.linalg.norm(r)):  # the iteration got stuck
-                self._solver = linear_solver(self._matrix, "lu", symmetric=self._symmetric)
+                self._solver = linear_solver(
+                    self._matrix, "lu", symmetric=self._symmetric, places=self._places
+                )
                 x = self._solver.solve(r, accuracy)
         return x
 
