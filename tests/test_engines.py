@@ -65,7 +65,7 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
 
 
 thoroughly = settings(
-    max_examples=150,
+    max_examples=75,
     deadline=None,
     suppress_health_check=list(HealthCheck),
 )

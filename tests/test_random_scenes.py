@@ -17,7 +17,7 @@ TOLERANCE = 1e-11
 MEASURED = ["pe1", "pe1_intact", "pe2", "u", "broken_bonds"]
 
 thoroughly = settings(
-    max_examples=300,
+    max_examples=150,
     deadline=None,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )

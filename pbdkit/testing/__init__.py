@@ -17,8 +17,9 @@ from pbdkit.testing.examination import (
     examine,
     examine_all,
 )
+from pbdkit.testing.fault import NotAskedError, PropertyError
 from pbdkit.testing.properties import PROPERTIES, properties_of
-from pbdkit.testing.property import NotAskedError, Property, PropertyError
+from pbdkit.testing.property import Property
 from pbdkit.testing.subject import examples_of
 
 __all__ = [

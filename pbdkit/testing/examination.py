@@ -14,8 +14,9 @@ from pbdkit.errors import PluginError
 from pbdkit.interfaces import Component, Lattice, NeighbourMetric
 from pbdkit.interfaces.component import AnswerError
 from pbdkit.registry.blame import remedy
+from pbdkit.testing.fault import NotAskedError, PropertyError
 from pbdkit.testing.properties import properties_of
-from pbdkit.testing.property import NotAskedError, Property, PropertyError
+from pbdkit.testing.property import Property
 from pbdkit.testing.subject import Subject, examples_of, full_name
 
 State = Literal["held", "failed", "skipped"]

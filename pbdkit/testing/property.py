@@ -15,14 +15,6 @@ if TYPE_CHECKING:
 Check = Callable[["Subject"], None]
 
 
-class PropertyError(Exception):
-    """A property does not hold; the text names the fault, and the remedy where there is one."""
-
-
-class NotAskedError(Exception):
-    """A property says nothing about this component; the text is the reason."""
-
-
 @dataclass(frozen=True)
 class Property:
     """One thing that is asked of every component of some interfaces.

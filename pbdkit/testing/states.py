@@ -28,7 +28,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.remembered_values import describe_bonds, describe_particles
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.property import NotAskedError
+from pbdkit.testing.fault import NotAskedError
 
 Floats = NDArray[np.float64]
 

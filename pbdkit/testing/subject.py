@@ -21,7 +21,7 @@ from pbdkit.interfaces import (
 )
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.testing.property import PropertyError
+from pbdkit.testing.fault import PropertyError
 from pbdkit.testing.question import Question, questions_of
 
 LATTICES: dict[str, dict[str, Any]] = {

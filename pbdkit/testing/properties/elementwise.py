@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import BreaksAtStrain, Draws, FollowerRule, FractureModel, RenewsBonds
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.fault import NotAskedError, PropertyError
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.question import Question, applied, flat, gathered
 from pbdkit.testing.states import SEED, SHAPE, differences, here, owners, remembers
 from pbdkit.testing.subject import Subject

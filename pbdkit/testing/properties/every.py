@@ -10,7 +10,8 @@ import re
 from pydantic import ValidationError
 
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.testing.property import PropertyError, asked_of
+from pbdkit.testing.fault import PropertyError
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.subject import Subject
 
 ALL = tuple(INTERFACES.values())

@@ -22,7 +22,8 @@ from pbdkit.interfaces import (
 from pbdkit.registry.registry import Registry
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
-from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.fault import NotAskedError, PropertyError
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.states import frame_showing
 from pbdkit.testing.subject import LATTICES, Subject, alternatives, place_of
 

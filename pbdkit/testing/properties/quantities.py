@@ -18,7 +18,8 @@ from pbdkit.interfaces import (
 )
 from pbdkit.results.layout import base_columns, bond_columns, broken_columns, reserved_names
 from pbdkit.scene.declarations import remembered_names
-from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.fault import NotAskedError, PropertyError
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.states import SEED, moment_of, numbers_of, owners, shown
 from pbdkit.testing.subject import Subject
 

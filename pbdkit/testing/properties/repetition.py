@@ -20,7 +20,8 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
 )
-from pbdkit.testing.property import PropertyError, asked_of
+from pbdkit.testing.fault import PropertyError
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.question import Arrays, Question, applied, each, flat, gathered
 from pbdkit.testing.states import differences, here
 from pbdkit.testing.subject import Subject

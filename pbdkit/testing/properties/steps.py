@@ -25,8 +25,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.state import State, initial_state
+from pbdkit.testing.fault import NotAskedError, PropertyError
 from pbdkit.testing.properties.repetition import differing
-from pbdkit.testing.property import NotAskedError, PropertyError, asked_of
+from pbdkit.testing.property import asked_of
 from pbdkit.testing.question import Arrays
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
 from pbdkit.testing.subject import Subject, place_of, scenes_with
