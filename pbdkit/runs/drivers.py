@@ -6,8 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator
 from typing import TYPE_CHECKING
 
-from pbdkit.equilibrium.increments import settle
-from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
 from pbdkit.scene.scene import Scene
@@ -154,6 +152,10 @@ class Straight(Driver):
 
     def states(self) -> States:
         """Interrupted, it gives out how far it had come."""
+        # Loaded by those who look for an equilibrium, and by nobody else.
+        from pbdkit.equilibrium.increments import settle
+        from pbdkit.equilibrium.newton import UnconvergedError
+
         state, steps = self.state, self.scene.experiment.steps
         yield state
         try:
