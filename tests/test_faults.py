@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -125,10 +126,13 @@ TEXTS = {
 
 @pytest.mark.parametrize(("text", "expected"), TEXTS.values(), ids=TEXTS)
 def test_a_file_is_refused_at_once(refused: Refused, text: str | bytes, expected: str) -> None:
+    gc.freeze()  # what other tests have left behind is not gone through
     begun = time.process_time()  # a busy machine does not decide
     message = refused(text)
     assert agrees(message, expected), message
-    assert time.process_time() - begun < 1.0
+    taken = time.process_time() - begun
+    gc.unfreeze()
+    assert taken < 2.0
 
 
 READ = {

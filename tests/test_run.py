@@ -121,7 +121,9 @@ def test_all_that_decides_when_a_run_settles_is_data(tensile: dict[str, Any]) ->
     rest.driver.guard = Guard(**vars(copy.deepcopy(driver.guard)))
     rest.driver.settling.pace = Pace(**dataclasses.asdict(driver.settling.pace))
     assert [state.step for state in rest] == steps[steps.index(middle) :]
-    assert (rest.outcome.status, rest.outcome.steps) == ("settled", whole.outcome.steps)  # type: ignore[union-attr]  # they ended
+    assert rest.outcome is not None
+    assert whole.outcome is not None
+    assert (rest.outcome.status, rest.outcome.steps) == ("settled", whole.outcome.steps)
 
 
 @pytest.mark.parametrize("solver", ["stepping", "equilibrium"])

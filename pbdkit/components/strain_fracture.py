@@ -127,7 +127,7 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
         onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
         strain = length(r + d) * c.per_rest - 1.0
         softens = strain > onset
-        law = failure / (failure - onset) * (1.0 - onset / where(softens, strain, 1.0))
+        law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
         law = where(strain < failure, law, 1.0)
         return (where(softens & (law > damage), law, damage),)
 
