@@ -173,7 +173,7 @@ def _cells(subject: Subject) -> Iterator[tuple[str, Cell]]:
         lattice: Any = part
         if not isinstance(part, Lattice):
             lattice = registry.find(Lattice, part["type"]).model_validate(part)
-            name, cell = lattice.type, lattice.cell()
+        name, cell = lattice.type, lattice.cell()
         try:
             for s in range(len(cell.sites)):
                 subject.component.shells_around(cell, s)
