@@ -65,7 +65,8 @@ def test_a_device_is_not_replaced() -> None:
 def test_the_experiment_itself_is_not_replaced(call: Call, name: str) -> None:
     Path("linked.json").symlink_to("e.json")
     text = Path("e.json").read_text()
-    for given, output in ((name, "e.json"), ("e.json", "../work/e.json")):
+    around = f"../{Path.cwd().name}/e.json"
+    for given, output in ((name, "e.json"), ("e.json", around)):
         result = call("run", given, "-o", output, "--force")
         assert (result.code, "is the experiment itself" in result.err) == (2, True)
     assert Path("e.json").read_text() == text

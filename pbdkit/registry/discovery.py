@@ -33,8 +33,9 @@ class Hooks:
     """What a plugin may implement, as functions of the module that its entry point names."""
 
     @hookspec
-    def pbdkit_components(self) -> list[type[Component]]:  # type: ignore[empty-body]  # a specification only
+    def pbdkit_components(self) -> list[type[Component]]:
         """The component classes that the distribution offers."""
+        raise NotImplementedError  # a specification only: pluggy never calls it
 
 
 @dataclass(frozen=True)
