@@ -4,11 +4,23 @@ Steps are few and thresholds lie off round numbers, so that no unstable mode and
 length and a threshold magnifies rounding into a difference.
 """
 
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from pbdkit import Lattice, NeighbourMetric
 from pbdkit.registry.registry import Registry
 from pbdkit.scene.neighbourhood import build_neighbourhood
+
+
+def samples(count, **more):
+    """Settings for a test that draws so many scenes, and as many times more as the profile does."""
+    return settings(
+        max_examples=count * settings().max_examples // 100,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+        **more,
+    )
+
 
 DIAGNOSTICS = [{"type": t} for t in ("pe1", "pe1-intact", "pe2", "displacement", "broken")]
 

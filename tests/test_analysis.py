@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from property_cases import LATTICES, RULES
-from scene_strategies import calibrated_experiments, experiments
+from scene_strategies import calibrated_experiments, experiments, samples
 
 import pbdkit
 from pbdkit.analysis.analysis import Analysis
@@ -40,11 +40,7 @@ def unknowns(scene, u, rows):
     return np.stack([plane.ravel()[place] for plane in u], axis=1).ravel()
 
 
-@settings(
-    max_examples=75,
-    deadline=None,
-    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
-)
+@samples(40)
 @given(st.one_of(experiments(), calibrated_experiments()))
 def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
     """On random scenes, torn ones too; a nonlinear rule at the state where it is linearised."""

@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from scene_strategies import samples
 
 import pbdkit
 from pbdkit.scene.raster import FRAME, LEADER
@@ -199,7 +200,7 @@ def test_springs_turn_with_their_leaders_exactly(parts):
     np.testing.assert_allclose(turned, np.stack([-y, x], axis=1), rtol=0, atol=1e-12)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@samples(30)
 @given(seed=st.integers(0, 2**31), lattice=st.sampled_from(list(SPRINGS)))
 def test_the_energy_of_springs_never_rises(seed, lattice):
     """From scrambled starts, up to two spacings from rest, with relaxation 1."""

@@ -5,11 +5,11 @@ import time
 import numba
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
 from remembering_parts import Tiring, Weakest
-from scene_strategies import calibrated_experiments, experiments, pulled_apart
+from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -64,26 +64,19 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
     return reference
 
 
-thoroughly = settings(
-    max_examples=75,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-)
-
-
-@thoroughly
+@samples(40)
 @given(experiments())
 def test_the_kernels_logic_on_random_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@thoroughly
+@samples(40)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
 def test_the_kernels_logic_on_torn_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@thoroughly
+@samples(40)
 @given(calibrated_experiments())
 def test_the_kernels_logic_on_calibrated_scenes(experiment):
     compare_interpreted(experiment)

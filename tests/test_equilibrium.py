@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import HealthCheck, assume, given, settings
-from scene_strategies import experiments
+from hypothesis import assume, given
+from scene_strategies import experiments, samples
 
 import pbdkit
 from pbdkit.cli import program
@@ -61,11 +61,7 @@ def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size
 
 
 @pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
-@settings(
-    max_examples=15,
-    deadline=None,
-    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
-)
+@samples(6)
 @given(experiments())
 def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     """Where steps from

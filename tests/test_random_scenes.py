@@ -7,35 +7,29 @@ at a time.
 import numpy as np
 import plain_loops
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
-from scene_strategies import experiments, grids, initials, pulled_apart
+from scene_strategies import experiments, grids, initials, pulled_apart, samples
 
 import pbdkit
 
 TOLERANCE = 1e-11
 MEASURED = ["pe1", "pe1_intact", "pe2", "u", "broken_bonds"]
 
-thoroughly = settings(
-    max_examples=150,
-    deadline=None,
-    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
-)
 
-
-@thoroughly
+@samples(50)
 @given(experiments())
 def test_matches_the_plain_loops(experiment):
     compare(experiment)
 
 
-@thoroughly
+@samples(50)
 @given(experiments(body=grids, start=initials.filter(lambda i: i["type"] == "reference")))
 def test_grids_match_the_plain_loops(experiment):
     compare(experiment)
 
 
-@thoroughly
+@samples(50)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
 def test_fracture_matches_the_plain_loops(experiment):
     compare(experiment)

@@ -9,10 +9,10 @@ from functools import partial
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from property_cases import BOTH_ENDS_HELD, HOLD_LEFT, LATTICES, experiment, pull_right
-from scene_strategies import experiments
+from scene_strategies import experiments, samples
 
 import pbdkit
 from pbdkit.cli import program
@@ -63,11 +63,7 @@ def error_of(ds, rest):
     return float(np.hypot(*(u - rest).T)[ds.kind[-1].values == 1].max(initial=0.0))
 
 
-@settings(
-    max_examples=15,
-    deadline=None,
-    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
-)
+@samples(6)
 @given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
 def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
     """All lattices, rules, frames, motions and fracture, against the steps themselves."""
