@@ -12,7 +12,7 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.plugin import Offer, Plugin
+    from pbdkit.registry.discovery import Offer, Plugin
     from pbdkit.testing import Report
 
 INTERFACES = (

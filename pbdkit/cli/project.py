@@ -16,7 +16,8 @@ from string import Template
 from pbdkit import __version__
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import INTERFACES
-from pbdkit.registry.discovery import BUILTIN, canonical
+from pbdkit.registry import BUILTIN
+from pbdkit.registry.discovery import canonical
 from pbdkit.registry.registry import Registry
 
 PREFIX = f"{BUILTIN}-"
