@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,20 +68,16 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
         raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 
-def disk_warnings(path: Path, scene: Scene) -> tuple[str, ...]:
+def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """What is to be said where the output may not fit on its disk."""
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output
-    try:
-        free = shutil.disk_usage(path.parent).free
-    except OSError:  # no such folder: said when the file is opened
-        return ()
-    if output <= free:
-        return ()
-    return (
-        f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
-        f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or name a file "
-        "on another disk with -o",
-    )
+    with suppress(OSError):  # no such folder: said when the file is opened
+        if output > (free := shutil.disk_usage(path.parent).free):
+            yield (
+                f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
+                f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or "
+                "name a file on another disk with -o"
+            )
 
 
 FORMATS = (".png", ".svg", ".pdf")

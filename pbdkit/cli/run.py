@@ -132,13 +132,9 @@ def _peak_memory_mib() -> float | None:
 
 
 def _exit_code(report: Report, path: Path, written: Path) -> int:
-    codes = {"diverged": 4, "unconverged": 4, "interrupted": 130}
-    code = codes.get(report.outcome.status, 0)
-    if code:
-        left = "" if written == path else f"; {path} is left as it was"
-        click.echo(
-            f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
-            f"what was recorded until then is in {written}{left}",
-            err=True,
-        )
-    return code
+    if report.outcome.status in ("complete", "settled"):
+        return 0
+    left = "" if written == path else f"; {path} is left as it was"
+    what = f"{report.outcome.status}: {report.outcome.stop_reason}"
+    click.echo(f"pbdkit: {what}; what was recorded until then is in {written}{left}", err=True)
+    return 130 if report.outcome.status == "interrupted" else 4
