@@ -58,9 +58,8 @@ class Project:
 
     def files(self) -> dict[str, str]:
         """The text of each file, by its place in the project's folder."""
-        own = (
-            f"[{{type: {self.type}}}]" if self.field == "diagnostics" else f"{{type: {self.type}}}"
-        )
+        listed = self.field == "diagnostics"
+        own = f"[{{type: {self.type}}}]" if listed else f"{{type: {self.type}}}"
         parts = DEFAULT_PARTS | {self.field: own}
         known = {
             **vars(self),
@@ -70,12 +69,11 @@ class Project:
             "parts": "\n".join(f"{name}: {part}" for name, part in parts.items()),
         }
         folder = files("pbdkit.cli").joinpath("templates")
-        return {
-            file.format(**known): Template(
-                folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
-            ).substitute(known)
-            for file, template in TEMPLATES.items()
-        }
+        texts = {}
+        for file, template in TEMPLATES.items():
+            text = folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
+            texts[file.format(**known)] = Template(text).substitute(known)
+        return texts
 
     def write(self, parent: Path) -> Path:
         """Writes it into a new folder of `parent`, named as the distribution, and returns that.
@@ -120,15 +118,11 @@ def project_of(name: str, interface: str) -> Project:
     module, instead = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
     if not class_name.isidentifier() or class_name in TAKEN:
         raise ExperimentError(f"'{name}' makes no name for a class{instead}")
-    if module in keyword.kwlist or _is_module(module):
+    taken = {*keyword.kwlist, *sys.stdlib_module_names}
+    spec = None if module in taken else find_spec(module)
+    if module in taken or (spec and spec.origin):  # a mere folder has no origin
         raise ExperimentError(f"there is a module {module} already{instead}")
     field, own = next((field, i) for field, i in INTERFACES.items() if i.__name__ == interface)
     if kind in Registry().components(own, installed=False):
         raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
     return Project(distribution, module, kind, class_name, interface, field)
-
-
-def _is_module(name: str) -> bool:
-    """Whether Python finds a module of that name; a mere folder is none."""
-    spec = None if name in sys.stdlib_module_names else find_spec(name)
-    return name in sys.stdlib_module_names or (spec is not None and spec.origin is not None)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import in_rectangles, in_triangles
+from pbdkit.components.cell_stiffness import on_both_sides
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
@@ -68,10 +68,7 @@ class CellElastic(Calibrated, FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
         to the right the transpose; a cell on both sides counts half on each."""
-        if setting.cells.rectangle:
-            left, right = in_rectangles(slot, self.ratios(), setting.cells)
-        else:
-            left, right = in_triangles(slot, self.ratios())
+        left, right = on_both_sides(slot, self.ratios(), setting.cells)
         mean = (left + right.T) / 2
         return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
 
