@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,13 +31,11 @@ def folder_kept() -> Iterator[None]:
     """Goes back to the current folder: a plugin may change it when it is imported. Raises
     StorageError where there is none."""
     try:
-        here = Path.cwd()
+        kept = chdir(Path.cwd())
     except OSError as error:
         raise StorageError(f"the current folder: {error.strerror}") from None
-    try:
+    with kept:
         yield
-    finally:
-        os.chdir(here)
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:

@@ -219,29 +219,26 @@ class _Equations:
 
     def solved(self) -> FrameMap:
         """The points' weights of the body particles."""
-        from scipy.sparse import coo_array, vstack
+        from scipy.sparse import coo_array, hstack
         from scipy.sparse.linalg import splu
 
         row, column, value = map(np.concatenate, zip(*self._entries, strict=True))
-        size = 2 * len(self._site), 2 * math.prod(self._shape)
+        ring = self._place(self._site)
+        inner = np.setdiff1d(column // 2, ring)
+        size = 2 * len(ring), 2 * math.prod(self._shape)
         M = coo_array((value, (row, column)), size).tocsc()
-        of_points = (2 * self._place(self._site)[:, None] + (0, 1)).ravel()
-        A, others = M[:, of_points], np.setdiff1d(column, of_points)
-        B = -M[:, others]
-        there = np.column_stack(np.unravel_index(others // 2, self._shape)) + self._first
-        body = 2 * self._frame.body_at(there.astype(np.int32)) + others % 2
+        A, B = (M[:, (2 * places[:, None] + (0, 1)).ravel()] for places in (ring, inner))
         inverse, parts = splu(A), []
-        for first in range(0, len(body), COLUMNS):
-            answers = inverse.solve(B[:, first : first + COLUMNS].toarray())
+        for first in range(0, B.shape[1], COLUMNS):
+            answers = inverse.solve(-B[:, first : first + COLUMNS].toarray())
             answers[np.abs(answers) < NEGLIGIBLE] = 0.0
-            parts.append(coo_array(answers.T))
-        found = vstack(parts).T.tocoo()
-        point, body = found.row, body[found.col]
-        places = np.stack([point // 2, body // 2])
-        (points, bodies), entry = np.unique(places, axis=1, return_inverse=True)
-        weight = np.zeros((len(points), 2, 2))
-        weight[entry.ravel(), point % 2, body % 2] = found.data
-        return FrameMap(points, bodies, weight)
+            parts.append(coo_array(answers))
+        weights = hstack(parts).tobsr((2, 2))
+        weights.sort_indices()
+        point = np.repeat(np.arange(len(ring)), np.diff(weights.indptr))
+        sites = np.column_stack(np.unravel_index(inner, self._shape)) + self._first
+        body = self._frame.body_at(sites.astype(np.int32))[weights.indices]
+        return FrameMap(point, body, weights.data)
 
     def _add(self, points: Any, row: int, site: Any, axis: int, factor: Any) -> None:
         """Adds factor · (component `axis` at some sites) to the equations `row` of some points."""
