@@ -123,32 +123,26 @@ def identify(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
             click.echo(f"note: {note}")
 
 
-class Sizes(click.ParamType[tuple[int, ...]]):
-    """Numbers of sites, separated by commas."""
-
-    name = "sizes"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        """The numbers, each from 2."""
-        words = [word.strip() for word in str(value).split(",")]
-        for word in words:
-            if not (word.isascii() and word.isdecimal()) or not 2 <= int(word) < 2**31:
-                self.fail(f"'{word}' is no number of sites from 2; write for instance 50,100,200")
-        return tuple(dict.fromkeys(int(word) for word in words))
+def _sizes(context: click.Context, option: click.Parameter, given: str | None) -> tuple[int, ...]:
+    """Numbers of sites, separated by commas, each from 2."""
+    words = [word.strip() for word in given.split(",")] if given is not None else []
+    for word in words:
+        if not (word.isascii() and word.isdecimal()) or not 2 <= int(word) < 2**31:
+            what = f"'{word}' is no number of sites from 2; write for instance 50,100,200"
+            raise click.BadParameter(what)
+    return tuple(dict.fromkeys(map(int, words)))
 
 
 @click.command()
 @experiment_argument
-@click.option("--sizes", type=Sizes(), help="Sites along the longer side, e.g. 50,100,200.")
+@click.option("--sizes", callback=_sizes, help="Sites along the longer side, e.g. 50,100,200.")
 @click.option("--steps", type=click.IntRange(min=1), help="Steps of each run; else its own.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures.")
 @click.option("--plot", "picture", type=click.Path(path_type=Path), help="PNG, SVG or PDF.")
 @set_option
 def bench(
     experiment: str,
-    sizes: tuple[int, ...] | None,
+    sizes: tuple[int, ...],
     steps: int | None,
     json_file: Path | None,
     picture: Path | None,

@@ -123,6 +123,6 @@ def project_of(name: str, interface: str) -> Project:
     if module in taken or (spec and spec.origin):  # a mere folder has no origin
         raise ExperimentError(f"there is a module {module} already{instead}")
     field, own = next((field, i) for field, i in INTERFACES.items() if i.__name__ == interface)
-    if kind in Registry().components(own, installed=False):
+    if [kind] in Registry().spellings(own, installed=False).values():
         raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
     return Project(distribution, module, kind, class_name, interface, field)

@@ -70,20 +70,18 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
     A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
     """
-    asked = False
+    asked: list[int] = []
 
     def note(number: int, frame: Any) -> None:
-        nonlocal asked
         if asked:
             raise KeyboardInterrupt
-        asked = True
+        asked.append(number)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if ours else ()
+    before = {number: signal.signal(number, note) for number in numbers}
     try:
-        yield lambda: asked
+        yield lambda: bool(asked)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -77,23 +77,16 @@ class Registry:
             raise ExperimentError(f"{one_line(distribution)} {what}")
         for plugin, offer in offers:
             raise PluginError(f"'{told}' comes from {plugin}, which is broken: {offer.reason}")
-        installed = sorted(self.components(interface))
+        installed = sorted(names[0] for names in self.spellings(interface).values())
         hint = f"{did_you_mean(kind, installed)} (installed: {', '.join(installed)})"
         others = "".join(f"; {p} is {p.fault}" for p in self.installed if p.fault)
         raise ExperimentError(f"unknown type '{told}'{hint}{others}")
 
-    def components(
-        self, interface: type[Component], *, installed: bool = True
-    ) -> dict[str, type[Component]]:
-        """Every usable component of an interface by the name that an experiment gives it; third
-        parties' too if `installed`."""
-        spellings = self.spellings(interface, installed=installed)
-        return {names[0]: component for component, names in spellings.items()}
-
     def spellings(
         self, interface: type[Component], *, installed: bool = True
     ) -> dict[type[Component], list[str]]:
-        """The same by class, with all names that an experiment may give it, the shortest first."""
+        """Every usable component of an interface, third parties' too if `installed`, with all names
+        that an experiment may give it, the shortest first."""
         found: dict[type[Component], list[str]] = {}
         for plugin in self.plugins if installed else self._own:
             for offer in plugin.offers:
