@@ -28,13 +28,13 @@ def experiments() -> None:
 @click.argument("file", default="experiment.yaml", type=click.Path(path_type=Path))
 def init(file: Path) -> None:
     """Write a commented experiment to start from."""
-    from pbdkit.cli.output import storing
+    from pbdkit.cli.output import refusals_as
     from pbdkit.errors import ExperimentError
     from pbdkit.experiment.shipped import shipped_text
 
     if os.path.lexists(file):
         raise ExperimentError(f"{file}: exists and is left as it is; name another file")
-    with storing(file), file.open("x", encoding="utf-8") as written:
+    with refusals_as(f"{file}: cannot be written"), file.open("x", encoding="utf-8") as written:
         written.write(shipped_text("start"))
     click.echo(f"{file} written; next: pbdkit check {file}, then pbdkit run {file}")
 
@@ -153,7 +153,7 @@ def bench(
     from pbdkit.api import load
     from pbdkit.bench import work_precision
     from pbdkit.bench.measurement import measure
-    from pbdkit.cli.output import refuse_unwritable, save, show_table, storing
+    from pbdkit.cli.output import refusals_as, refuse_unwritable, save, show_table
 
     refuse_unwritable(picture, json_file)
     changed = (*settings, *([f"steps={steps}"] if steps else ()))
@@ -165,7 +165,7 @@ def bench(
     click.echo("\n".join(work_precision.lines(rows)))
     if json_file:
         figures = work_precision.as_dict(experiment, settings, loaded.steps, rows)
-        with storing(json_file):
+        with refusals_as(f"{json_file}: cannot be written"):
             json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
         click.echo(f"{json_file} written")
     if picture:

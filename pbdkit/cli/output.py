@@ -26,15 +26,26 @@ KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: 
 """What may be at a path and no plain file, by the type that the system gives it."""
 
 
+FORMATS = (".png", ".svg", ".pdf")
+UNLIMITED = 10_000
+
+
+@contextmanager
+def refusals_as(what: str) -> Iterator[None]:
+    """What the system refuses in the block becomes a StorageError that begins with `what`."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{what}: {error.strerror}") from None
+
+
 @contextmanager
 def folder_kept() -> Iterator[None]:
     """Goes back to the current folder: a plugin may change it when it is imported. Raises
     StorageError where there is none."""
-    try:
-        kept = chdir(Path.cwd())
-    except OSError as error:
-        raise StorageError(f"the current folder: {error.strerror}") from None
-    with kept:
+    with refusals_as("the current folder"):
+        here = Path.cwd()
+    with chdir(here):
         yield
 
 
@@ -47,12 +58,11 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     except UnicodeEncodeError:
         shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
         raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
-    try:
-        mode = path.lstat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except OSError as error:
-        raise StorageError(f"{str(path)[:80]}...: {error.strerror}") from None
+    with refusals_as(f"{str(path)[:80]}..."):
+        try:
+            mode = path.lstat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            return
     if stat.S_ISDIR(mode):
         raise ExperimentError(f"{path}: is a folder; name a file with -o")
     if not stat.S_ISREG(mode):
@@ -78,19 +88,6 @@ def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
             )
 
 
-FORMATS = (".png", ".svg", ".pdf")
-UNLIMITED = 10_000
-
-
-@contextmanager
-def storing(path: Path) -> Iterator[None]:
-    """StorageError where the system refuses to write the file in the block."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
-
-
 def show_table(table: Table) -> None:
     """Prints it; a line a row where it goes to a file or another program."""
     from rich.console import Console
@@ -112,9 +109,8 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
             raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
+def save(picture: Path, drawn: Figure) -> None:
     """Writes a figure and says so; StorageError where the system refuses."""
-    with storing(picture):
+    with refusals_as(f"{picture}: cannot be written"):
         drawn.savefig(picture)
-    if not quiet:
-        click.echo(f"{picture} written")
+    click.echo(f"{picture} written")

@@ -4,9 +4,11 @@ distribution."""
 from __future__ import annotations
 
 import keyword
+import os
 import re
 import shutil
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
@@ -14,7 +16,8 @@ from pathlib import Path
 from string import Template
 
 from pbdkit import __version__
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.cli.output import refusals_as
+from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import INTERFACES
 from pbdkit.registry import BUILTIN
 from pbdkit.registry.discovery import canonical
@@ -83,22 +86,19 @@ class Project:
         """
         folder = parent / self.distribution
         texts = self.files()
-        try:
-            folder.mkdir()
-        except FileExistsError:
+        if os.path.lexists(folder):
             raise ExperimentError(
                 f"{folder}: exists and is left as it is; take another name or --dir"
-            ) from None
-        except OSError as error:
-            raise StorageError(f"{folder}: cannot be made: {error.strerror}") from None
-        try:
+            )
+        with refusals_as(f"{folder}: cannot be made"):
+            folder.mkdir()
+        with refusals_as(f"{folder}: cannot be written"), ExitStack() as undo:
+            undo.callback(shutil.rmtree, folder, ignore_errors=True)
             for file, text in texts.items():
                 path = folder / file
                 path.parent.mkdir(exist_ok=True)
                 path.write_text(text, "utf-8")
-        except OSError as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise StorageError(f"{folder}: cannot be written: {error.strerror}") from None
+            undo.pop_all()
         return folder
 
 

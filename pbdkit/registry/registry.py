@@ -61,18 +61,17 @@ class Registry:
         else:
             plugins = self._own if _offers(self._own, interface, kind) else self.installed
         offers, told = _offers(plugins, interface, kind), one_line(kind)
-        classes = {p.distribution: o.component for p, o in offers if o.component is not None}
+        classes = {p.distribution: o.component for p, o in offers if o.component}
         if len(classes) > 1:
             choice = ", ".join(f"'{one}:{kind}'" for one in classes)
             raise ExperimentError(f"'{told}' is offered by several distributions: write {choice}")
-        for component in classes.values():
-            return component
+        if classes:
+            return classes.popitem()[1]
         if distribution:
             for plugin in [p for p, _ in offers] or plugins:
                 if plugin.fault:
                     raise PluginError(f"'{told}' is asked of {plugin}, which is {plugin.fault}")
-            offered = [o.name for p in plugins for o in p.offers if o.interface is interface]
-            hint = did_you_mean(kind, offered)
+            hint = did_you_mean(kind, [o.name for _, o in _offers(plugins, interface)])
             what = f"offers no {interface.__name__} '{told}'{hint}"
             raise ExperimentError(f"{one_line(distribution)} {what}")
         for plugin, offer in offers:
@@ -88,13 +87,12 @@ class Registry:
         """Every usable component of an interface, third parties' too if `installed`, with all names
         that an experiment may give it, the shortest first."""
         found: dict[type[Component], list[str]] = {}
-        for plugin in self.plugins if installed else self._own:
-            for offer in plugin.offers:
-                if offer.component is not None and offer.interface is interface:
-                    names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
-                    full = f"{plugin.distribution}:{offer.name}"
-                    if plugin not in self._own and full not in names:
-                        names.append(full)
+        for plugin, offer in _offers(self.plugins if installed else self._own, interface):
+            if offer.component:
+                names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
+                full = f"{plugin.distribution}:{offer.name}"
+                if plugin not in self._own and full not in names:
+                    names.append(full)
         return found
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
@@ -110,11 +108,9 @@ class Registry:
     def name_of(self, component: Component) -> str:
         """The type by which an experiment finds this component again: with its distribution unless
         nobody else is known to offer the type."""
-        for plugin in [*self._own, *self._loaded.values()]:
-            for offer in plugin.offers:
-                if offer.component is type(component):
-                    return self._name_in(plugin, offer)
-        return component.type_name()
+        known = [(p, o) for p in [*self._own, *self._loaded.values()] for o in p.offers]
+        names = (self._name_in(p, o) for p, o in known if o.component is type(component))
+        return next(names, component.type_name())
 
     def doubts(self) -> list[str]:
         """What the user may have meant otherwise: names to be disabled that nothing has."""
@@ -155,15 +151,11 @@ class Registry:
 
 
 def _offers(
-    plugins: Iterable[Plugin], interface: type[Component] | None, name: str
+    plugins: Iterable[Plugin], interface: type[Component] | None, name: str | None = None
 ) -> list[tuple[Plugin, Offer]]:
-    """The offers of that interface and type, the broken ones too."""
-    return [
-        (plugin, offer)
-        for plugin in plugins
-        for offer in plugin.offers
-        if offer.interface is interface and offer.name == name
-    ]
+    """The offers of that interface, and of one type where it is given, the broken ones too."""
+    every = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
+    return [(plugin, o) for plugin, o in every if name in (None, o.name)]
 
 
 def _judged(plugins: list[Plugin], builtin: Plugin) -> list[Plugin]:
