@@ -21,8 +21,6 @@ MODULES = {
 }
 COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
 """Every command with the module of pbdkit.cli in which it stands."""
-COMPLETING = "_PBDKIT_COMPLETE"
-"""The variable by which a shell asks how a line goes on."""
 
 
 class Commands(click.Group):
@@ -84,9 +82,9 @@ def main(arguments: list[str] | None = None) -> None:
         code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
-    except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
-        if isinstance(error, SystemExit) and COMPLETING in os.environ:
-            raise
+    except (Exception, SystemExit) as error:  # pbdkit itself exits below
+        if isinstance(error, SystemExit) and "_PBDKIT_COMPLETE" in os.environ:
+            raise  # click has told a shell how the line goes on
         if debug:
             traceback.print_exc()
         code = _report(error)

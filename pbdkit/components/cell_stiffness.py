@@ -13,20 +13,18 @@ from pbdkit.interfaces.polygons import Tiling
 
 Floats = NDArray[np.float64]
 
-CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
-"""Of a rectangular cell, counterclockwise, in units of its sides."""
-HOURGLASS = np.array([1.0, -1.0, 1.0, -1.0])
-"""The displacement of the corners that no mean strain knows."""
+CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Of a rectangular cell from its middle, counterclockwise, in units of half its sides."""
 
 
 @cache
 def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
-    signs = 2 * np.array(CORNERS) - 1.0
-    K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
+    K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
-    K += stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+    hourglass = CORNERS.prod(axis=1)  # the displacement that no mean strain knows
+    K += stiffness * np.einsum("m,n,ab->manb", hourglass, hourglass, np.eye(2))
     K.flags.writeable = False
     return K
 

@@ -56,7 +56,9 @@ class CellElastic(Calibrated, FollowerRule):
                 "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
                 "lattice with 6 ({type: coordination, shells: 1})"
             )
-        if setting.cells.regular == 3 and not _is_isotropic(ratios):
+        xx, yy, xy, shear = ratios
+        isotropic = xx == yy and math.isclose(xx, xy + 2 * shear, rel_tol=1e-12)
+        if setting.cells.regular == 3 and not isotropic:
             raise ExperimentError(
                 f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
             )
@@ -169,10 +171,6 @@ class Orthotropic(CellElastic):
         modulus = 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
         coupled = self.poisson_ratio * self.modulus_ratio
         return modulus, Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / modulus)
-
-
-def _is_isotropic(c: Stiffness) -> bool:
-    return c.xx == c.yy and math.isclose(c.xx, c.xy + 2 * c.shear, rel_tol=1e-12)
 
 
 class StrainGradient(AppliesTwice, IsotropicElastic):

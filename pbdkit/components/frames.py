@@ -179,8 +179,7 @@ class _Equations:
         self._frame, self._site, self._spacings = frame, frame.site, (a.x, b.y)
         self._first, self._shape = low - 1, tuple(high - low + 3)
         self._entries: list[tuple[Any, Any, Any]] = []
-        for axis in (0, 1):
-            self._add(np.arange(len(frame.site)), axis, frame.site, axis, 1.0)
+        self._add_both(np.arange(len(frame.site)), frame.site, 1.0)
 
     def balance_edges(self, c: Stiffness) -> None:
         """No shear and no tension across the edges."""
@@ -190,8 +189,7 @@ class _Equations:
             side, step = self._beyond[points, across], np.eye(2, dtype=int)[along]
             inner = self._site[points] - side[:, None] * np.eye(2, dtype=int)[across]
             slope = side * self._spacings[across] / (2 * self._spacings[along])
-            for axis in (0, 1):
-                self._add(points, axis, inner, axis, -1.0)
+            self._add_both(points, inner, -1.0)
             for some, steps in self._differences(self._site[points, along], along):
                 for n, weight in steps.items():
                     for row in (self._site[points], inner):
@@ -214,8 +212,7 @@ class _Equations:
         points = np.flatnonzero(self._beyond.all(axis=1))
         site, beyond = self._site[points], self._beyond[points]
         for back, factor in (([1, 0], -1.0), ([0, 1], -1.0), ([1, 1], 1.0)):
-            for axis in (0, 1):
-                self._add(points, axis, site - beyond * back, axis, factor)
+            self._add_both(points, site - beyond * back, factor)
 
     def solved(self) -> FrameMap:
         """The points' weights of the body particles."""
@@ -239,6 +236,10 @@ class _Equations:
         sites = np.column_stack(np.unravel_index(inner, self._shape)) + self._first
         body = self._frame.body_at(sites.astype(np.int32))[weights.indices]
         return FrameMap(point, body, weights.data)
+
+    def _add_both(self, points: Any, site: Any, factor: float) -> None:
+        for axis in (0, 1):
+            self._add(points, axis, site, axis, factor)
 
     def _add(self, points: Any, row: int, site: Any, axis: int, factor: Any) -> None:
         """Adds factor · (component `axis` at some sites) to the equations `row` of some points."""
