@@ -85,7 +85,7 @@ def _offered(entry: EntryPoint) -> list[Any]:
     answers = manager.hook.pbdkit_components()
     if not answers or not isinstance(answers[0], list):
         raise TypeError("its hook `pbdkit_components` must return a list of component classes")
-    return [c for n, c in enumerate(answers[0]) if not any(c is d for d in answers[0][:n])]
+    return list({id(component): component for component in answers[0]}.values())
 
 
 def _offer(component: Any, package: str) -> Offer:

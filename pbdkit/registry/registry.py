@@ -160,12 +160,11 @@ def _offers(
 
 def _judged(plugins: list[Plugin], builtin: Plugin) -> list[Plugin]:
     """The plugins, with the reason at each offer that is in conflict with others."""
-    return [
-        replace(
-            plugin, offers=tuple(_judged_offer(plugin, o, plugins, builtin) for o in plugin.offers)
-        )
-        for plugin in plugins
-    ]
+    found = []
+    for plugin in plugins:
+        offers = tuple(_judged_offer(plugin, o, plugins, builtin) for o in plugin.offers)
+        found.append(replace(plugin, offers=offers))
+    return found
 
 
 def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
