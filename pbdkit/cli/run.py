@@ -70,20 +70,18 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
     A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
     """
-    asked = False
+    asked: list[int] = []
 
     def note(number: int, frame: Any) -> None:
-        nonlocal asked
         if asked:
             raise KeyboardInterrupt
-        asked = True
+        asked.append(number)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if ours else ()
+    before = {number: signal.signal(number, note) for number in numbers}
     try:
-        yield lambda: asked
+        yield lambda: bool(asked)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -132,13 +130,9 @@ def _peak_memory_mib() -> float | None:
 
 
 def _exit_code(report: Report, path: Path, written: Path) -> int:
-    codes = {"diverged": 4, "unconverged": 4, "interrupted": 130}
-    code = codes.get(report.outcome.status, 0)
-    if code:
-        left = "" if written == path else f"; {path} is left as it was"
-        click.echo(
-            f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
-            f"what was recorded until then is in {written}{left}",
-            err=True,
-        )
-    return code
+    if report.outcome.status in ("complete", "settled"):
+        return 0
+    left = "" if written == path else f"; {path} is left as it was"
+    what = f"{report.outcome.status}: {report.outcome.stop_reason}"
+    click.echo(f"pbdkit: {what}; what was recorded until then is in {written}{left}", err=True)
+    return 130 if report.outcome.status == "interrupted" else 4

@@ -161,7 +161,7 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
     `installed`, of those of the built-in diagnostics alone."""
     base = base_columns()
     columns = base + optional_columns()
-    for diagnostic in registry.components(Diagnostic, installed=installed).values():
+    for diagnostic in registry.spellings(Diagnostic, installed=installed):
         columns += _columns_of(diagnostic)
     strings: dict[str, Any] = {name: {"type": "string"} for name in ATTRIBUTES}
     strings |= {"status": {"enum": list(STATUSES)}, "schema_version": {"const": SCHEMA_VERSION}}
