@@ -13,7 +13,7 @@ from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.places import Block
+from pbdkit.scene.places import Block, hull
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 
 Mask = NDArray[np.bool_]
@@ -54,12 +54,8 @@ def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
     forward = raster.body_block(plane.slot.source)
     landed = raster.body_block(plane.slot.target)
     backward = landed.seen_through(plane.opposite) if landed else None
-    blocks = [b for b in (forward, backward) if b]
-    if not blocks:
-        return None
-    start = tuple(map(min, zip(*(b.start for b in blocks), strict=True)))
-    stop = tuple(map(max, zip(*(b.stop for b in blocks), strict=True)))
-    return Block(plane.slot.source, start, stop)
+    corners = [(block.start, block.stop) for block in (forward, backward) if block]
+    return Block(plane.slot.source, *hull(corners)) if corners else None
 
 
 def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> NDArray[np.bool_]:
@@ -75,7 +71,7 @@ def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) ->
 
 def count_bonds(raster: Raster, neighbourhood: Neighbourhood) -> int:
     """The number of bonds with at least one end in the body."""
-    blocks = [(plane, plane_block(raster, plane)) for plane in neighbourhood.planes]
+    blocks = ((plane, plane_block(raster, plane)) for plane in neighbourhood.planes)
     return sum(int(bonds_in(raster, b, plane, True).sum()) for plane, b in blocks if b)
 
 
@@ -86,19 +82,20 @@ def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
         for n, plane in enumerate(neighbourhood.planes)
         if (block := plane_block(raster, plane))
     ]
-    lower, upper, shell, number, place = (np.concatenate(p) for p in zip(*parts, strict=True))
-    order = np.lexsort((upper, lower))
-    ends = np.stack([lower, upper], axis=1)[order].astype(np.int64)
-    return BondTable(ends, shell[order].astype(np.int8), number[order], place[order])
+    ends, shell, number, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+    ends.sort(axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    return BondTable(ends[order], shell[order], number[order], place[order])
 
 
 def _bonds_of_plane(
     raster: Raster, number: int, plane: BondPlane, block: Block
-) -> tuple[Indices, Indices, Indices, Indices, Indices]:
+) -> tuple[Indices, NDArray[np.int8], Indices, Indices]:
+    """(rows of both ends, shell, number of the plane, place in it) of its bonds."""
     found = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
     cells, slot = list(map(add, found, block.start)), plane.slot
-    a = raster.rows_at(np.full(len(found[0]), slot.source), *cells)
-    b = raster.rows_at(np.full(len(found[0]), slot.target), *map(add, cells, slot.cell))
+    a = raster.rows_at(slot.source, *cells)
+    b = raster.rows_at(slot.target, *map(add, cells, slot.cell))
     within = np.ravel_multi_index(tuple(cells), raster.shape[1:])
-    shell = np.full(len(a), plane.slot.shell)
-    return np.minimum(a, b), np.maximum(a, b), shell, np.full(len(a), number), within
+    shell, of_plane = np.full(len(a), slot.shell, np.int8), np.full(len(a), number)
+    return np.stack([a, b], axis=1), shell, of_plane, within

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import permutations
+from operator import sub
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from pbdkit.scene.raster import FOLLOWER, Raster
 
 Floats = NDArray[np.float64]
 Slots = tuple[tuple[Slot, ...], ...]
-Step = tuple[int, Index]
+Step = tuple[int, int, Index]
 Share = NDArray[np.floating[Any]] | float
 CELLS_AT_ONCE = 65536
 """So many are looked at together, so that temporaries stay small."""
@@ -57,16 +59,15 @@ class Patch:
         corners, found = self.polygon.corners, []
         for k, a in enumerate(corners):
             ahead = {_step(a, b) for b in corners[k + 1 :]}
-            own = [slot for slot in slots[a.target] if (slot.target, slot.cell) in ahead]
+            own = [s for s in slots[a.target] if (s.source, s.target, s.cell) in ahead]
             found += [(self.corners[k], slot) for slot in own]
         return found
 
     def rows(self, raster: Raster, place: int) -> Indices:
         """The rows of the corners of the cell at a flat place of the patch."""
-        m, n = np.unravel_index(place, self.whole.shape)
         s = np.array([block.sublattice for block in self.corners])
         start = np.array([block.start for block in self.corners])
-        return raster.rows_at(s, start[:, 0] + m, start[:, 1] + n)
+        return raster.rows_at(s, *np.add(start, np.unravel_index(place, self.whole.shape)).T)
 
 
 def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
@@ -114,13 +115,11 @@ def _within(raster: Raster, polygon: Polygon) -> Block | None:
     block = raster.body_block(polygon.source)
     if not block:
         return None
-    bounds = []
-    for axis in (0, 1):
-        steps = [corner.cell[axis] for corner in polygon.corners]
-        begin = max(block.start[axis], -min(steps))
-        bounds.append((begin, min(block.stop[axis], raster.shape[1 + axis] - max(steps))))
-    (i, k), (j, n) = bounds
-    return Block(polygon.source, (i, j), (k, n)) if i < k and j < n else None
+    steps = np.array([corner.cell for corner in polygon.corners])
+    start = np.maximum(block.start, -steps.min(axis=0))
+    stop = np.minimum(block.stop, raster.shape[1:] - steps.max(axis=0))
+    there = Block(polygon.source, tuple(start.tolist()), tuple(stop.tolist()))
+    return there if (start < stop).all() else None
 
 
 def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon, ...]:
@@ -147,30 +146,26 @@ def _beside(
     polygons: tuple[tuple[Polygon, ...], ...], slots: Slots
 ) -> dict[Slot, tuple[Side, Side]]:
     """The cells beside every slot, where the neighbours are the corners of simple cells."""
+    slot_of = {(slot.source, slot.target, slot.cell): slot for own in slots for slot in own}
+    left: dict[Step, Side] = {}
+    right: dict[Step, Side] = {}
     every = [(kind, polygon) for own in polygons for kind, polygon in enumerate(own)]
-    found: dict[Slot, tuple[Side, Side]] = {}
-    for s, own in enumerate(slots):
-        slot_of = {(slot.target, slot.cell): slot for slot in own}
-        left: dict[Step, Side] = {}
-        right: dict[Step, Side] = {}
-        for kind, polygon in every:
-            n = len(polygon.corners)
-            for start in (k for k in range(n) if polygon.corners[k].target == s):
-                keys = [_step(polygon.corners[start], corner) for corner in polygon.corners]
-                for ahead in range(1, n):
-                    end = (start + ahead) % n
-                    side = Side(kind, slot_of.get(keys[0]), start, end)
-                    left |= {keys[end]: side} if ahead < n - 1 else {}
-                    right |= {keys[end]: side} if ahead > 1 else {}
-        if not left.keys() == right.keys() == slot_of.keys():
-            return {}
-        found |= {slot: (left[key], right[key]) for key, slot in slot_of.items()}
-    return found if all(_is_simple(polygon) for _, polygon in every) else {}
+    for kind, polygon in every:
+        corners = polygon.corners
+        for start, end in permutations(range(len(corners)), 2):
+            side = Side(kind, slot_of.get(_step(corners[start], corners[0])), start, end)
+            step, ahead = _step(corners[start], corners[end]), (end - start) % len(corners)
+            left |= {step: side} if ahead < len(corners) - 1 else {}
+            right |= {step: side} if ahead > 1 else {}
+    fits = left.keys() == right.keys() == slot_of.keys()
+    if not (fits and all(_is_simple(polygon) for _, polygon in every)):
+        return {}
+    return {slot: (left[step], right[step]) for step, slot in slot_of.items()}
 
 
 def _step(here: Offset, there: Offset) -> Step:
-    """(sublattice, repeat cells) from one corner of a polygon to another."""
-    return there.target, (there.cell[0] - here.cell[0], there.cell[1] - here.cell[1])
+    """(sublattice, sublattice, repeat cells) from one corner of a polygon to another."""
+    return here.target, there.target, tuple(map(sub, there.cell, here.cell))
 
 
 def _is_simple(polygon: Polygon) -> bool:

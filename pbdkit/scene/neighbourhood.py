@@ -47,15 +47,20 @@ class Neighbourhood:
         """The cells of the lattice, and which of them lie beside the slots."""
         return tiling_of(self.cell, self.slots)
 
+    @cached_property
+    def every(self) -> tuple[Slot, ...]:
+        """The slots of all sublattices, one after the other."""
+        return tuple(slot for own in self.slots for slot in own)
+
     @property
     def reach(self) -> int:
         """The largest difference of site index, max(|Δi|, |Δj|)."""
-        return max(max(abs(n) for n in slot.site) for slots in self.slots for slot in slots)
+        return max(abs(n) for slot in self.every for n in slot.site)
 
     @property
     def reach_in_cells(self) -> Index:
         """The largest difference of repeat cell along each axis."""
-        steps = zip(*(slot.cell for slots in self.slots for slot in slots), strict=True)
+        steps = zip(*(slot.cell for slot in self.every), strict=True)
         return tuple(max(map(abs, along)) for along in steps)
 
     @cached_property
@@ -67,19 +72,18 @@ class Neighbourhood:
 
     def shells(self) -> list[list[float]]:
         """The rest lengths of each shell, the first shell first."""
-        found: dict[int, list[float]] = {}
-        for slots in self.slots:
-            for slot in slots:
-                found.setdefault(slot.shell, []).append(math.hypot(*slot.rest))
-        return [found[shell] for shell in sorted(found)]
+        found: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]
+        for slot in self.every:
+            found[slot.shell - 1].append(math.hypot(*slot.rest))
+        return found
 
     def spans_space(self) -> bool:
         """Whether steps between neighbours reach in all directions; else rows do not feel each
         other."""
-        rests = np.array([slot.rest for slots in self.slots for slot in slots])
+        rests = np.array([slot.rest for slot in self.every])
         directions = rests / np.linalg.norm(rests, axis=1)[:, None]
         rank = int(np.linalg.matrix_rank(directions, tol=1e-9))
-        return rank == len(self.slots[0][0].rest)
+        return rank == self.cell.axes
 
 
 def checked_cell(lattice: Lattice) -> Cell:
@@ -131,8 +135,8 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
     """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual and
     balanced."""
     exact = _ExactVectors()
-    chosen = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
-    slots = tuple(_slots_of(s, shells, exact) for s, shells in enumerate(chosen))
+    sublattices = range(len(cell.sites))
+    slots = tuple(_slots_of(s, metric.shells_around(cell, s), exact) for s in sublattices)
     by_key = {(s.source, s.target, s.cell): s for own in slots for s in own}
     _refuse_gaps(slots, len(by_key))
     planes = []
