@@ -83,7 +83,6 @@ def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
         if (block := plane_block(raster, plane))
     ]
     ends, shell, number, place = (np.concatenate(part) for part in zip(*parts, strict=True))
-    ends.sort(axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     return BondTable(ends[order], shell[order], number[order], place[order])
 
@@ -98,4 +97,5 @@ def _bonds_of_plane(
     b = raster.rows_at(slot.target, *map(add, cells, slot.cell))
     within = np.ravel_multi_index(tuple(cells), raster.shape[1:])
     shell, of_plane = np.full(len(a), slot.shell, np.int8), np.full(len(a), number)
-    return np.stack([a, b], axis=1), shell, of_plane, within
+    ends = np.stack([np.minimum(a, b), np.maximum(a, b)], axis=1)
+    return ends, shell, of_plane, within

@@ -13,8 +13,7 @@ from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.polygons import Polygon, Tiling
-from pbdkit.scene.raster import cells_of_sites
-from pbdkit.scene.sites import Filling, rounding_of, sites_from, trimmed, window
+from pbdkit.scene.sites import Filling, rounding_of, sites_from, sublattices_from, trimmed, window
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +63,7 @@ class _Cutter:
         self.shape = tuple(b - a + 1 + 2 * margin for a, b in zip(low, high, strict=True))
         self._body, self._of_sites = body, any(box.in_sites for box in body.boxes())
         sites = sites_from(lattice, self.low, self.shape)
-        self._sublattice = cells_of_sites(lattice.cell(), *sites.index)[0]
+        self._sublattice = sublattices_from(lattice.cell(), self.low, self.shape)
         self._at, self._tolerance = sites.at, rounding_of(lattice.cell(), *sites.at)
         self._distance = self._signed(sites)
 

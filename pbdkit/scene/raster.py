@@ -136,10 +136,11 @@ class Raster:
         """(particle, axis): the values of planes u, (axis, sublattice, cell, cell), by number."""
         if not self._full:
             flat = u.reshape(len(u), -1)
-            return self._of_all(lambda rows: flat[:, self.place_of(rows)].T, len(u), u.dtype)
+            return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
         out = np.empty((*self.sites.shape, len(u)), u.dtype)
         for s, here, there in self._strides():
-            out[here] = np.moveaxis(u[:, s][(slice(None), *there)], 0, -1)
+            for axis, plane in enumerate(u):
+                out[here][..., axis] = plane[s][there]
         return out.reshape(-1, len(u))
 
     def body_block(self, sublattice: int) -> Block | None:

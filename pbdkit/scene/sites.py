@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Box, Floats, Sites
 from pbdkit.interfaces import Cell, Lattice
+from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.scene.cells import WeighedCells
@@ -70,7 +71,7 @@ def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) 
     cell = lattice.cell()
     inside = np.pad(filling.body, layers)
     low = tuple(n - layers for n in filling.first)
-    window = dilated(inside, layers) & existing(cell, low, inside.shape)
+    window = dilated(inside, layers) & (sublattices_from(cell, low, inside.shape) >= 0)
     sites = np.where(window, np.int8(FRAME), np.int8(EMPTY))
     sites[inside] = FOLLOWER
     first = np.floor_divide(low, cell.period) - reach
@@ -83,11 +84,10 @@ def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) 
     return raster
 
 
-def existing(cell: Cell, low: Index, shape: tuple[int, ...]) -> Mask:
-    """Which sites of a window of indices, from `low` on, the lattice has."""
-    along = [np.arange(n, n + size) for n, size in zip(low, shape, strict=True)]
-    there: Mask = sublattices(cell) >= 0
-    return there[np.ix_(*(n % p for n, p in zip(along, cell.period, strict=True)))]
+def sublattices_from(cell: Cell, low: Index, shape: Index) -> Indices:
+    """The sublattice of each site of a window of indices, from `low` on; -1 at a hole."""
+    window = zip(low, shape, cell.period, strict=True)
+    return sublattices(cell)[np.ix_(*(np.arange(n, n + size) % p for n, size, p in window))]
 
 
 def dilated(mask: Mask, layers: int) -> Mask:
@@ -107,7 +107,7 @@ def window(body: Body, lattice: Lattice) -> tuple[Index, Index]:
     return hull(_indices(box, lattice) for box in body.boxes())
 
 
-def sites_from(lattice: Lattice, low: Index, shape: tuple[int, ...]) -> Sites:
+def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
     """All indices of a window from the site `low` on, and where such sites lie or would lie."""
     index = [n + first for n, first in zip(np.indices(shape), low, strict=True)]
     at = positions(lattice.cell(), *cells_of_sites(lattice.cell(), *index))
@@ -123,7 +123,8 @@ def fill(body: Body, lattice: Lattice) -> Filling:
             "lies beyond the site indices of 32 bits; move it, or the lattice's origin, nearer",
             ("body",),
         )
-    inside = existing(cell, low, tuple(b - a + 1 for a, b in zip(low, high, strict=True))).copy()
+    shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
+    inside = sublattices_from(cell, low, shape) >= 0
     lines = max(1, CHUNK_ROWS // inside[0].size)
     for begin in range(0, len(inside), lines):
         part = inside[begin : begin + lines]
