@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import add
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,8 @@ from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.places import Block, hull
+from pbdkit.scene.places import Block, Floats, Mask, hull
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
-
-Mask = NDArray[np.bool_]
 
 
 def crosses(start: Vector, end: Vector, crack: Segment) -> Mask:
@@ -26,15 +23,13 @@ def crosses(start: Vector, end: Vector, crack: Segment) -> Mask:
     particles parts the row from those on its right; a bond that a tip touches is crossed.
     """
     a, b = (Vector(*point) for point in crack)
-    sides = (_side(a, b, start) >= 0) != (_side(a, b, end) >= 0)
-    ends = _side(start, end, a) * _side(start, end, b) <= 0
-    found: Mask = sides & ends
-    return found
+    parted = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
+    return parted & (_side(start, end, a) * _side(start, end, b) <= 0)
 
 
-def _side(a: Vector, b: Vector, c: Vector) -> Any:
+def _side(a: Vector, b: Vector, c: Vector) -> Floats:
     """Twice the signed area of a, b, c: positive where c lies left of the line from a to b."""
-    return (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
+    return np.asarray((b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x))
 
 
 @dataclass(frozen=True)
@@ -58,12 +53,12 @@ def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
     return Block(plane.slot.source, *hull(corners)) if corners else None
 
 
-def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> NDArray[np.bool_]:
+def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> Mask:
     """Where in the block of a plane a bond starts: both ends are particles, at least one of the
     body, or both where bonds to the frame are left out."""
     here = raster.kind[block.slices()]
     there = raster.kind[block.seen_through(plane.slot).slices()]
-    found: NDArray[np.bool_] = (here == FOLLOWER) & (there == FOLLOWER)
+    found: Mask = (here == FOLLOWER) & (there == FOLLOWER)
     if frame_too:
         found = (here == FOLLOWER) & (there != EMPTY) | (here != EMPTY) & (there == FOLLOWER)
     return found

@@ -16,10 +16,9 @@ from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Side, Tiling
-from pbdkit.scene.places import Block, Where
+from pbdkit.scene.places import Block, Floats, Mask, Where
 from pbdkit.scene.raster import FOLLOWER, Raster
 
-Floats = NDArray[np.float64]
 Slots = tuple[tuple[Slot, ...], ...]
 Step = tuple[int, int, Index]
 Share = NDArray[np.floating[Any]] | float
@@ -47,7 +46,7 @@ class Patch:
     polygon: Polygon
     kind: int
     corners: tuple[Block, ...]
-    whole: NDArray[np.bool_]
+    whole: Mask
 
     def differences(self, u: NDArray[Any]) -> tuple[Vector, ...]:
         """u_k - u_0 of the corners, from planes u, (axis, sublattice, cell, cell)."""

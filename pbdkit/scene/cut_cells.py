@@ -6,16 +6,14 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.polygons import Polygon, Tiling
+from pbdkit.scene.places import Floats
 from pbdkit.scene.sites import Filling, rounding_of, sites_from, sublattices_from, trimmed, window
-
-Floats = NDArray[np.float64]
 
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, FollowerRule, FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import FollowerRule, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
 
 Floats = NDArray[np.floating[Any]]
@@ -62,7 +61,7 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     inside = raster.site_of(raster.body_rows)
     low, high = (tuple(end.tolist()) for end in (inside.min(axis=0), inside.max(axis=0)))
     site = raster.site_of(rows).astype(np.int32)
-    return RasterFrame(raster, rows, raster.lattice.cell(), site, low, high, rule)
+    return RasterFrame(raster.lattice.cell(), site, low, high, rule, raster, rows)
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
@@ -89,11 +88,6 @@ class RasterFrame(FrameSites):
 
     raster: Raster
     frame_rows: Indices
-    cell: Cell
-    site: NDArray[np.int32]
-    low: Index
-    high: Index
-    rule: FollowerRule
 
     def body_at(self, site: NDArray[np.int32]) -> Indices:
         """Looks the sites up on the raster."""

@@ -15,6 +15,9 @@ from pbdkit.interfaces import Offset, Slot
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True)
 class Block:
@@ -76,7 +79,7 @@ class Places:
         return Places(self.shape, self.place + slot_step(self.shape, slot))
 
 
-def bounds(mask: NDArray[np.bool_]) -> tuple[Index, Index] | None:
+def bounds(mask: Mask) -> tuple[Index, Index] | None:
     """(start, stop) of the smallest rectangle around all that is true; None where nothing is."""
     axes = range(mask.ndim)
     some = [np.flatnonzero(mask.any(axis=tuple({*axes} - {axis}))) for axis in axes]

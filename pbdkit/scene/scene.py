@@ -22,8 +22,9 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.places import Mask
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
-from pbdkit.scene.sites import Filling, Mask, build_raster, fill, has_narrow_slot, window
+from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
 
 FLAT = 0.05
@@ -69,11 +70,6 @@ class Scene:
         """The middle of the body's box, from the lattice's site (0, 0)."""
         lower, upper = body_box(self.raster)
         return (lower + upper) / 2
-
-    @property
-    def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds."""
-        return self.experiment.shows_bonds
 
     @cached_property
     def leaders_overlap(self) -> bool:
@@ -178,9 +174,9 @@ def _doubts(
     doubts, frame, rule = [], experiment.frame, experiment.rule
     if (flat := flatness(neighbourhood.cell)) < FLAT:
         doubts.append(
-            f"lattice: nearly degenerate, sites lie {1 / flat:.3g} times closer along "
-            "one line than its longer cell vector is long, so that neighbours by distance lie "
-            "along that line; take chebyshev neighbours, or open the angle between the vectors"
+            f"lattice: nearly degenerate, sites lie {1 / flat:.3g} times closer along one line "
+            "than its longer cell vector is long, so that neighbours by distance lie along that "
+            "line; take chebyshev neighbours, or open the angle between the vectors"
         )
     if not neighbourhood.spans_space():
         doubts.append(

@@ -8,7 +8,6 @@ from itertools import product
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Box, Floats, Sites
@@ -17,7 +16,7 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.scene.cells import WeighedCells
-from pbdkit.scene.places import bounds, hull
+from pbdkit.scene.places import Mask, bounds, hull
 from pbdkit.scene.raster import (
     CHUNK_ROWS,
     EMPTY,
@@ -28,8 +27,6 @@ from pbdkit.scene.raster import (
     positions,
     sublattices,
 )
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
