@@ -33,18 +33,16 @@ def tiling_of(cell: Cell, slots: Slots) -> Tiling:
     in the plane."""
     if len(cell.vectors) != 2:
         return Tiling()
-    polygons = tuple(_polygons(cell, s, slots[s]) for s in range(len(cell.sites)))
+    polygons = tuple(found for s, own in enumerate(slots) for found in _polygons(cell, s, own))
     return Tiling(polygons, _beside(polygons, slots))
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The cells of one shape on a rectangle of the raster: polygon number `kind` of its sublattice,
-    `corners[k]` the block of their k-th corners; `whole` tells of which all corners are particles
-    of the body."""
+    """The cells of one shape on a rectangle of the raster: `corners[k]` is the block of their k-th
+    corners, `whole` tells of which all corners are particles of the body."""
 
     polygon: Polygon
-    kind: int
     corners: tuple[Block, ...]
     whole: Mask
 
@@ -72,12 +70,12 @@ class Patch:
 def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
     """The places with cells whose corners are all of the body, some at a time."""
     found = []
-    for kind, polygon in ((k, p) for own in tiling.polygons for k, p in enumerate(own)):
+    for polygon in tiling.polygons:
         block = _within(raster, polygon)
         for part in block.rows(CELLS_AT_ONCE) if block else ():
             corners = tuple(part.seen_through(corner) for corner in polygon.corners)
             inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
-            patch = Patch(polygon, kind, corners, np.logical_and.reduce(inside))
+            patch = Patch(polygon, corners, np.logical_and.reduce(inside))
             found += [patch] if patch.whole.any() else []
     return tuple(found)
 
@@ -92,7 +90,7 @@ class WeighedCells:
 
     def of(self, patch: Patch) -> Floats:
         """The shares of the cells of a patch."""
-        return patch.corners[0].of(self.share[patch.kind])
+        return patch.corners[0].of(self.share[patch.polygon.kind])
 
     def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
         """The shares to the left and the right of a slot; 1 where all are whole."""
@@ -121,7 +119,7 @@ def _within(raster: Raster, polygon: Polygon) -> Block | None:
     return there if (start < stop).all() else None
 
 
-def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon, ...]:
+def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[Polygon]:
     """Those whose first corner is of sublattice `source`, counter-clockwise; corners that are
     neighbours lie where the slots say, to the last bit."""
     exact = {(slot.target, slot.cell): slot.rest for slot in slots}
@@ -132,8 +130,9 @@ def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon
         others = tuple(around[k] for k in places)
         # It is met from each of its corners: kept is the first.
         if all(_is_ahead(offset.rest) for offset in others):
-            found.append(Polygon(source, (cell.offset(source, source, (0, 0)), *others)))
-    return tuple(sorted(found, key=lambda polygon: math.atan2(*polygon.rest[1][::-1])))
+            found.append((cell.offset(source, source, (0, 0)), *others))
+    found.sort(key=lambda corners: math.atan2(*corners[1].rest[::-1]))
+    return (Polygon(source, kind, corners) for kind, corners in enumerate(found))
 
 
 def _is_ahead(r: Components) -> bool:
@@ -141,23 +140,20 @@ def _is_ahead(r: Components) -> bool:
     return bool(r.x > 0.0 if level else r.y > 0.0)
 
 
-def _beside(
-    polygons: tuple[tuple[Polygon, ...], ...], slots: Slots
-) -> dict[Slot, tuple[Side, Side]]:
+def _beside(polygons: tuple[Polygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
     """The cells beside every slot, where the neighbours are the corners of simple cells."""
     slot_of = {(slot.source, slot.target, slot.cell): slot for own in slots for slot in own}
     left: dict[Step, Side] = {}
     right: dict[Step, Side] = {}
-    every = [(kind, polygon) for own in polygons for kind, polygon in enumerate(own)]
-    for kind, polygon in every:
+    for polygon in polygons:
         corners = polygon.corners
         for start, end in permutations(range(len(corners)), 2):
-            side = Side(kind, slot_of.get(_step(corners[start], corners[0])), start, end)
+            side = Side(polygon.kind, slot_of.get(_step(corners[start], corners[0])), start, end)
             step, ahead = _step(corners[start], corners[end]), (end - start) % len(corners)
             left |= {step: side} if ahead < len(corners) - 1 else {}
             right |= {step: side} if ahead > 1 else {}
     fits = left.keys() == right.keys() == slot_of.keys()
-    if not (fits and all(_is_simple(polygon) for _, polygon in every)):
+    if not (fits and all(map(_is_simple, polygons))):
         return {}
     return {slot: (left[step], right[step]) for step, slot in slot_of.items()}
 

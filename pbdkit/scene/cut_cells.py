@@ -34,11 +34,11 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     no cell.
     """
     cutter = _Cutter(body, lattice, tiling)
-    share = np.zeros((max(map(len, tiling.polygons)), *cutter.shape))
+    share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *cutter.shape))
     corner = np.zeros(cutter.shape, bool)
-    for kind, polygon in ((kind, p) for own in tiling.polygons for kind, p in enumerate(own)):
+    for polygon in tiling.polygons:
         i, j, found = cutter.shares(polygon)
-        share[kind, i, j] = found
+        share[polygon.kind, i, j] = found
         for m, n in (at.site for at in polygon.corners):
             corner[i + m, j + n] = True
     if not (filling := trimmed(cutter.low, corner, share)):
@@ -55,8 +55,8 @@ class _Cutter:
 
     def __init__(self, body: Body, lattice: Lattice, tiling: Tiling) -> None:
         low, high = window(body, lattice)
-        corners = (at for own in tiling.polygons for p in own for at in p.corners)
-        margin = max(2, *(abs(n) for at in corners for n in at.site))
+        corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
+        margin = max(2, *(abs(n) for corner in corners for n in corner.site))
         self.low = tuple(n - margin for n in low)
         self.shape = tuple(b - a + 1 + 2 * margin for a, b in zip(low, high, strict=True))
         self._body, self._of_sites = body, any(box.in_sites for box in body.boxes())

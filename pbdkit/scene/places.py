@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import add, sub
 from typing import Any
@@ -88,8 +88,8 @@ def bounds(mask: Mask) -> tuple[Index, Index] | None:
     return tuple(int(n[0]) for n in some), tuple(int(n[-1]) + 1 for n in some)
 
 
-def hull(boxes: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
-    """The smallest and the largest index along each axis over some (low, high)."""
+def hull(boxes: Iterable[tuple[Sequence[Any], Sequence[Any]]]) -> tuple[Any, Any]:
+    """The smallest and the largest number along each axis over some (low, high), as tuples."""
     low, high = zip(*boxes, strict=True)
     return tuple(map(min, zip(*low, strict=True))), tuple(map(max, zip(*high, strict=True)))
 

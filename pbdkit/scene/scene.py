@@ -22,7 +22,7 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.places import Mask
+from pbdkit.scene.places import Mask, hull
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
@@ -160,12 +160,10 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
 def body_box(raster: Raster) -> tuple[Components, Components]:
     """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
     cell = raster.lattice.cell()
-    lower, upper = np.full(len(cell.vectors), np.inf), np.full(len(cell.vectors), -np.inf)
-    for rows in raster.chunks():
-        x = np.array(positions(cell, *raster.cells_of(rows[raster.table_kind[rows] == FOLLOWER])))
-        lower = np.minimum(lower, x.min(axis=1, initial=np.inf))
-        upper = np.maximum(upper, x.max(axis=1, initial=-np.inf))
-    return vector(lower.tolist()), vector(upper.tolist())
+    bodies = (rows[raster.table_kind[rows] == FOLLOWER] for rows in raster.chunks())
+    parts = (positions(cell, *raster.cells_of(rows)) for rows in bodies if len(rows))
+    lower, upper = hull(([x.min() for x in at], [x.max() for x in at]) for at in parts)
+    return vector(map(float, lower)), vector(map(float, upper))
 
 
 def _doubts(
