@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,8 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
 from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
-
-Floats = NDArray[np.floating[Any]]
 
 SHOWN = 5
 """So many warnings of one kind are given."""

@@ -138,28 +138,20 @@ class Raster:
             flat = u.reshape(len(u), -1)
             return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
         out = np.empty((*self.sites.shape, len(u)), u.dtype)
-        for s, here, there in self._strides():
+        cell = self.lattice.cell()
+        for s, site in enumerate(cell.sites):
+            skip = np.subtract(site.index, self.low) % cell.period
+            own = out[tuple(slice(n, None, p) for n, p in zip(skip, cell.period, strict=True))]
+            begin = np.add(self.low, skip) // cell.period - self.first
+            there = tuple(map(slice, begin, begin + own.shape[:-1]))
             for axis, plane in enumerate(u):
-                out[here][..., axis] = plane[s][there]
+                own[..., axis] = plane[s][there]
         return out.reshape(-1, len(u))
 
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
         found = bounds(self.kind[sublattice] == FOLLOWER)
         return Block(sublattice, *found) if found else None
-
-    def _strides(self) -> Iterator[tuple[int, tuple[slice, ...], tuple[slice, ...]]]:
-        """(sublattice, its sites in the window, its cells on the raster)."""
-        cell = self.lattice.cell()
-        for s, site in enumerate(cell.sites):
-            here, there = [], []
-            for axis, (period, low) in enumerate(zip(cell.period, self.low, strict=True)):
-                skip = (site.index[axis] - low) % period
-                number = len(range(skip, self.sites.shape[axis], period))
-                begin = (low + skip) // period - self.first[axis]
-                here.append(slice(skip, None, period))
-                there.append(slice(begin, begin + number))
-            yield s, tuple(here), tuple(there)
 
 
 def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:
