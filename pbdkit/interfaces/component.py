@@ -34,15 +34,9 @@ class Strict(BaseModel):
     """
 
     model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        validate_default=True,
-        validate_by_name=False,
-        validate_by_alias=True,
-        serialize_by_alias=True,
-    )
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True,
+        validate_by_name=False, validate_by_alias=True, serialize_by_alias=True,
+    )  # fmt: skip
 
     @classmethod
     def known_keys(cls) -> list[str]:

@@ -48,7 +48,7 @@ class Measured:
         """The lengths of the dimensions that are known before the first step."""
         scene = self._scene
         sizes = {"particle": scene.raster.count, "axis": scene.axes, "index": scene.axes}
-        if scene.shows_bonds:
+        if scene.experiment.shows_bonds:
             sizes |= {"bond": len(scene.bonds.ends), "end": 2}
         if self.shows_leaders:
             sizes["leader_group"] = len(scene.leading)

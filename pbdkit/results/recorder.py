@@ -81,7 +81,7 @@ class Recorder:
             "site": raster.site_table,
             "reference": raster.reference,
         }
-        if scene.shows_bonds:
+        if scene.experiment.shows_bonds:
             known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
         if self._measured.shows_leaders:
             known["leader_group"] = lambda: np.arange(len(scene.leading))
@@ -131,7 +131,7 @@ class Recorder:
 
     def _columns(self) -> list[Column]:
         columns = layout.base_columns()
-        if self._scene.shows_bonds:
+        if self._scene.experiment.shows_bonds:
             columns += layout.bond_columns()
         if self._scene.has_fracture:
             columns += layout.broken_columns()

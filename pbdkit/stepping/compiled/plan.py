@@ -38,7 +38,8 @@ class Level:
     @cached_property
     def seen(self) -> Seen:
         """The numbers that the rule sees."""
-        return numbers_of(self.scene)
+        scene = self.scene
+        return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
 
     @property
     def renews(self) -> bool:
