@@ -10,8 +10,7 @@ import numpy as np
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
-from pbdkit.stepping.followers import Followers, SlotFollowers
-from pbdkit.stepping.moving_neighbours import GatheringFollowers
+from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import Floats, State
 
@@ -38,10 +37,8 @@ class Stepper(Engine):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
-        near = scene.experiment.neighbours.nearness()
-        self._followers: Followers = followers or (
-            GatheringFollowers(scene, near) if near else SlotFollowers(scene)
-        )
+        kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
+        self._followers = followers or kind(scene)
 
     def advance(self, state: State, steps: int = 1) -> State:
         """One step after the other."""

@@ -15,8 +15,7 @@ from pbdkit.scene.places import Where
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Contributions, Mask, Neighbour, summed
-from pbdkit.stepping.remembered_values import shown
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import State, shown
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
@@ -59,7 +58,7 @@ class Surroundings:
     def here(self, u: NDArray[Any], state: State) -> Here:
         """What stands at the particles."""
         own = self._scene.constants.of_particle(*shown(self.own(state)))
-        return Here(read_only(vector(self.where.of(u))), *self._reference, own)
+        return Here(vector(shown(self.where.of(u))), *self._reference, own)
 
     def own(self, state: State) -> list[NDArray[Any]]:
         """What is remembered of the particles; of a block, views into the state."""
@@ -72,7 +71,7 @@ class Surroundings:
         state: State,
     ) -> Contributions:
         """Σ function(d, u, neighbour), as the evaluator's `contribution` is."""
-        own = read_only(vector(self.where.of(u)))
+        own = vector(shown(self.where.of(u)))
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
         return summed((function(d, own, to), to.present) for d, to in parts)
 
@@ -108,13 +107,6 @@ def blocks(scene: Scene) -> list[Surroundings]:
         if block
         for part in block.rows(BLOCK_CELLS)
     ]
-
-
-def read_only(v: Any) -> Any:
-    """The same, as components hand it to a rule: nobody writes to the state but the stepper."""
-    for plane in v:
-        plane.flags.writeable = False
-    return v
 
 
 def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,33 +13,44 @@ from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import plane_block
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.plan import Level
-from pbdkit.stepping.state import State
+from pbdkit.stepping.compiled.plan import Level, Plan
+from pbdkit.stepping.state import Floats, State
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, Any]
 
 
 def constant_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
     """What does not change from step to step."""
-    frame, cell = scene.frame, scene.raster.lattice.cell()
-    real = np.dtype(scene.experiment.stepping.precision)
-    none = np.empty(0, np.intp)
-    entries, mapped = none, np.empty(0)
-    if frame:
-        counts = np.bincount(frame.map.point, minlength=len(frame.place))
-        entries, mapped = np.concatenate([[0], np.cumsum(counts)]), frame.map.weight
-    return {
+    cell, real = scene.raster.lattice.cell(), np.dtype(scene.experiment.stepping.precision)
+    arrays = {
         "kind": scene.raster.kind,
-        "share": np.array(scene.cells.share if scene.cells else np.empty(0), real),
         "first": np.array(scene.raster.first, np.int64),
         "at": np.array([site.at for site in cell.sites]),
-        "points": frame.place if frame else none,
-        "entries": entries,
-        "bodies": frame.body_place if frame else none,
-        "mapped": mapped.astype(real),
         **rule_arrays(scene, levels),
         **_by_slot(scene, levels, real),
         **_by_plane(scene, real),
+    }
+    if scene.cells:
+        arrays["share"] = np.array(scene.cells.share, real)
+    if frame := scene.frame:
+        counts = np.bincount(frame.map.point, minlength=len(frame.place))
+        arrays |= {
+            "points": frame.place,
+            "entries": np.concatenate([[0], np.cumsum(counts)]),
+            "bodies": frame.body_place,
+            "mapped": frame.map.weight.astype(real),
+        }
+    return arrays
+
+
+def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
+    """Displacements u, those of the step before, and what a state remembers."""
+    return {
+        **dict(zip([*plan.each("u_@"), *plan.each("v_@")], [*u, *v], strict=True)),
+        **{f"bond{n}": value for n, value in enumerate(state.bond_values)},
+        **{f"own{n}": value for n, value in enumerate(state.particle_values)},
+        "broken": state.broken_step,
+        "lengths": state.broken_length,
     }
 
 
@@ -59,7 +70,7 @@ def _by_slot(scene: Scene, levels: Sequence[Level], real: np.dtype[Any]) -> Arra
     """Numbers of each slot, (sublattice, slot, ...): rest offset, limits, weights, the sign of d at
     the home of its bonds, and from a particle's place in flat arrays the way to the neighbour, to
     the home of the bond in planes of bonds, and to the shares of the cells beside it."""
-    around, shape, limits = scene.neighbourhood, scene.raster.shape, scene.constants.limits
+    around, shape = scene.neighbourhood, scene.raster.shape
     beside = scene.cells.tiling.beside if scene.cells else {}
     plane_size, size = math.prod(shape[1:]), math.prod(shape)
 
@@ -74,26 +85,22 @@ def _by_slot(scene: Scene, levels: Sequence[Level], real: np.dtype[Any]) -> Arra
             for side in beside.get(slot, ())
         ]
 
-    numbers: dict[str, tuple[Any, Any]] = {
+    numbers: dict[str, tuple[Callable[[Slot], Any], Any]] = {
         "rests": (lambda slot: slot.rest, real),
-        "limits": (lambda slot: limits.get(slot, ()), real),
+        "limits": (scene.constants.limits.__getitem__, real),
         "signs": (lambda slot: 1.0 if around.home[slot][1] else -1.0, real),
         "away": (lambda slot: slot_step(shape, slot), np.int64),
         "bonds_away": (bonds_away, np.int64),
         "cells_away": (cells_away, np.int64),
     }
     for level in levels:
-        weights = level.scene.constants.weights
-        numbers[f"weights{level.number}"] = (weights.__getitem__, real)
+        numbers[f"weights{level.number}"] = (level.scene.constants.weights.__getitem__, real)
     most = max(map(len, around.slots))
-    found: Arrays = {"counts": np.array([len(own) for own in around.slots])}
-    for name, (value, dtype) in numbers.items():
-        one = np.array(value(around.slots[0][0]), dtype)
-        found[name] = np.zeros((shape[0], most, *one.shape), dtype)
-        for s, own in enumerate(around.slots):
-            for k, slot in enumerate(own):
-                found[name][s, k] = np.array(value(slot), dtype)
-    return found
+    padded = [[*own, *own[:1] * (most - len(own))] for own in around.slots]
+    return {"counts": np.array([len(own) for own in around.slots])} | {
+        name: np.array([[value(slot) for slot in own] for own in padded], dtype)
+        for name, (value, dtype) in numbers.items()
+    }
 
 
 def _by_plane(scene: Scene, real: np.dtype[Any]) -> Arrays:
@@ -106,31 +113,25 @@ def _by_plane(scene: Scene, real: np.dtype[Any]) -> Arrays:
     return {
         "ends": np.array([(p.slot.source, p.slot.target, *p.slot.cell) for p in planes]),
         "end_rests": np.array([p.slot.rest for p in planes], real),
-        "end_limits": np.array([limits.get(p.slot, ()) for p in planes], real),
+        "end_limits": np.array([limits[p.slot] for p in planes], real),
         "end_blocks": blocks,
     }
 
 
-def bits_for(scene: Scene) -> Any:
+def bits_for(scene: Scene) -> np.dtype[Any]:
     """The smallest unsigned integer with a bit for every slot."""
-    most = max(map(len, scene.neighbourhood.slots))
-    return next(t for t, bits in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32)) if most <= bits)
+    return np.min_scalar_type(2 ** max(map(len, scene.neighbourhood.slots)) - 1)
 
 
 def lost_bits(scene: Scene, state: State) -> NDArray[np.unsignedinteger[Any]]:
     """Bit k of a particle: the bond along its slot k is broken; both ends know."""
     assert state.broken_step is not None
-    dtype = bits_for(scene)
-    lost = np.zeros(scene.raster.shape, dtype)
+    lost = np.zeros(scene.raster.shape, bits_for(scene))
     for n, plane in enumerate(scene.neighbourhood.planes):
-        block = plane_block(scene.raster, plane)
-        if block is None:
-            continue
-        broken = (block.within(state.broken_step[n]) >= 0).astype(dtype)
-        for slot, seen in ((plane.slot, block), (plane.opposite, block.seen_through(plane.slot))):
-            seen.of(lost)[...] |= broken << dtype(_place_of(scene, slot))
+        if block := plane_block(scene.raster, plane):
+            broken = (block.within(state.broken_step[n]) >= 0).astype(lost.dtype)
+            ends = (plane.slot, block), (plane.opposite, block.seen_through(plane.slot))
+            for slot, seen in ends:
+                bit = scene.neighbourhood.slots[slot.source].index(slot)
+                seen.of(lost)[...] |= broken << lost.dtype.type(bit)
     return lost
-
-
-def _place_of(scene: Scene, slot: Slot) -> int:
-    return scene.neighbourhood.slots[slot.source].index(slot)

@@ -12,7 +12,6 @@ from pbdkit.interfaces import (
     FollowerRule,
     FractureModel,
     Here,
-    Remembered,
     RenewsBonds,
     RenewsParticles,
     Softens,
@@ -25,7 +24,7 @@ from pbdkit.stepping.compiled.kernel_cache import load_kernel
 from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.followers import target
-from pbdkit.stepping.remembered_values import changing, renew
+from pbdkit.stepping.state import started
 
 Function = Callable[..., Any]
 
@@ -35,7 +34,7 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
     scenes = [scene]
     while inner := scenes[0].inner:
         scenes.insert(0, inner)
-    return tuple(Level(n, of, _parts(of), last=of is scene) for n, of in enumerate(scenes))
+    return tuple(Level(n, of, _parts(of)) for n, of in enumerate(scenes))
 
 
 def functions_of(levels: Sequence[Level]) -> dict[str, Function]:
@@ -76,28 +75,19 @@ def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | Fr
     return next((r for r in rules if f"function {r.apply.__qualname__} " in text), rules[-1])
 
 
-def sample_values(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Any:
-    """Arrays of one place as remembered numbers are kept in."""
-    precision = scene.experiment.stepping.precision
-    return tuple(
-        np.full(shape, number.initial, precision if number.dtype == "f8" else number.dtype)
-        for number in numbers
-    )
-
-
 def _parts(scene: Scene) -> tuple[int, ...]:
     """The components of each contribution. What functions return by mistake is refused as numpy
     refuses it: a kernel would take some of it for numbers."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     ones = np.ones(1, experiment.stepping.precision)
     one: Components = vector([ones] * scene.axes)
-    own = sample_values(scene, particle_numbers(experiment), (1,))
+    own = started(scene, particle_numbers(experiment), (1,))
     slot = scene.neighbourhood.slots[0][0]
     with np.errstate(all="ignore"):
         if scene.has_fracture:
             with blaming(experiment.fracture, "to compile"):
                 limits = scene.constants.limits[slot]
-                bond = sample_values(scene, bond_numbers(experiment), (1,))
+                bond = started(scene, bond_numbers(experiment), (1,))
                 evaluator.renew_bonds(one, slot.rest, limits, bond, np.ones(1, bool))
                 evaluator.breaks(one, slot.rest, limits, bond)
         with blaming(experiment.rule, "to compile"):
@@ -105,7 +95,5 @@ def _parts(scene: Scene) -> tuple[int, ...]:
             here = Here(one, one, one, scene.constants.of_particle(*own))
             for component in evaluator.move(total, here):
                 target(ones, component, ones, experiment.stepping)
-            if isinstance(experiment.rule, RenewsParticles):
-                fresh = changing(particle_numbers(experiment), own)
-                renew(fresh, evaluator.remember(total, here), None)
+            evaluator.renew_particles(total, here, own, None)
     return tuple(len(part) if isinstance(part, Components) else 1 for part in total)
