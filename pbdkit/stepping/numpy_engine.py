@@ -12,7 +12,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 
 class Engine(ABC):
@@ -58,11 +58,7 @@ class Stepper(Engine):
             self._followers.move(u, new, state)
         place(new, led)
         place(u, before)
-        self._move_frame(u, new)
-        return replace(state, step=step, u=new, previous=u, starts=starts)
-
-    def _move_frame(self, old: Floats, new: Floats) -> None:
-        """u of every frame point from the body's, of this step or, with lag, of the last."""
         if self._scene.frame:
-            body = old if self._scene.frame.map.lag else new
-            self._scene.frame.follow(body.reshape(len(body), -1), new.reshape(len(new), -1))
+            body = u if self._scene.frame.map.lag else new
+            self._scene.frame.follow(body.reshape(len(u), -1), new.reshape(len(u), -1))
+        return replace(state, step=step, u=new, previous=u, starts=starts)

@@ -100,11 +100,10 @@ class Surroundings:
 
 def blocks(scene: Scene) -> list[Surroundings]:
     """The surroundings of the body's particles, block by block."""
-    whole = ((s, scene.raster.body_block(s)) for s in range(scene.raster.shape[0]))
     return [
         Surroundings(scene, part, s)
-        for s, block in whole
-        if block
+        for s in range(scene.raster.shape[0])
+        if (block := scene.raster.body_block(s))
         for part in block.rows(BLOCK_CELLS)
     ]
 

@@ -49,9 +49,9 @@ class CompiledStepper(Engine):
         if scene.experiment.neighbours.nearness():
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
-        self._reach = Reach(scene)
         self._last: State | None = None
         levels = levels_of(scene)
+        self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
         self._arrays = constant_arrays(scene, levels) | {"runs": runs, "starts": starts}

@@ -84,8 +84,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
-    bonds = range(plan.bonds if plan.model else 0)
-    bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in bonds]
+    bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
     since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
     out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
     if plan.long:

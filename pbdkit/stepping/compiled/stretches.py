@@ -44,16 +44,12 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
 def _joined(lines: Ints) -> Ints:
     """Stretches at one place of rows that follow each other, as one."""
     *lead, row, begin, end = lines.T
-    order = np.lexsort((row, end, begin, *reversed(lead)))
-    *lead, row, begin, end = lines[order].T
-    goes_on = np.ones(len(row) - 1, bool)
-    for places in (*lead, begin, end):
-        goes_on &= np.diff(places) == 0
-    goes_on &= np.diff(row) == 1
+    lines = lines[np.lexsort((row, end, begin, *reversed(lead)))]
+    step = np.diff(lines, axis=0)
+    goes_on = (np.delete(step, -3, axis=1) == 0).all(axis=1) & (step[:, -3] == 1)
     first = np.flatnonzero(np.concatenate([[True], ~goes_on]))
     last = np.append(first[1:], len(row)) - 1
-    runs = np.stack([*(n[first] for n in lead), row[first], row[last] + 1, begin[first],
-                     end[first]], axis=1)  # fmt: skip
+    runs = np.insert(lines[first], -2, lines[last, -3] + 1, axis=1)
     ordered: Ints = runs[np.lexsort(tuple(runs.T[::-1]))]
     return ordered
 
