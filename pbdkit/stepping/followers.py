@@ -166,8 +166,8 @@ class GatheringFollowers(Followers):
         parts = self._evaluator.contribution(d, vector(u[:, j]), to)
         total = tuple(_summed(part, j, count) for part in parts)
         own = [value.ravel()[self.place] for value in state.particle_values]
-        of_particle = self._scene.constants.of_particle
-        here = Here(vector(u), self._at, self._centred, of_particle(*own))
+        of_particle = self._scene.constants.of_particle(*own)
+        here = Here(vector(u), self._at, self._centred, of_particle)
         move = self._evaluator.move(total, here)
         movable = self.body[np.bincount(j, minlength=count)[self.body] > 0]
         place = self.place[movable]
@@ -201,11 +201,10 @@ class GatheringFollowers(Followers):
         sizes = np.array(self._rank.shape[2:])[:, None]
         step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
         near = ((step >= 0) & (step < sizes)).all(axis=0)
-        rank = np.full(len(j), len(self._rest[0]))
+        rank, rest = np.full(len(j), len(self._rest[0])), self.X[:, k] - self.X[:, j]
         rank[near] = self._rank[(s[j[near]], s[k[near]], *step[:, near])]
-        slot = np.minimum(rank, len(self._rest[0]) - 1)
         known = rank < len(self._rest[0])
-        rest: Floats = np.where(known, self._rest[:, slot], self.X[:, k] - self.X[:, j])
+        rest[:, known] = self._rest[:, rank[known]]
         return rank, rest
 
 

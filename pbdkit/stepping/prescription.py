@@ -28,7 +28,7 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
         n_th = step - leading.group.from_ + 1
         offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
         led.append((leading.place, begun + np.atleast_2d(offset).T))
-    if scene.leaders_overlap:
+    if scene.leaders_overlap and len(led) > 1:
         _refuse_contradiction(scene, led, step)
     return led, tuple(starts)
 
@@ -36,8 +36,6 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
 def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     """What could not be known before: groups that move one particle differently from where it
     stands."""
-    if len(led) < 2:
-        return
     places = np.concatenate([p for p, _ in led])
     u = np.concatenate([v for _, v in led], axis=1)
     order = np.argsort(places, kind="stable")

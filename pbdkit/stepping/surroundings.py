@@ -19,6 +19,8 @@ from pbdkit.stepping.state import State, shown
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
+Contributing = Callable[[Components, Components, Neighbour], Contributions]
+"""What a neighbour contributes, given d and u."""
 
 
 class Surroundings:
@@ -64,12 +66,7 @@ class Surroundings:
         """What is remembered of the particles; of a block, views into the state."""
         return [self.where.of(value) for value in state.particle_values]
 
-    def sums(
-        self,
-        function: Callable[[Components, Components, Neighbour], Contributions],
-        u: NDArray[Any],
-        state: State,
-    ) -> Contributions:
+    def sums(self, function: Contributing, u: NDArray[Any], state: State) -> Contributions:
         """Σ function(d, u, neighbour), as the evaluator's `contribution` is."""
         own = vector(shown(self.where.of(u)))
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
@@ -112,8 +109,5 @@ def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask |
     """For each slot, where the neighbour exists, None where it does everywhere; only places with a
     particle count."""
     nobody = place.of(raster.kind) == EMPTY
-    found: list[Mask | None] = []
-    for slot in slots:
-        present = place.seen_through(slot).of(raster.kind) != EMPTY
-        found.append(None if (present | nobody).all() else present)
-    return found
+    there = (place.seen_through(slot).of(raster.kind) != EMPTY for slot in slots)
+    return [None if (present | nobody).all() else present for present in there]

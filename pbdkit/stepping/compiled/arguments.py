@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,35 +12,38 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import plane_block
+from pbdkit.scene.neighbourhood import BondPlane
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.plan import Level, Plan
+from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.state import Floats, State
 
 Arrays = dict[str, Any]
 
 
-def constant_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
+def constant_arrays(plan: Plan) -> Arrays:
     """What does not change from step to step."""
-    cell, real = scene.raster.lattice.cell(), np.dtype(scene.experiment.stepping.precision)
+    scene, slots = plan.scene, plan.scene.neighbourhood.slots
+    most, real = max(map(len, slots)), np.dtype(scene.experiment.stepping.precision)
+    # Sublattices with fewer neighbours than others have the first once more, which nobody reads.
+    padded = [slot for own in slots for slot in (*own, *own[:1] * (most - len(own)))]
+    by_slot = _stacked([_of_slot(plan, slot) for slot in padded], real)
     arrays = {
         "kind": scene.raster.kind,
         "first": np.array(scene.raster.first, np.int64),
-        "at": np.array([site.at for site in cell.sites]),
-        **rule_arrays(scene, levels),
-        **_by_slot(scene, levels, real),
-        **_by_plane(scene, real),
+        "at": np.array([site.at for site in scene.raster.lattice.cell().sites]),
+        "counts": np.array([len(own) for own in slots]),
+        **rule_arrays(plan),
+        **{name: v.reshape(len(slots), most, *v.shape[1:]) for name, v in by_slot.items()},
+        **_stacked([_of_plane(scene, plane) for plane in scene.neighbourhood.planes], real),
     }
     if scene.cells:
         arrays["share"] = np.array(scene.cells.share, real)
     if frame := scene.frame:
         counts = np.bincount(frame.map.point, minlength=len(frame.place))
-        arrays |= {
-            "points": frame.place,
-            "entries": np.concatenate([[0], np.cumsum(counts)]),
-            "bodies": frame.body_place,
-            "mapped": frame.map.weight.astype(real),
-        }
+        arrays |= {"points": frame.place, "bodies": frame.body_place}
+        arrays["entries"] = np.concatenate([[0], np.cumsum(counts)])
+        arrays["mapped"] = frame.map.weight.astype(real)
     return arrays
 
 
@@ -54,67 +58,50 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
     }
 
 
-def rule_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
+def rule_arrays(plan: Plan) -> Arrays:
     """The parameters of rules and solver."""
-    solver = scene.experiment.stepping
-    real = np.dtype(solver.precision)
+    solver = plan.scene.experiment.stepping
     # One more, so that no array is empty.
-    rules = {level.number: [*level.scene.constants.rule, 0.0] for level in levels}
+    rules = {f"rule{n}": [*own.scene.constants.rule, 0.0] for n, own in enumerate(plan.levels)}
+    numbers = {"solver": [solver.relaxation, solver.memory], **rules}
+    return {name: np.array(values, solver.precision) for name, values in numbers.items()}
+
+
+def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
+    """The numbers of all rows by name, (row, ...)."""
+    stacked = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return {name: v.astype(real if v.dtype.kind == "f" else int) for name, v in stacked.items()}
+
+
+def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
+    """Rest offset, limits, weights, the sign of d at the home of its bonds, and from a particle's
+    place in flat arrays the way to the neighbour, to the home of the bond in planes of bonds, and
+    to the shares of the cells beside it."""
+    scene, shape = plan.scene, plan.scene.raster.shape
+    away, (plane, here) = slot_step(shape, slot), scene.neighbourhood.home[slot]
+    home = plane - (slot.source if here else slot.target)
+    beside = scene.cells.tiling.beside[slot] if scene.cells else ()
+    cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in beside]
     return {
-        "solver": np.array([solver.relaxation, solver.memory], real),
-        **{f"rule{n}": np.array(values, real) for n, values in rules.items()},
+        "rests": slot.rest,
+        "limits": scene.constants.limits[slot],
+        "signs": 1.0 if here else -1.0,
+        "away": away,
+        "bonds_away": home * math.prod(shape[1:]) + (0 if here else away),
+        "cells_away": [kind * math.prod(shape) + step for kind, step in cells],
+        **{f"weights{n}": own.scene.constants.weights[slot] for n, own in enumerate(plan.levels)},
     }
 
 
-def _by_slot(scene: Scene, levels: Sequence[Level], real: np.dtype[Any]) -> Arrays:
-    """Numbers of each slot, (sublattice, slot, ...): rest offset, limits, weights, the sign of d at
-    the home of its bonds, and from a particle's place in flat arrays the way to the neighbour, to
-    the home of the bond in planes of bonds, and to the shares of the cells beside it."""
-    around, shape = scene.neighbourhood, scene.raster.shape
-    beside = scene.cells.tiling.beside if scene.cells else {}
-    plane_size, size = math.prod(shape[1:]), math.prod(shape)
-
-    def bonds_away(slot: Slot) -> int:
-        plane, here = around.home[slot]
-        source = slot.source if here else slot.target
-        return (plane - source) * plane_size + (0 if here else slot_step(shape, slot))
-
-    def cells_away(slot: Slot) -> list[int]:
-        return [
-            side.kind * size + (slot_step(shape, side.first) if side.first else 0)
-            for side in beside.get(slot, ())
-        ]
-
-    numbers: dict[str, tuple[Callable[[Slot], Any], Any]] = {
-        "rests": (lambda slot: slot.rest, real),
-        "limits": (scene.constants.limits.__getitem__, real),
-        "signs": (lambda slot: 1.0 if around.home[slot][1] else -1.0, real),
-        "away": (lambda slot: slot_step(shape, slot), np.int64),
-        "bonds_away": (bonds_away, np.int64),
-        "cells_away": (cells_away, np.int64),
-    }
-    for level in levels:
-        numbers[f"weights{level.number}"] = (level.scene.constants.weights.__getitem__, real)
-    most = max(map(len, around.slots))
-    padded = [[*own, *own[:1] * (most - len(own))] for own in around.slots]
-    return {"counts": np.array([len(own) for own in around.slots])} | {
-        name: np.array([[value(slot) for slot in own] for own in padded], dtype)
-        for name, (value, dtype) in numbers.items()
-    }
-
-
-def _by_plane(scene: Scene, real: np.dtype[Any]) -> Arrays:
-    """Numbers of each plane of bonds: source, target and step, rest offset, limits, block."""
-    planes, limits = scene.neighbourhood.planes, scene.constants.limits
-    blocks = np.zeros((len(planes), 2 * scene.axes), np.int64)
-    for n, plane in enumerate(planes):
-        if block := plane_block(scene.raster, plane):
-            blocks[n, ::2], blocks[n, 1::2] = block.start, block.stop
+def _of_plane(scene: Scene, plane: BondPlane) -> dict[str, Any]:
+    """Of a plane of bonds source, target and step, rest offset, limits, block."""
+    slot, block = plane.slot, plane_block(scene.raster, plane)
+    spans = zip(block.start, block.stop, strict=True) if block else [(0, 0)] * scene.axes
     return {
-        "ends": np.array([(p.slot.source, p.slot.target, *p.slot.cell) for p in planes]),
-        "end_rests": np.array([p.slot.rest for p in planes], real),
-        "end_limits": np.array([limits[p.slot] for p in planes], real),
-        "end_blocks": blocks,
+        "ends": (slot.source, slot.target, *slot.cell),
+        "end_rests": slot.rest,
+        "end_limits": scene.constants.limits[slot],
+        "end_blocks": list(chain(*spans)),
     }
 
 

@@ -11,12 +11,7 @@ import numpy as np
 
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.arguments import (
-    bits_for,
-    constant_arrays,
-    lost_bits,
-    state_arrays,
-)
+from pbdkit.stepping.compiled.arguments import bits_for, constant_arrays, lost_bits, state_arrays
 from pbdkit.stepping.compiled.emitter import write_kernel
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
@@ -54,7 +49,7 @@ class CompiledStepper(Engine):
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
-        self._arrays = constant_arrays(scene, levels) | {"runs": runs, "starts": starts}
+        self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
         start = unmoved_state(scene, (1,) * scene.axes)
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)

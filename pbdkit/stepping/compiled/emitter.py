@@ -94,11 +94,8 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
                 out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
                 _write_frame(out, plan, f"fz{n}", f"fz{n}")
     out.add(1, "for e in range(led.size):")
-    out.add(
-        2,
-        *plan.each("fv_@[led[e]] = led_values[#, e]"),
-        *plan.each("fu_@[led[e]] = led_kept[#, e]"),
-    )
+    out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
+    out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))
     if plan.scene.frame:
         _write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
@@ -119,13 +116,12 @@ def _write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
     """Frame points from flat planes of the body."""
     assert plan.scene.frame
     out.add(1, "for f in range(points.size):")
-    out.add(
-        2, *plan.each(f"t_@ = {plan.number(0.0)}"), "for e in range(entries[f], entries[f + 1]):"
-    )
+    out.add(2, *plan.each(f"t_@ = {plan.number(0.0)}"))
+    out.add(2, "for e in range(entries[f], entries[f + 1]):")
     for a, c in enumerate(plan.axes):
+        term = f"mapped[e] * {source}_{c}[bodies[e]]"
         if plan.scene.frame.map.weight.ndim == 3:
             terms = plan.each(f"mapped[e, {a}, #] * {source}_@[bodies[e]]")
-            out.add(3, f"t_{c} = t_{c} + ({' + '.join(terms)})")
-        else:
-            out.add(3, f"t_{c} = t_{c} + mapped[e] * {source}_{c}[bodies[e]]")
+            term = f"({' + '.join(terms)})"
+        out.add(3, f"t_{c} = t_{c} + {term}")
     out.add(2, *plan.each(f"{target}_@[points[f]] = t_@"))

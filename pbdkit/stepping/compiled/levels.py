@@ -26,7 +26,14 @@ from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.followers import target
 from pbdkit.stepping.state import started
 
-Function = Callable[..., Any]
+FUNCTIONS: dict[type[Any], tuple[str, ...]] = {
+    FollowerRule: ("gather", "apply"),
+    RenewsParticles: ("remember",),
+    FractureModel: ("breaks", "fictitious"),
+    Softens: ("seen",),
+    RenewsBonds: ("update",),
+}
+"""The elementwise functions of rules and fracture models, and of those with a capability."""
 
 
 def levels_of(scene: Scene) -> tuple[Level, ...]:
@@ -37,22 +44,16 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
     return tuple(Level(n, of, _parts(of)) for n, of in enumerate(scenes))
 
 
-def functions_of(levels: Sequence[Level]) -> dict[str, Function]:
-    """The elementwise functions by their names in the kernel."""
-    found: dict[str, Function] = {}
-    for level in levels:
-        rule = level.scene.experiment.rule
-        named: dict[str, Function] = {"gather": rule.gather, "apply": rule.apply}
-        if isinstance(rule, RenewsParticles):
-            named["remember"] = rule.remember
-        found |= {f"{name}{level.number}": function for name, function in named.items()}
+def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
+    """The elementwise functions by their names in the kernel, a rule's with its level's number."""
+    parts: dict[str, Any] = {str(level.number): level.scene.experiment.rule for level in levels}
     if levels[-1].scene.has_fracture:
-        model = levels[-1].scene.experiment.fracture
-        found |= {"breaks": model.breaks, "fictitious": model.fictitious}
-        if isinstance(model, Softens):
-            found["seen"] = model.seen
-        if isinstance(model, RenewsBonds):
-            found["update"] = model.update
+        parts[""] = levels[-1].scene.experiment.fracture
+    found = {}
+    for number, part in parts.items():
+        for kind, names in FUNCTIONS.items():
+            if isinstance(part, kind):
+                found |= {f"{name}{number}": getattr(part, name) for name in names}
     return found
 
 

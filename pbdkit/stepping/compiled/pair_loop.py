@@ -22,9 +22,8 @@ class PairFollowers(Followers):
     def __init__(self, scene: Scene, threads: int) -> None:
         self._finder = finder = GatheringFollowers(scene)
         self._chunks = 4 * threads
-        levels = levels_of(scene)
-        self._plan = Plan(scene, levels, threads > 1)
-        self._arrays = rule_arrays(scene, levels) | {
+        self._plan = Plan(scene, levels_of(scene), threads > 1)
+        self._arrays = rule_arrays(self._plan) | {
             "place": finder.place,
             "body": finder.body,
             "local": finder.X,
@@ -33,7 +32,7 @@ class PairFollowers(Followers):
         start, none = unmoved_state(scene, (1,) * scene.axes), np.zeros(0, np.intp)
         found = none, none, np.zeros((scene.axes, 0))
         arguments = self._given(start.u, start.previous, start, *found), 0, 0, self._chunks
-        self._run = load_blamed(levels, source, arguments)
+        self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Neighbours in the order in which the numpy engine sums them."""

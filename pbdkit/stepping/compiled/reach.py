@@ -97,9 +97,8 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
     experiment, raster = scene.experiment, scene.raster
     rule, fracture = experiment.rule, experiment.fracture
     cracked = isinstance(fracture, StartsCracked) and fracture.segments()
-    if not experiment.initial.at_rest or rule.uses_reference or cracked:
-        return False
-    if particle_numbers(experiment) or bond_numbers(experiment):
+    remembered = particle_numbers(experiment) or bond_numbers(experiment)
+    if not experiment.initial.at_rest or rule.uses_reference or cracked or remembered:
         return False
     for s, slots in enumerate(scene.neighbourhood.slots):
         block = raster.body_block(s)
@@ -133,16 +132,14 @@ def _growth(scene: Scene) -> Box:
     slots = list(chain(*scene.neighbourhood.slots))
     carried = [np.array([slot.cell for slot in slots])]
     if scene.frame:
-        points = scene.frame.place[scene.frame.map.point]
-        _, *at = np.unravel_index(points, scene.raster.shape)
-        _, *body = np.unravel_index(scene.frame.body_place, scene.raster.shape)
         kinds = scene.raster.kind
+        places = scene.frame.place[scene.frame.map.point], scene.frame.body_place
+        at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
         for slot in slots:
             # The particle at `seeing` sees the frame point through this slot.
-            seeing = np.stack(at) - np.array(slot.cell)[:, None]
-            inside = ((seeing.T >= 0) & (kinds.shape[1:] > seeing.T)).all(axis=1)
-            seeing = seeing[:, inside]
-            follows = kinds[(slot.source, *seeing)] == FOLLOWER
-            carried.append((seeing - np.stack(body)[:, inside]).T[follows])
+            seeing = at - slot.cell
+            inside = ((seeing >= 0) & (seeing < kinds.shape[1:])).all(axis=1)
+            follows = kinds[(slot.source, *seeing[inside].T)] == FOLLOWER
+            carried.append((seeing - body)[inside][follows])
     most = np.concatenate(carried)
     return _interleaved(np.minimum(most.min(axis=0), 0), np.maximum(most.max(axis=0), 0))

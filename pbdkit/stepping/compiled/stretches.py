@@ -23,7 +23,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
     beside each other share, sorted by sublattice and kind, then as they lie; (group, row, 2): the
     first run that reaches a row of the first axis, and the first that begins there or later; and
     the sublattice and kind of each group."""
-    found, starts, groups, total = [], [], [], 0
+    found, starts, groups = list[Ints](), list[Ints](), list[tuple[int, int]]()
     rows = np.arange(scene.raster.shape[1] + 1)
     for s in range(scene.raster.shape[0]):
         if block := scene.raster.body_block(s):
@@ -34,10 +34,9 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
                 last = own[:, 1] if scene.axes == 2 else own[:, 0] + 1
                 reach = np.searchsorted(np.maximum.accumulate(last), rows, side="right")
                 begin = np.searchsorted(own[:, 0], rows)
-                starts.append(total + np.stack([reach, begin], axis=1))
+                starts.append(sum(map(len, found)) + np.stack([reach, begin], axis=1))
                 found.append(own)
                 groups.append((s, kind))
-                total += len(own)
     return np.concatenate(found), np.stack(starts), tuple(groups)
 
 
@@ -76,14 +75,13 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
 
 def _lines_of(kinds: Ints) -> Ints:
     """The stretches of one kind, in each row along the last axis."""
-    closed = np.full((*kinds.shape[:-1], kinds.shape[-1] + 1), NOBODY)
-    closed[..., :-1] = kinds
+    beyond = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
+    closed = np.pad(kinds, beyond, constant_values=NOBODY)
     flat = closed.ravel()
     for these, beside in (([PLAIN], WITH_CELLS), ([PLAIN, WITH_CELLS], GENERAL)):
         begin, end, kind = _stretches(flat)
-        touches = np.zeros(len(kind), bool)
-        touches[1:] |= kind[:-1] == beside
-        touches[:-1] |= kind[1:] == beside
+        # The last is of nobody, so that no end touches the other.
+        touches = (np.roll(kind, 1) == beside) | (np.roll(kind, -1) == beside)
         short = np.isin(kind, these) & (end - begin < SHORT) & touches
         flat = np.repeat(np.where(short, beside, kind), end - begin)
     begin, end, kind = _stretches(flat)
@@ -95,6 +93,5 @@ def _lines_of(kinds: Ints) -> Ints:
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:
     """(begin, end, value) of the stretches of equal values."""
-    edges = np.flatnonzero(np.diff(flat)) + 1
-    begin = np.concatenate([[0], edges])
-    return begin, np.concatenate([edges, [len(flat)]]), flat[begin]
+    begin = np.flatnonzero(np.diff(flat, prepend=-1))
+    return begin, np.append(begin[1:], len(flat)), flat[begin]
