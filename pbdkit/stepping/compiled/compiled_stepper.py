@@ -11,7 +11,13 @@ import numpy as np
 
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.arguments import bits_for, constant_arrays, lost_bits, state_arrays
+from pbdkit.stepping.compiled.arguments import (
+    Arrays,
+    bits_for,
+    constant_arrays,
+    lost_bits,
+    state_arrays,
+)
 from pbdkit.stepping.compiled.emitter import write_kernel
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
@@ -56,7 +62,8 @@ class CompiledStepper(Engine):
         self._arrays |= dict(zip(inner, self._moves, strict=True))
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
-        source, self._names = write_kernel(plan, groups)
+        shared = (*plan.shared, *self._named(start, []))
+        source, self._names = write_kernel(replace(plan, shared=shared), groups)
         # No step is made, so that what does not compile is known before the first.
         self._run = load_blamed(levels, source, self._given(start, [], 0))
 
@@ -90,21 +97,22 @@ class CompiledStepper(Engine):
         self._reach.after(now, before)
         return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
 
-    def _given(self, state: State, led: Led, count: int) -> tuple[Any, ...]:
-        """The arguments of the kernel that makes `count` steps in the arrays of the state."""
+    def _named(self, state: State, led: Led) -> Arrays:
+        """The arrays of a kernel that steps in those of the state, by name."""
         none = np.empty(0, np.intp), np.empty((self._scene.axes, 0))
         places, values = zip(none, *led, strict=True)
         led_values = np.concatenate(values, axis=1).astype(state.u.dtype)
-        arrays = self._arrays | state_arrays(self._plan, state.u, state.previous, state)
-        arrays |= {
-            "led": np.concatenate(places),
-            "led_values": led_values,
-            "led_kept": np.empty_like(led_values),
-            "box": self._reach.box,
-            "growth": self._reach.growth,
-        }
+        leaders = {"led": np.concatenate(places), "led_values": led_values}
+        leaders["led_kept"] = np.empty_like(led_values)
+        reached = {"box": self._reach.box, "growth": self._reach.growth}
+        moved = state_arrays(self._plan, state.u, state.previous, state)
+        return self._arrays | moved | leaders | reached
+
+    def _given(self, state: State, led: Led, count: int) -> tuple[Any, ...]:
+        """The arguments of the kernel that makes `count` steps."""
         if self.threads > 1:
             numba.set_num_threads(self.threads)
+        arrays = self._named(state, led)
         given = tuple(arrays[name] for name in self._names)
         chunks, row = 4 * self.threads, math.prod(self._scene.raster.shape[2:])
         return given, state.step, count, chunks, max(1, BAND * self.threads**2 // row)

@@ -130,8 +130,10 @@ def _reached(function: Function) -> list[Function]:
     """The function and, once each, every Python function that it reaches by name."""
     found = [function]
     for here in found:
-        reached = (getattr(value, "py_func", value) for value in _names(here).values())
-        found += [v for v in reached if isinstance(v, types.FunctionType) and v not in found]
+        for value in _names(here).values():
+            reached = getattr(value, "py_func", value)
+            if isinstance(reached, types.FunctionType) and reached not in found:
+                found.append(reached)
     return found
 
 

@@ -49,7 +49,7 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
     parts: dict[str, Any] = {str(level.number): level.scene.experiment.rule for level in levels}
     if levels[-1].scene.has_fracture:
         parts[""] = levels[-1].scene.experiment.fracture
-    found = {}
+    found: dict[str, Callable[..., Any]] = {}
     for number, part in parts.items():
         for kind, names in FUNCTIONS.items():
             if isinstance(part, kind):
@@ -68,12 +68,12 @@ def load_blamed(levels: Sequence[Level], source: str, arguments: tuple[Any, ...]
 
 def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | FractureModel:
     """The part whose function an error of the compiler names, else the rule."""
-    experiment, text = levels[-1].scene.experiment, str(error)
-    model, rules = experiment.fracture, [level.scene.experiment.rule for level in levels]
-    names = {f.__qualname__ for name, f in functions_of(levels).items() if not name[-1].isdigit()}
-    if any(f"function {name} " in text for name in names):
-        return model
-    return next((r for r in rules if f"function {r.apply.__qualname__} " in text), rules[-1])
+    functions, text = functions_of(levels).items(), str(error)
+    named = [name for name, of in functions if f"function {of.__qualname__} " in text]
+    if any(not name[-1].isdigit() for name in named):
+        return levels[-1].scene.experiment.fracture
+    culprit = next((level for level in levels if f"apply{level.number}" in named), levels[-1])
+    return culprit.scene.experiment.rule
 
 
 def _parts(scene: Scene) -> tuple[int, ...]:

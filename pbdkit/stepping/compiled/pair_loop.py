@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.arguments import rule_arrays, state_arrays
+from pbdkit.stepping.compiled.arguments import Arrays, rule_arrays, state_arrays
 from pbdkit.stepping.compiled.emitter import write_module, write_pass
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
 from pbdkit.stepping.compiled.particle import contributions, difference, parameters, target_lines
@@ -28,25 +29,28 @@ class PairFollowers(Followers):
             "body": finder.body,
             "local": finder.X,
         }
-        source, self._names = _write_kernel(self._plan)
         start, none = unmoved_state(scene, (1,) * scene.axes), np.zeros(0, np.intp)
-        found = none, none, np.zeros((scene.axes, 0))
-        arguments = self._given(start.u, start.previous, start, *found), 0, 0, self._chunks
+        pairs = none, none, np.zeros((scene.axes, 0))
+        arrays = self._named(start.u, start.previous, start, *pairs)
+        source, self._names = _write_kernel(replace(self._plan, shared=tuple(arrays)))
+        arguments = tuple(arrays[name] for name in self._names), 0, 0, self._chunks
         self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Neighbours in the order in which the numpy engine sums them."""
         j, other, rest = self._finder.pairs(m)
         first = np.searchsorted(j, np.append(self._finder.body, len(self._finder.place)))
-        given = self._given(m, new, state, first, other, rest)
+        arrays = self._named(m, new, state, first, other, rest)
+        given = tuple(arrays[name] for name in self._names)
         self._run(given, 0, len(self._finder.body), self._chunks)
 
-    def _given(
+    def _named(
         self, m: Floats, new: Floats, state: State, first: Any, other: Any, rest: Floats
-    ) -> tuple[Any, ...]:
-        arrays = self._arrays | state_arrays(self._plan, m, new, state)
-        arrays |= {"first_pair": first, "partner": other, "rests": np.ascontiguousarray(rest)}
-        return tuple(arrays[name] for name in self._names)
+    ) -> Arrays:
+        """By name the arrays of the kernel, of which `first_pair` is by particle of the body, the
+        `partner` by pair, `place` and `local` by row of the table."""
+        pairs = {"first_pair": first, "partner": other, "rests": np.ascontiguousarray(rest)}
+        return self._arrays | state_arrays(self._plan, m, new, state) | pairs
 
 
 def _write_kernel(plan: Plan) -> tuple[str, list[str]]:

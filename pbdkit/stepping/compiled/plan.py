@@ -17,16 +17,6 @@ from pbdkit.scene.scene import Scene
 MOST_BITS = 32
 """Neighbours of a sublattice up to which its slots are written out and lost bonds are bits."""
 
-NAMES = (
-    "kind", "share", "broken", "lengths", "lost", "counts", "rests", "limits", "signs", "away",
-    "bonds_away", "cells_away", "ends", "end_rests", "end_limits", "end_blocks", "runs", "starts",
-    "first", "at", "solver", "led", "led_values", "led_kept", "points", "entries", "bodies",
-    "mapped", "box", "growth", "step", "first_pair", "partner", "place", "body", "local",
-)  # fmt: skip
-"""What kernels of all scenes know; the last where neighbours are found anew: by particle of the
-body its first pair, by pair the row of the neighbour, by row of the table its place, the rows of
-the body, and X from site (0, 0)."""
-
 
 @dataclass(frozen=True)
 class Level:
@@ -56,22 +46,13 @@ class Level:
 
 @dataclass(frozen=True)
 class Plan:
-    """A scene's levels, the last of which moves the particles, and whether it is stepped on several
-    threads."""
+    """A scene's levels, the last of which moves the particles, whether it is stepped on several
+    threads, and the names of what all functions of its kernel may use: mostly arrays."""
 
     scene: Scene
     levels: tuple[Level, ...]
     parallel: bool
-
-    @cached_property
-    def shared(self) -> list[str]:
-        """The names of the arrays of a kernel: displacements u, those of the step before, over
-        which the new are written, and moves of inner rules first."""
-        levels, own = len(self.levels), len(self.levels[-1].seen.own)
-        planes = ["u", "v", *(f"z{n}" for n in range(levels - 1))]
-        counts = {"bond": self.bonds, "own": own, "rule": levels, "weights": levels}
-        numbered = (f"{name}{n}" for name, count in counts.items() for n in range(count))
-        return [*(name for plane in planes for name in self.each(f"{plane}_@")), *numbered, *NAMES]
+    shared: tuple[str, ...] = ("step",)
 
     @property
     def axes(self) -> str:
