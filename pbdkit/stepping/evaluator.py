@@ -63,8 +63,7 @@ class Evaluator:
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        seen = self.seen(d, u, to)
-        return as_values(self.rule.gather(seen, to.r, to.w, self._p), "gather")
+        return as_values(self.rule.gather(self.seen(d, u, to), to.r, to.w, self._p), "gather")
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""

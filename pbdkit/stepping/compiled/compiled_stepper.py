@@ -88,8 +88,7 @@ class CompiledStepper(Engine):
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
         led, starts = prescribe(self._scene, state, step)
-        count = steady_steps(self._scene, step, end - state.step)
-        count = self._reach.before(led, count)
+        count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
         u, new = state.u, state.previous

@@ -22,28 +22,24 @@ def parameters(plan: Plan, level: Level) -> list[str]:
     return [rule, f"q = Fracture({literal})"] if plan.model else [rule]
 
 
-def write_row_loop(out: Function, plan: Plan) -> None:
-    """The loop over the rows of some runs, as far as motion has come; what comes after stands in
-    it."""
-    out.add(0, "for n in range(first_run, last_run):")
+def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
+    """The loop over the rows of some runs, as far as motion has come, with the rows of what stands
+    at the particles themselves and of where their moves go; what comes after stands in it."""
+    out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
     *lead, name = plan.lead
-    a = len(lead)
-    out.add(1, *(f"{outer} = runs[n, {n}]" for n, outer in enumerate(lead)))
+    a, n = len(lead), level.number
+    out.add(1, *(f"{outer} = runs[n, {m}]" for m, outer in enumerate(lead)))
     out.add(1, f"j0 = max(runs[n, {a + 2}], box[{2 * a + 2}])")
     out.add(1, f"j1 = min(runs[n, {a + 3}], box[{2 * a + 3}])", "if j0 >= j1:", "    continue")
     low, high = (f"box[{2 * a}]", f"box[{2 * a + 1}]") if a else ("first_row", "last_row")
     out.add(1, f"for {name} in range(max(runs[n, {a}], {low}), min(runs[n, {a + 1}], {high})):")
     out.depth += 2
-
-
-def here_rows(plan: Plan, level: Level, s: str) -> list[str]:
-    """The rows of what stands at the particles themselves, and of where their moves go."""
-    n, is_last = level.number, level is plan.levels[-1]
-    rows = {"h@": "u_@", "o@": "v_@" if is_last else f"z{n}_@"}
+    rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
-        rows["z@"] = f"z{n - 1}_@"
-    lines = [line for name, of in rows.items() for line in plan.each(f"{name} = {plan.row(of, s)}")]
-    return lines + [f"a{n} = {plan.row(f'own{n}', s)}" for n in range(len(level.seen.own))]
+        rows["z@"] = f"{level.source}_@"
+    for row, of in rows.items():
+        out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
+    out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
 
 
 def displacements(plan: Plan, level: Level) -> list[str]:

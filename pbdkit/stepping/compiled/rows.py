@@ -11,9 +11,7 @@ from pbdkit.stepping.compiled.particle import (
     contributions,
     difference,
     displacements,
-    here_rows,
     local_places,
-    parameters,
     target_lines,
     write_row_loop,
 )
@@ -28,9 +26,7 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     """The function that moves the particles of such a row."""
     out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
     slots = plan.scene.neighbourhood.slots[s]
-    out.add(0, *parameters(plan, level))
-    write_row_loop(out, plan)
-    out.add(0, *here_rows(plan, level, str(s)))
+    write_row_loop(out, plan, level, str(s))
     for k, slot in enumerate(slots):
         there = plan.row(f"{level.source}_@", slot.target, slot.cell)
         out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))

@@ -18,9 +18,7 @@ from pbdkit.stepping.compiled.particle import (
     contributions,
     difference,
     displacements,
-    here_rows,
     local_places,
-    parameters,
     target_lines,
     write_row_loop,
 )
@@ -30,9 +28,8 @@ from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
     """The function that moves particles of sublattice s."""
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
-    out.add(0, *parameters(plan, level))
-    write_row_loop(out, plan)
-    out.add(0, *here_rows(plan, level, "s"), f"base = {plan.flat('s')}", "width = j1 - j0")
+    write_row_loop(out, plan, level, "s")
+    out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
     (_write_slot_after_slot if plan.long else _write_one_by_one)(out, plan, level)
     if events:
         out.add(0, "if changed:", "    " + events.call("s", "base", "width"))
