@@ -38,9 +38,8 @@ def choose(scene: Scene) -> Choice:
     solver = scene.experiment.stepping
     hindrance = obstacle()
     if solver.engine == "compiled" and hindrance:
-        raise scene.experiment.located(
-            ExperimentError(f"the compiled engine cannot be had: {hindrance}", ("solver", "engine"))
-        )
+        refusal = f"the compiled engine cannot be had: {hindrance}"
+        raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
     if solver.engine == "numpy":
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
@@ -72,9 +71,7 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
 
 def obstacle() -> str:
     """Why the compiled engine cannot be had; empty where it can."""
-    if find_spec("numba") is None:
-        return "numba is not installed: pip install 'pbdkit[fast]'"
-    return ""
+    return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"
 
 
 def _numpy_seconds(scene: Scene) -> float:

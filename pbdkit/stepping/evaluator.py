@@ -81,8 +81,7 @@ class Evaluator:
         if isinstance(model, Softens) and to.c is not None:
             with blaming(model, "to soften a bond"):
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
-        chosen: Components = d if to.broken is None else where(to.broken, lost, d)
-        return chosen
+        return d if to.broken is None else where(to.broken, lost, d)
 
     def move(self, total: Contributions, here: Here) -> Any:
         """From where the particle stands to its target."""

@@ -23,7 +23,7 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
     `count` steps further, and the names of the arrays that it is given."""
     events = write_events(plan) if plan.judged else None
     passes = [write_bond_pass(plan)] if plan.bonds_first else []
-    functions = [*passes, *([events] if events else [])]
+    functions = [events] if events else list(passes)
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
         passes.append(functions[-1])

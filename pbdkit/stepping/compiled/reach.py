@@ -122,8 +122,7 @@ def _stays(scene: Scene) -> bool:
 
 
 def _interleaved(low: Any, high: Any) -> Box:
-    found: Box = np.stack([low, high], axis=1).astype(np.int64).ravel()
-    return found
+    return np.stack([low, high], axis=1).astype(np.int64).ravel()
 
 
 def _growth(scene: Scene) -> Box:

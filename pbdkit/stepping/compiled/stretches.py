@@ -49,8 +49,7 @@ def _joined(lines: Ints) -> Ints:
     first = np.flatnonzero(np.concatenate([[True], ~goes_on]))
     last = np.append(first[1:], len(row)) - 1
     runs = np.insert(lines[first], -2, lines[last, -3] + 1, axis=1)
-    ordered: Ints = runs[np.lexsort(tuple(runs.T[::-1]))]
-    return ordered
+    return np.take(runs, np.lexsort(tuple(runs.T[::-1])), axis=0)
 
 
 def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
@@ -87,8 +86,7 @@ def _lines_of(kinds: Ints) -> Ints:
     begin, end, kind = _stretches(flat)
     *lead, first = np.unravel_index(begin, closed.shape)
     lines = np.stack([*lead, first, first + end - begin, kind], axis=1)
-    some: Ints = lines[kind != NOBODY].astype(np.int64)
-    return some
+    return np.compress(kind != NOBODY, lines, axis=0).astype(np.int64)
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:
