@@ -52,6 +52,9 @@ def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
     return there + solver.memory * (here - before) if solver.memory != 0.0 else there
 
 
+Summed = tuple[Surroundings, Contributions, Here]
+
+
 class SlotFollowers(Followers):
     """Moves the followers of a scene whose neighbours stay as they are."""
 
@@ -79,9 +82,7 @@ class SlotFollowers(Followers):
         zero where there is no neighbour."""
         return self._of_all(self._evaluator.force, m, state)
 
-    def _of_all(
-        self, function: Callable[[Contributions, Here], Any], m: Floats, state: State
-    ) -> Floats:
+    def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
         """What a function makes of the sums of contributions, zero where there is none."""
         out = np.zeros_like(m)
         for around, total, here in self._summed(m, state):
@@ -118,9 +119,7 @@ class SlotFollowers(Followers):
             self._scene.frame.follow(flat, flat)
         return z
 
-    def _summed(
-        self, m: Floats, state: State
-    ) -> Iterator[tuple[Surroundings, Contributions, Here]]:
+    def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
         """Every block with the sums of its neighbours' contributions and what stands there."""
         seen = self._seen(m, state)
         for around in self._blocks:

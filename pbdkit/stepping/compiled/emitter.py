@@ -72,10 +72,9 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     out.add(0, "for _ in range(count):", "    step += 1")
     for side in "uv":
         out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
-    out.add(1, "for e in range(led.size):")
-    out.add(2, *plan.each("led_kept[#, e] = fu_@[led[e]]"))
-    out.add(1, "for e in range(led.size):")
-    out.add(2, *plan.each("fu_@[led[e]] = led_values[#, e]"))
+    for placing in ("led_kept[#, e] = fu_@[led[e]]", "fu_@[led[e]] = led_values[#, e]"):
+        out.add(1, "for e in range(led.size):")
+        out.add(2, *plan.each(placing))
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
     if plan.bonds_first:

@@ -30,8 +30,8 @@ class PairFollowers(Followers):
             "local": finder.X,
         }
         start, none = unmoved_state(scene, (1,) * scene.axes), np.zeros(0, np.intp)
-        pairs = none, none, np.zeros((scene.axes, 0))
-        arrays = self._named(start.u, start.previous, start, *pairs)
+        pairs = {"first_pair": none, "partner": none, "rests": np.zeros((scene.axes, 0))}
+        arrays = self._named(start.u, start.previous, start, **pairs)
         source, self._names = _write_kernel(replace(self._plan, shared=tuple(arrays)))
         arguments = tuple(arrays[name] for name in self._names), 0, 0, self._chunks
         self._run = load_blamed(self._plan.levels, source, arguments)
@@ -40,16 +40,14 @@ class PairFollowers(Followers):
         """Neighbours in the order in which the numpy engine sums them."""
         j, other, rest = self._finder.pairs(m)
         first = np.searchsorted(j, np.append(self._finder.body, len(self._finder.place)))
-        arrays = self._named(m, new, state, first, other, rest)
+        rest = np.ascontiguousarray(rest)
+        arrays = self._named(m, new, state, first_pair=first, partner=other, rests=rest)
         given = tuple(arrays[name] for name in self._names)
         self._run(given, 0, len(self._finder.body), self._chunks)
 
-    def _named(
-        self, m: Floats, new: Floats, state: State, first: Any, other: Any, rest: Floats
-    ) -> Arrays:
-        """By name the arrays of the kernel, of which `first_pair` is by particle of the body, the
-        `partner` by pair, `place` and `local` by row of the table."""
-        pairs = {"first_pair": first, "partner": other, "rests": np.ascontiguousarray(rest)}
+    def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
+        """By name the arrays of the kernel: `first_pair` is by particle of the body, `partner` and
+        `rests` by pair, `place` and `local` by row of the table."""
         return self._arrays | state_arrays(self._plan, m, new, state) | pairs
 
 

@@ -94,11 +94,10 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
     rest, no bond is broken or breaks at rest, and the rules' moves from there are zero. Where
     particles or bonds have numbers of their own it is looked at instead."""
     scene = levels[-1].scene
-    experiment, raster = scene.experiment, scene.raster
-    rule, fracture = experiment.rule, experiment.fracture
+    experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = isinstance(fracture, StartsCracked) and fracture.segments()
     remembered = particle_numbers(experiment) or bond_numbers(experiment)
-    if not experiment.initial.at_rest or rule.uses_reference or cracked or remembered:
+    if not experiment.initial.at_rest or experiment.rule.uses_reference or cracked or remembered:
         return False
     for s, slots in enumerate(scene.neighbourhood.slots):
         block = raster.body_block(s)

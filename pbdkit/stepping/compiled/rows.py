@@ -42,7 +42,7 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     if plan.judged:
         out.add(1, "bits = int64(gone[j])", "now = bits")
     for k, slot in enumerate(slots):
-        out.add(1, *_neighbour_lines(plan, level, k, slot, shares))
+        out.add(1, *_slot_lines(plan, level, k, slot, shares))
     out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
     if events:
         out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
@@ -51,9 +51,7 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     return out
 
 
-def _neighbour_lines(
-    plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str]
-) -> list[str]:
+def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str]) -> list[str]:
     """The contributions of one neighbour; `shares` are the names of rows of shares of cells."""
     bond = {Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]", Home.BOND: f"b{k}_{{n}}[j]"}
     c = f"Constants({values(level.seen.bond, bond)})"
