@@ -15,7 +15,7 @@ from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembered_values import describe_bonds
+from pbdkit.stepping.state import describe_bonds
 
 if TYPE_CHECKING:
     import xarray

@@ -23,8 +23,7 @@ from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import Selecting, kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.stepping.evaluator import summed
-from pbdkit.stepping.remembered_values import describe_bonds
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import Floats, State, describe_bonds
 
 
 class StateMoment(Moment):

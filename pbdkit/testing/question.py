@@ -31,7 +31,7 @@ from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
-from pbdkit.stepping.remembered_values import generator_for
+from pbdkit.stepping.state import generator_for
 from pbdkit.testing.states import (
     SEED,
     SHAPE,

@@ -26,8 +26,7 @@ from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.remembered_values import describe_bonds, describe_particles
-from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
 from pbdkit.testing.fault import NotAskedError
 
 Floats = NDArray[np.float64]
