@@ -17,6 +17,7 @@ import numpy as np
 from pbdkit.api import load
 from pbdkit.bench.size import resized
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.stepping.choice import processors
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
@@ -70,18 +71,10 @@ class Row:
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
-def processors() -> int:
-    """Those that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def engines() -> list[tuple[str, str, int]]:
     """Engine, precision and threads of all ways to step, the reference first."""
-    alone = [("numpy", "float64", 1), ("numpy", "float32", 1)]
-    counts, precisions = dict.fromkeys((1, processors())), ("float64", "float32")
-    return [*alone, *(("compiled", p, threads) for threads in counts for p in precisions)]
+    ways = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
+    return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
 
 
 def measure(

@@ -10,7 +10,8 @@ from itertools import groupby
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.bench.measurement import Row, processors
+from pbdkit.bench.measurement import Row
+from pbdkit.stepping.choice import processors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

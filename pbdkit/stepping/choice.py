@@ -50,7 +50,7 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
-        threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
+        threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason)
 
@@ -97,7 +97,8 @@ def _steps(scene: Scene) -> float:
     return min(steps, last_event(scene) + (4 * cells / math.pi) ** 2 * -math.log(settle.tolerance))
 
 
-def _processors() -> int:
+def processors() -> int:
+    """Those that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,12 +1,14 @@
 """A question: one call of a component with arrays that are kept; and all that can be asked.
 
-Inputs and answers are trees: arrays and numbers in vectors, tuples, lists and dicts.
+Inputs and answers are trees: arrays and numbers in vectors, tuples, lists and dicts; answers also
+in dataclasses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from pbdkit.interfaces import (
     NeighbourMetric,
     RenewsBonds,
     RenewsParticles,
+    Slot,
     Softens,
 )
 from pbdkit.interfaces.component import as_vector
@@ -52,8 +55,9 @@ def flat(tree: Any, name: str = "") -> Arrays:
     """The arrays and numbers of a tree by name."""
     if isinstance(tree, Components):
         parts = {f"{name}.{c}".lstrip("."): v for c, v in zip("xyz", tree, strict=False)}
-    elif isinstance(tree, dict):
-        parts = tree
+    elif isinstance(tree, dict) or is_dataclass(tree):
+        named = tree if isinstance(tree, dict) else vars(tree)
+        parts = {f"{name}.{key}".lstrip("."): part for key, part in named.items()}
     elif isinstance(tree, (tuple, list)):
         parts = {f"{name}{n}": v for n, v in enumerate(tree)}
     else:
@@ -94,18 +98,10 @@ class Question:
         return {name: np.array(value) for name, value in flat(self.asked(change)).items()}
 
 
+@singledispatch
 def questions_of(component: Component, scene: Scene, seed: int) -> list[Question]:
     """Those that its interface allows."""
-    makers: dict[type[Component], Callable[..., list[Question]]] = {
-        FollowerRule: _to_rule,
-        FractureModel: _to_fracture_model,
-        FramePolicy: _to_frame,
-        Diagnostic: _to_diagnostic,
-        Lattice: _to_lattice,
-        NeighbourMetric: _to_metric,
-    }
-    make = next(m for interface, m in makers.items() if isinstance(component, interface))
-    return make(component, scene, seed)
+    raise TypeError(f"{type(component).__name__} is of no interface")
 
 
 def gathered(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
@@ -125,6 +121,7 @@ def _standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
     return Here(u, place, place, scene.constants.of_particle(*own))
 
 
+@questions_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
     """`gather` and `apply`; `remember`, `force` and `draw` where it has them."""
     d, evaluator = differences(scene, seed), Evaluator(scene)
@@ -150,40 +147,41 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
     return [gather, *map(question, asks), *_to_draw(rule, scene)]
 
 
+@questions_of.register
 def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Question]:
     """`breaks` and `fictitious`; `update`, `seen` and `draw` where it has them."""
-    slots, p, limits = (
-        scene.neighbourhood.slots[0],
-        scene.constants.fracture,
-        scene.constants.limits,
-    )
-    evaluator = Evaluator(scene)
+    slots, evaluator = scene.neighbourhood.slots[0], Evaluator(scene)
+    p, limits = scene.constants.fracture, scene.constants.limits
 
-    def breaks(d: Any, own: Any) -> Any:
-        return [evaluator.breaks(v, s.rest, limits[s], own) for v, s in zip(d, slots, strict=True)]
+    def question(what: str, ask: Callable[..., Any], **inputs: Any) -> Question:
+        """One that is asked along every slot, with the difference along it where there are `d`."""
 
-    def update(d: Any, own: Any) -> Any:
-        return [evaluator.update(v, s.rest, limits[s], own) for v, s in zip(d, slots, strict=True)]
+        def ask_along(d: Any = slots, **given: Any) -> Any:
+            return [ask(v, s, **given) for v, s in zip(d, slots, strict=True)]
 
-    def fictitious(u: Any) -> Any:
-        return [as_vector(model.fictitious(u, s.rest, p), "fictitious", u) for s in slots]
+        return Question(what, inputs, ask_along, elementwise=True)
 
-    def seen(d: Any, own: Any, lost: Any) -> Any:
+    def breaks(d: Any, s: Slot, own: Any) -> Any:
+        return evaluator.breaks(d, s.rest, limits[s], own)
+
+    def update(d: Any, s: Slot, own: Any) -> Any:
+        return evaluator.update(d, s.rest, limits[s], own)
+
+    def fictitious(_: Any, s: Slot, u: Any) -> Any:
+        return as_vector(model.fictitious(u, s.rest, p), "fictitious", u)
+
+    def seen(d: Any, s: Slot, own: Any, lost: Any) -> Any:
         assert isinstance(model, Softens)
-        c = [scene.constants.of_bond(*limits[s], *own) for s in slots]
-        found = [model.seen(v, lost, s.rest, k, p) for v, s, k in zip(d, slots, c, strict=True)]
-        return [as_vector(one, "seen", lost) for one in found]
+        c = scene.constants.of_bond(*limits[s], *own)
+        return as_vector(model.seen(d, lost, s.rest, c, p), "seen", lost)
 
     bonds = {"d": differences(scene, seed, share=2.0), "own": remembers(model, scene, seed)}
     u, lost = here(scene, seed)["u"], here(scene, seed + 3)["u"]
-    questions = [
-        Question("breaks", bonds, breaks, elementwise=True),
-        Question("fictitious", {"u": u}, fictitious, elementwise=True),
-    ]
+    questions = [question("breaks", breaks, **bonds), question("fictitious", fictitious, u=u)]
     if isinstance(model, RenewsBonds):
-        questions.append(Question("update", bonds, update, elementwise=True))
+        questions.append(question("update", update, **bonds))
     if isinstance(model, Softens):
-        questions.append(Question("seen", bonds | {"lost": lost}, seen, elementwise=True))
+        questions.append(question("seen", seen, **bonds, lost=lost))
     return [*questions, *_to_draw(model, scene)]
 
 
@@ -193,11 +191,12 @@ def _to_draw(part: Component, scene: Scene) -> list[Question]:
     rows = owners(part, scene)
 
     def draw(**given: Any) -> Any:
-        return dict(part.draw(type(rows)(**given), generator_for(SEED, "fracture")))
+        return part.draw(type(rows)(**given), generator_for(SEED, "fracture"))
 
     return [Question("draw", dict(vars(rows)), draw)]
 
 
+@questions_of.register
 def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
     sites = sites_of_frame(scene.raster, scene.experiment.rule)
     if sites is None:
@@ -205,11 +204,12 @@ def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
     point, body = sites.nearest()
 
     def follow(**tables: Any) -> Any:
-        return dict(vars(policy.follow(frame_showing(sites, **tables))))
+        return policy.follow(frame_showing(sites, **tables))
 
     return [Question("follow", {"site": sites.site, "point": point, "body": body}, follow)]
 
 
+@questions_of.register
 def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Question]:
     moment = moment_of(scene, seed)
 
@@ -228,22 +228,16 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
     return [Question("measure", shown(moment).tables, measure)]
 
 
+@questions_of.register
 def _to_lattice(lattice: Lattice, _: Scene, __: int) -> list[Question]:
-    def cell() -> Any:
-        found = lattice.cell()
-        sites = [(*s.at, *s.index, *s.primitive) for s in found.sites]
-        return {"vectors": found.vectors, "sites": sites} | {
-            name: getattr(found, name) for name in ("period", "primitive")
-        }
-
-    return [Question("cell", {}, cell)]
+    return [Question("cell", {}, lattice.cell)]
 
 
+@questions_of.register
 def _to_metric(metric: NeighbourMetric, scene: Scene, _: int) -> list[Question]:
     cell = scene.experiment.lattice.cell()
 
     def shells() -> Any:
-        around = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
-        return [[[(o.target, *o.cell, *o.rest) for o in s] for s in shells] for shells in around]
+        return [metric.shells_around(cell, s) for s in range(len(cell.sites))]
 
     return [Question("shells_around", {}, shells)]
