@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -60,10 +61,8 @@ def peak_memory() -> int:
     figure of this program's own memory is taken where there is one.
     """
     status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
+        return int(found[1]) * 1024
     from resource import RUSAGE_SELF, getrusage
 
     return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
@@ -179,14 +178,10 @@ def _find_exact(job: Job) -> Job:
     exact = _of_followers(scene, state)
     np.save(Path(job["truth"]) / "exact.npy", exact)
     decay = decay_of(scene, exact)
-    return {
-        "particles": scene.raster.count,
-        "how": certificate.method,
-        "within": certificate.share,
-        "scale": scale_of(scene, initial_state(scene)),
-        "rate": decay.rate,
-        "steps": [decay.steps_to(tolerance) for tolerance in job["tolerances"]],
-    }
+    known = {"how": certificate.method, "within": certificate.share, "rate": decay.rate}
+    steps = [decay.steps_to(tolerance) for tolerance in job["tolerances"]]
+    scale = scale_of(scene, initial_state(scene))
+    return known | {"particles": scene.raster.count, "scale": scale, "steps": steps}
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from pbdkit.interfaces import (
     NeighbourMetric,
     RenewsBonds,
     RenewsParticles,
-    Slot,
     Softens,
 )
 from pbdkit.interfaces.component import as_vector
@@ -129,9 +128,8 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
     gather = Question("gather", {"d": d}, lambda d: gathered(scene, d), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
         return [gather]  # they cannot be summed, which is found elsewhere
-    total = each(
-        lambda t: np.broadcast_to(t, SHAPE).copy(), summed((c, None) for c in contributions)
-    )
+    sums = summed((c, None) for c in contributions)
+    total = each(lambda t: np.broadcast_to(t, SHAPE).copy(), sums)
     asks: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
     if isinstance(rule, RenewsParticles):
         asks["remember"] = evaluator.remember
@@ -156,30 +154,27 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
     def question(what: str, ask: Callable[..., Any], **inputs: Any) -> Question:
         """One that is asked along every slot, with the difference along it where there are `d`."""
 
-        def ask_along(d: Any = slots, **given: Any) -> Any:
-            return [ask(v, s, **given) for v, s in zip(d, slots, strict=True)]
+        def along(d: Any = slots, **given: Any) -> Any:
+            return [ask(v, s.rest, limits[s], **given) for v, s in zip(d, slots, strict=True)]
 
-        return Question(what, inputs, ask_along, elementwise=True)
+        return Question(what, inputs, along, elementwise=True)
 
-    def breaks(d: Any, s: Slot, own: Any) -> Any:
-        return evaluator.breaks(d, s.rest, limits[s], own)
+    def fictitious(_: Any, r: Any, __: Any, u: Any) -> Any:
+        return as_vector(model.fictitious(u, r, p), "fictitious", u)
 
-    def update(d: Any, s: Slot, own: Any) -> Any:
-        return evaluator.update(d, s.rest, limits[s], own)
-
-    def fictitious(_: Any, s: Slot, u: Any) -> Any:
-        return as_vector(model.fictitious(u, s.rest, p), "fictitious", u)
-
-    def seen(d: Any, s: Slot, own: Any, lost: Any) -> Any:
+    def seen(d: Any, r: Any, limits: Any, own: Any, lost: Any) -> Any:
         assert isinstance(model, Softens)
-        c = scene.constants.of_bond(*limits[s], *own)
-        return as_vector(model.seen(d, lost, s.rest, c, p), "seen", lost)
+        c = scene.constants.of_bond(*limits, *own)
+        return as_vector(model.seen(d, lost, r, c, p), "seen", lost)
 
     bonds = {"d": differences(scene, seed, share=2.0), "own": remembers(model, scene, seed)}
     u, lost = here(scene, seed)["u"], here(scene, seed + 3)["u"]
-    questions = [question("breaks", breaks, **bonds), question("fictitious", fictitious, u=u)]
+    questions = [
+        question("breaks", evaluator.breaks, **bonds),
+        question("fictitious", fictitious, u=u),
+    ]
     if isinstance(model, RenewsBonds):
-        questions.append(question("update", update, **bonds))
+        questions.append(question("update", evaluator.update, **bonds))
     if isinstance(model, Softens):
         questions.append(question("seen", seen, **bonds, lost=lost))
     return [*questions, *_to_draw(model, scene)]
@@ -214,10 +209,9 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
     moment = moment_of(scene, seed)
 
     def measure(**tables: Any) -> Any:
-        found: dict[str, Any] = {}
-        measured = diagnostic.measure(shown(moment, tables=tables))
-        for variable, value in zip(diagnostic.variables(), measured, strict=True):
-            values = found[variable.name] = np.asarray(value)
+        found = measured_by(diagnostic, shown(moment, tables=tables))
+        for variable in diagnostic.variables():
+            values = np.asarray(found[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
             if values.dtype.kind == "f" and sizes.get("particle") == len(moment.body):
                 # NaN may stand at frame points.
@@ -226,6 +220,12 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
         return found
 
     return [Question("measure", shown(moment).tables, measure)]
+
+
+def measured_by(diagnostic: Diagnostic, now: Any) -> Arrays:
+    """What a diagnostic measures of a moment, by variable."""
+    names = [variable.name for variable in diagnostic.variables()]
+    return dict(zip(names, diagnostic.measure(now), strict=True))
 
 
 @questions_of.register

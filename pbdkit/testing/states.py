@@ -133,9 +133,7 @@ class _Shown:
     OF_PARTICLES = ("body", "sum_over_neighbours", "gradient", "on_particles", "remembered")
 
     def __init__(self, inner: Any, order: Any, tables: Any = None) -> None:
-        self._inner = inner
-        self._order = order
-        self._tables = tables
+        self._inner, self._order, self._tables = inner, order, tables
 
     @property
     def tables(self) -> dict[str, Any]:

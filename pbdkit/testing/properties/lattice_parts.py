@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, combinations
-from typing import Any
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import BasisSite, Cell, Lattice, NeighbourMetric, Offset
+from pbdkit.interfaces import Cell, Lattice, NeighbourMetric, Offset
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, experiments_with
 
@@ -22,15 +21,10 @@ def has_a_sound_cell(subject: Subject) -> None:
     """The cell vectors span an area, no two basis sites share an index, a place or a primitive
     index, all lie within the period and near where their index says, and `primitive` counts equal
     steps alike and leaves none out."""
-    lattice = subject.component
     try:
-        cell = checked_cell(lattice)
+        cell = checked_cell(subject.component)
     except ExperimentError as error:
         raise PropertyError(str(error)) from None
-    _refuse_equal(cell, "place", cell.vectors, lambda site: site.at)
-    if np.linalg.det(cell.primitive) == 0.0:
-        raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
-    _refuse_equal(cell, "primitive index", cell.primitive, lambda site: site.primitive)
     for n, site in enumerate(cell.sites):
         cells = np.array(site.at) @ np.linalg.inv(np.array(cell.vectors))
         if (np.abs(cells - np.divide(site.index, cell.period)) > 1.0 - 1e-9).any():
@@ -42,8 +36,18 @@ def has_a_sound_cell(subject: Subject) -> None:
 
 
 def _refuse_miscounted(cell: Cell) -> None:
-    """Raises where `primitive` tells one step from another that leads the same way, or counts in
-    steps that no site takes."""
+    """Raises where `primitive` tells one step from another that leads the same way, or two sites
+    alike, or counts in steps that no site takes."""
+    if np.linalg.det(cell.primitive) == 0.0:
+        raise PropertyError(f"`primitive` gives the cell vectors {cell.primitive}: in line")
+    for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
+        between = np.subtract(other.primitive, one.primitive).astype(float)
+        apart = np.linalg.solve(np.transpose(cell.primitive), between)
+        if np.abs(apart - np.round(apart)).max() < 1e-9:
+            raise PropertyError(
+                f"basis sites {m} and {n} have the same primitive index {one.primitive}, up to "
+                "whole cells: they must differ"
+            )
     counted: dict[tuple[float, ...], tuple[int, ...]] = {}
     lengths = [math.hypot(*vector) for vector in cell.vectors]
     for offset in chain(*(cell.offsets(s, 1.5 * sum(lengths)) for s in range(len(cell.sites)))):
@@ -60,27 +64,12 @@ def _refuse_miscounted(cell: Cell) -> None:
         raise PropertyError("`primitive` counts steps that no site takes: count whole ones only")
 
 
-def _refuse_equal(
-    cell: Cell, what: str, steps: Any, of: Callable[[BasisSite], tuple[float, ...]]
-) -> None:
-    """Raises where two sites have the same value up to whole steps of the cell."""
-    for (m, one), (n, other) in combinations(enumerate(cell.sites), 2):
-        here, there = tuple(of(one)), tuple(of(other))
-        apart = np.linalg.solve(np.array(steps).T, np.subtract(there, here).astype(float))
-        if np.abs(apart - np.round(apart)).max() < 1e-9:
-            raise PropertyError(
-                f"basis sites {m} and {n} have the same {what} {here}, up to whole cells: they "
-                "must differ"
-            )
-
-
 @asked_of(Lattice)
 def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
     """The origin moves the lattice and does not enter its cell: no digit of a run depends on where
     the body lies."""
-    lattice = subject.component
-    moved = lattice.model_copy(update={"origin": (1000.3, -77.1)})
-    if moved.cell() != lattice.cell():
+    moved = subject.component.model_copy(update={"origin": (1000.3, -77.1)})
+    if moved.cell() != subject.component.cell():
         raise PropertyError("another origin gives another cell: leave `self.origin` out of `cell`")
 
 

@@ -132,7 +132,7 @@ def _reached(component: Component) -> Iterator[tuple[str, Any]]:
                 yield f"{owner.__name__}.{name}", value
 
 
-def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+def _of_function(function: types.FunctionType, helpers: bool = True) -> Iterator[tuple[str, Any]]:
     """Globals, closures, defaults and attributes of a function; helpers one call away."""
     yield f"defaults of {function.__name__}", (function.__defaults__, function.__kwdefaults__)
     yield f"attributes of {function.__name__}", vars(function)
@@ -140,9 +140,8 @@ def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
     for name, value in {**reached.globals, **reached.nonlocals}.items():
         if not isinstance(value, types.FunctionType):
             yield name, value
-        elif not value.__module__.startswith(("pbdkit.", "numpy")):
-            yield f"attributes of {value.__name__}", vars(value)
-            yield from inspect.getclosurevars(value).globals.items()
+        elif helpers and not value.__module__.startswith(("pbdkit.", "numpy")):
+            yield from _of_function(value, helpers=False)
 
 
 def _content(value: Any) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.properties.repetition import differing
-from pbdkit.testing.question import Arrays, flat
+from pbdkit.testing.question import flat, measured_by
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
@@ -151,16 +150,10 @@ def continues_where_it_stopped(subject: Subject) -> None:
         copied = Stepper(again).advance(kept, STEPS)
         _refuse_difference(copied, whole, f"a run continued from a copy of step {STEPS}", scene)
         if isinstance(component, Diagnostic):
-            measured = _measured(component, scene, whole), _measured(anew, again, continued)
-            if names := differing(*measured):
-                raise PropertyError(
-                    f"`{names[0]}` of a run continued at step {STEPS} is another one"
-                )
-
-
-def _measured(diagnostic: Any, scene: Scene, state: State) -> Arrays:
-    values = diagnostic.measure(StateMoment(state, Tables(scene)))
-    return dict(zip((v.name for v in diagnostic.variables()), values, strict=True))
+            one = measured_by(anew, StateMoment(continued, Tables(again)))
+            other = measured_by(component, StateMoment(whole, Tables(scene)))
+            for name in differing(other, one):
+                raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
 
 
 @asked_of(*STEPPED)
