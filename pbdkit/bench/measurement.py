@@ -126,8 +126,8 @@ def _step_by_step(work: Job, base: Row, steps: int) -> Iterator[Row]:
         chosen = {"engine": engine, "precision": precision, "threads": threads}
         settings = [f"solver.{key}={value}" for key, value in chosen.items()]
         try:
-            first = work("step", *settings, at=[], cache=row.line + precision)
-            found = work("step", *settings, at=looks, cache=row.line + precision)
+            cache = row.line + precision
+            first, found = (work("step", *settings, at=at, cache=cache) for at in ([], looks))
         except (ExperimentError, PluginError) as error:
             if n == 0:
                 raise

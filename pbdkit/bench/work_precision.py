@@ -14,7 +14,6 @@ from pbdkit.bench.measurement import Row
 from pbdkit.stepping.choice import processors
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
@@ -89,18 +88,11 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
     """What ``--json`` writes (docs/performance.md lists the keys)."""
-    return {
-        "experiment": name,
-        "settings": list(settings),
-        "steps": steps,
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "processors": processors(),
-            "system": platform.system(),
-            "python": sys.version.split()[0],
-        },
-        "rows": [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows],
-    }
+    machine = {"processor": platform.processor() or platform.machine(), "processors": processors()}
+    machine |= {"system": platform.system(), "python": sys.version.split()[0]}
+    figures = [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows]
+    asked = {"experiment": name, "settings": list(settings), "steps": steps}
+    return asked | {"machine": machine, "rows": figures}
 
 
 def picture(rows: Sequence[Row], title: str) -> Figure:
@@ -119,7 +111,11 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
     for ax, particles in zip(panels, sizes, strict=False):
         for kind, colour, marker in zip(kinds, cycle(COLOURS), cycle(MARKERS)):
             some = [row for row in measured if row.line == kind and row.particles == particles]
-            _draw(ax, some, kind, colour, marker)
+            x, y = [_x(row) for row in some], [max(row.error or 0.0, FLOOR) for row in some]
+            face = ["white" if row.is_predicted else colour for row in some]
+            ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
+            ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
+            ax.scatter([], [], color=colour, marker=marker, label=kind)
         ax.set_title(f"{particles:,} particles".replace(",", " "), fontsize=8)
         ax.set(xscale="log", yscale="log")
         ax.grid(visible=True, linewidth=0.3, alpha=0.6)
@@ -140,11 +136,3 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
 
 def _x(row: Row) -> float:
     return row.ns_per_particle_step or row.cpu_s or 0.0
-
-
-def _draw(ax: Axes, rows: Sequence[Row], kind: str, colour: str, marker: str) -> None:
-    x, y = [_x(row) for row in rows], [max(row.error or 0.0, FLOOR) for row in rows]
-    face = ["white" if row.is_predicted else colour for row in rows]
-    ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
-    ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
-    ax.scatter([], [], color=colour, marker=marker, label=kind)

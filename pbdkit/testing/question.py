@@ -37,13 +37,13 @@ from pbdkit.stepping.remembered_values import generator_for
 from pbdkit.testing.states import (
     SEED,
     SHAPE,
+    Shown,
     differences,
     frame_showing,
     here,
     moment_of,
     owners,
     remembers,
-    shown,
 )
 
 Arrays = dict[str, Any]
@@ -122,8 +122,9 @@ def _standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
 
 @questions_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
-    """`gather` and `apply`; `remember`, `force` and `draw` where it has them."""
-    d, evaluator = differences(scene, seed), Evaluator(scene)
+    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force` and `draw`
+    where it has them."""
+    d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
     gather = Question("gather", {"d": d}, lambda d: gathered(scene, d), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
@@ -140,9 +141,15 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
         def ask(total: Any, **at: Any) -> Any:
             return asks[what](total, _standing(scene, **at))
 
-        return Question(what, {"total": total} | here(scene, seed), ask, elementwise=True)
+        return Question(what, {"total": total} | at, ask, elementwise=True)
 
-    return [gather, *map(question, asks), *_to_draw(rule, scene)]
+    def meet(d: Any, **at: Any) -> Any:
+        return applied(scene, gathered(scene, d), **at)
+
+    slots = zip(d, scene.neighbourhood.slots[0], strict=True)
+    meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
+    met = Question("apply, where all neighbours meet in the particle,", meeting | at, meet)
+    return [gather, *map(question, asks), met, *_to_draw(rule, scene)]
 
 
 @questions_of.register
@@ -209,7 +216,7 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
     moment = moment_of(scene, seed)
 
     def measure(**tables: Any) -> Any:
-        found = measured_by(diagnostic, shown(moment, tables=tables))
+        found = measured_by(diagnostic, Shown(moment, tables=tables))
         for variable in diagnostic.variables():
             values = np.asarray(found[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
@@ -219,7 +226,7 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
                 found[variable.name] = np.where(allowed, 0.0, values)
         return found
 
-    return [Question("measure", shown(moment).tables, measure)]
+    return [Question("measure", Shown(moment).tables, measure)]
 
 
 def measured_by(diagnostic: Diagnostic, now: Any) -> Arrays:

@@ -126,14 +126,17 @@ def moment_of(scene: Scene, seed: int) -> StateMoment:
     return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
 
 
-class _Shown:
-    """A moment, its cells or its forces; see `shown`."""
+class Shown:
+    """A moment, its cells or its forces with other tables in the place of its own, or with its
+    particles in another order: row n shows what stands in row order[n]. What is in no order of
+    particles is as it is."""
 
     OWN = ("displacement", "previous_displacement", "reference")
     OF_PARTICLES = ("body", "sum_over_neighbours", "gradient", "on_particles", "remembered")
 
-    def __init__(self, inner: Any, order: Any, tables: Any = None) -> None:
-        self._inner, self._order, self._tables = inner, order, tables
+    def __init__(self, inner: Any, order: Any = None, tables: Any = None) -> None:
+        self._inner, self._tables = inner, tables
+        self._order = np.arange(len(inner.body)) if order is None else order
 
     @property
     def tables(self) -> dict[str, Any]:
@@ -146,7 +149,7 @@ class _Shown:
             return lambda rows=None: table if rows is None else table[rows]
         found = getattr(self._inner, name)
         if name in ("cells", "forces"):
-            return _Shown(found, self._order)
+            return Shown(found, self._order)
         if not callable(found):
             return self._shown(name, found)
         return lambda *given, **named: self._shown(name, found(*given, **named))
@@ -159,12 +162,6 @@ class _Shown:
             return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
-
-
-def shown(moment: StateMoment, order: Any = None, tables: Any = None) -> Any:
-    """The moment with other tables in the place of its own, or with its particles in another order:
-    row n shows what stands in row order[n]. What is in no order of particles is as it is."""
-    return _Shown(moment, np.arange(len(moment.body)) if order is None else order, tables)
 
 
 def frame_showing(frame: Any, site: Any, point: Any, body: Any) -> Any:

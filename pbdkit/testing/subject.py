@@ -181,18 +181,17 @@ def examples_of(component: type[Component]) -> list[Component]:
     the class lacks a method of its interface.
     """
     base: dict[str, Any] = {}
-    others: list[tuple[str, Any]] = []
+    others: list[dict[str, Any]] = [{}]
     for name, field in component.model_fields.items():
         key, examples = field.alias or name, list(field.examples or [])
         if field.is_required():
             if not examples:
-                raise PluginError(
-                    f"{component.__name__}.{name} has neither default nor example: write "
-                    f"`{name}: ... = Field(description=..., examples=[...])`"
-                )
+                fault = f"{component.__name__}.{name} has neither default nor example"
+                remedy = f"write `{name}: ... = Field(description=..., examples=[...])`"
+                raise PluginError(f"{fault}: {remedy}")
             base[key] = examples.pop(0)
-        others += [(key, value) for value in examples]
-    return [_made(component, base), *(_made(component, base | {k: v}) for k, v in others)]
+        others += [{key: value} for value in examples]
+    return [_made(component, base | other) for other in others]
 
 
 def _made(component: type[Component], given: dict[str, Any]) -> Component:
@@ -202,10 +201,8 @@ def _made(component: type[Component], given: dict[str, Any]) -> Component:
         raise PluginError(f"{component.__name__} cannot be made: {error}") from None
     except ValidationError as error:
         fault = error.errors()[0]
-        where = ".".join(map(str, fault["loc"])) or "the whole"
-        raise PluginError(
-            f"{component.__name__} refuses its examples {given}: {where}: {fault['msg']}"
-        ) from None
+        told = f"{'.'.join(map(str, fault['loc'])) or 'the whole'}: {fault['msg']}"
+        raise PluginError(f"{component.__name__} refuses its examples {given}: {told}") from None
 
 
 def full_name(component: Component) -> str:

@@ -26,9 +26,9 @@ def returns_a_value_a_particle(subject: Subject) -> None:
     for question in _elementwise(subject):
         for name, value in question.answer().items():
             if value.shape not in ((), SHAPE):
+                fault = f"`{question.what}` returns the shape {value.shape} ({name})"
                 raise PropertyError(
-                    f"`{question.what}` returns the shape {value.shape} for particles of shape "
-                    f"{SHAPE} ({name}): it is not elementwise"
+                    f"{fault} for particles of shape {SHAPE}: it is not elementwise"
                 )
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene
@@ -41,29 +41,12 @@ def returns_a_value_a_particle(subject: Subject) -> None:
 def is_finite(subject: Subject) -> None:
     """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
     one NaN spreads over the body within a few steps."""
-    for question in [*subject.questions(), *_meeting(subject)]:
+    for question in subject.questions():
         for name, value in question.answer().items():
             if value.dtype.kind in "fc" and not np.isfinite(value).all():
                 worst = value[~np.isfinite(value)].flat[0]
-                raise PropertyError(
-                    f"`{question.what}` answers {worst} ({name}): guard the division, as in "
-                    "`a / where(b > 0.0, b, 1.0)`"
-                )
-
-
-def _meeting(subject: Subject) -> list[Question]:
-    """A rule asked where r + d = 0 along every slot."""
-    if not isinstance(subject.component, FollowerRule):
-        return []
-    scene = subject.scene
-    slots = zip(differences(scene, 0), scene.neighbourhood.slots[0], strict=True)
-    meeting = [d.each(lambda v, r: np.full_like(v, -r), slot.rest) for d, slot in slots]
-
-    def ask(d: Any, **at: Any) -> Any:
-        return applied(scene, gathered(scene, d), **at)
-
-    inputs = {"d": meeting} | here(scene, 0)
-    return [Question("apply, where all neighbours meet in the particle,", inputs, ask)]
+                remedy = "guard the division, as in `a / where(b > 0.0, b, 1.0)`"
+                raise PropertyError(f"`{question.what}` answers {worst} ({name}): {remedy}")
 
 
 @asked_of(FollowerRule, FractureModel, is_needed=True)
@@ -77,17 +60,13 @@ def renews_what_it_remembers(subject: Subject) -> None:
     what, answer = asked[0].what, asked[0].asked()
     for values in answer if what == "update" else [answer]:
         if len(values) != len(changing):
-            count = f"{len(values)} value{'s' * (len(values) != 1)}"
-            raise PropertyError(
-                f"`{what}` returns {count}, and {len(changing)} of the numbers change: declare "
-                "`changes=False` for those that stay"
-            )
+            returned = f"{len(values)} value{'s' * (len(values) != 1)}"
+            fault = f"`{what}` returns {returned}, and {len(changing)} of the numbers change"
+            raise PropertyError(f"{fault}: declare `changes=False` for those that stay")
         for number, value in zip(changing, map(np.asarray, values), strict=True):
             if not np.can_cast(value.dtype, number.dtype, "same_kind"):
-                raise PropertyError(
-                    f"`{what}` returns {value.dtype} for '{number.name}', which is declared as "
-                    f"{number.dtype}: fractions would be lost"
-                )
+                fault = f"`{what}` returns {value.dtype} for '{number.name}', which is declared"
+                raise PropertyError(f"{fault} as {number.dtype}: fractions would be lost")
 
 
 @asked_of(FollowerRule, FractureModel)
@@ -150,10 +129,8 @@ def _refuse_an_order_of_rows(subject: Subject) -> None:
     one, other = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (shown, mixed))
     for name, values in one.items():
         if not np.array_equal(np.asarray(values)[order], other[name]):
-            raise PropertyError(
-                f"`draw` gives '{name}' by the row: take it from what a row holds, or from the "
-                "generator"
-            )
+            remedy = "take it from what a row holds, or from the generator"
+            raise PropertyError(f"`draw` gives '{name}' by the row: {remedy}")
 
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
@@ -162,10 +139,8 @@ def _refuse_an_order_of_slots(scene: Scene) -> None:
     other = applied(scene, contributions[::-1], **at)
     for name, value in one._asdict().items():
         if _apart(value, getattr(other, name)) is not None:
-            raise PropertyError(
-                f"the move depends on the order in which neighbours are summed ({name}): do not "
-                "sum large numbers that cancel"
-            )
+            fault = f"the move depends on the order in which neighbours are summed ({name})"
+            raise PropertyError(f"{fault}: do not sum large numbers that cancel")
 
 
 @asked_of(FollowerRule, FractureModel, is_needed=True)
@@ -178,10 +153,8 @@ def is_local(subject: Subject) -> None:
             try:
                 alone = flat(question.asked(methodcaller("item", *place)))
             except Exception as error:
-                raise PropertyError(
-                    f"`{question.what}` fails with plain numbers in the place of arrays: "
-                    f"{type(error).__name__}: {error}"
-                ) from None
+                fault = f"`{question.what}` fails with plain numbers in the place of arrays"
+                raise PropertyError(f"{fault}: {type(error).__name__}: {error}") from None
             for name, value in alone.items():
                 among = np.broadcast_to(whole[name], SHAPE)[place]
                 if np.shape(value) or _apart(value, among) is not None:

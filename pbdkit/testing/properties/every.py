@@ -24,10 +24,8 @@ def names_itself(subject: Subject) -> None:
     if not re.fullmatch(WORD, name):
         raise PropertyError(f"the type '{name}' is not in lower case with hyphens, as 'my-rule' is")
     if getattr(field.annotation, "__args__", None) != (name,):
-        raise PropertyError(
-            f"any other word passes as its type too: declare it as "
-            f'`type: Literal["{name}"] = "{name}"`'
-        )
+        remedy = f'declare it as `type: Literal["{name}"] = "{name}"`'
+        raise PropertyError(f"any other word passes as its type too: {remedy}")
 
 
 @asked_of()
@@ -39,10 +37,8 @@ def is_documented(subject: Subject) -> None:
         raise PropertyError(f"{component.__name__} has no docstring: say what it computes")
     for name, field in component.model_fields.items():
         if name != "type" and not (field.description or "").strip():
-            raise PropertyError(
-                f"the parameter `{name}` has no description: write "
-                f'`{name}: ... = Field(..., description="what it is, with units")`'
-            )
+            remedy = f'`{name}: ... = Field(..., description="what it is, with units")`'
+            raise PropertyError(f"the parameter `{name}` has no description: write {remedy}")
 
 
 @asked_of()

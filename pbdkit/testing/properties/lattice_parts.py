@@ -28,10 +28,8 @@ def has_a_sound_cell(subject: Subject) -> None:
     for n, site in enumerate(cell.sites):
         cells = np.array(site.at) @ np.linalg.inv(np.array(cell.vectors))
         if (np.abs(cells - np.divide(site.index, cell.period)) > 1.0 - 1e-9).any():
-            raise PropertyError(
-                f"basis site {n} lies a cell or more from where its index {site.index} says: take "
-                "whole cell vectors from its `at`"
-            )
+            fault = f"basis site {n} lies a cell or more from where its index {site.index} says"
+            raise PropertyError(f"{fault}: take whole cell vectors from its `at`")
     _refuse_miscounted(cell)
 
 
@@ -44,19 +42,16 @@ def _refuse_miscounted(cell: Cell) -> None:
         between = np.subtract(other.primitive, one.primitive).astype(float)
         apart = np.linalg.solve(np.transpose(cell.primitive), between)
         if np.abs(apart - np.round(apart)).max() < 1e-9:
-            raise PropertyError(
-                f"basis sites {m} and {n} have the same primitive index {one.primitive}, up to "
-                "whole cells: they must differ"
-            )
+            fault = f"basis sites {m} and {n} have the same primitive index {one.primitive}"
+            raise PropertyError(f"{fault}, up to whole cells: they must differ")
     counted: dict[tuple[float, ...], tuple[int, ...]] = {}
     lengths = [math.hypot(*vector) for vector in cell.vectors]
     for offset in chain(*(cell.offsets(s, 1.5 * sum(lengths)) for s in range(len(cell.sites)))):
         step = tuple((np.round(np.divide(tuple(offset.rest), lengths[0]), 6) + 0.0).tolist())
         if (known := counted.setdefault(step, offset.primitive)) != offset.primitive:
-            raise PropertyError(
-                f"`primitive` counts the step {tuple(offset.rest)} from one site as {known} and "
-                f"from another as {offset.primitive}"
-            )
+            twice = f"as {known} and from another as {offset.primitive}"
+            counts = f"`primitive` counts the step {tuple(offset.rest)}"
+            raise PropertyError(f"{counts} from one site {twice}")
     first, *others = cell.sites
     steps = [*cell.primitive, *(np.subtract(s.primitive, first.primitive) for s in others)]
     spanned = [np.linalg.det(np.array(some)) for some in combinations(steps, len(cell.vectors))]
@@ -73,46 +68,39 @@ def keeps_its_cell_wherever_it_lies(subject: Subject) -> None:
         raise PropertyError("another origin gives another cell: leave `self.origin` out of `cell`")
 
 
-Shells = Sequence[Sequence[Offset]]
-
-
 @asked_of(NeighbourMetric, is_needed=True)
 def is_mutual(subject: Subject) -> None:
     """Whoever is a neighbour has this particle as its own neighbour, in the same shell, once: bonds
     have two ends, and a body at rest stays at rest."""
-    for lattice, cell, _ in _tried(subject):
+    for where, cell, _, _ in _tried(subject):
         try:
             build_neighbourhood(cell, subject.component)
         except ExperimentError as error:
-            raise PropertyError(f"on the {lattice} lattice: {error}") from None
+            raise PropertyError(f"{where}: {error}") from None
 
 
 @asked_of(NeighbourMetric)
 def takes_offsets_of_the_cell(subject: Subject) -> None:
     """Every offset is one that the cell itself gives, so that its site index and its opposite
     agree with the lattice's."""
-    for lattice, cell, around in _tried(subject):
-        for s, shells in enumerate(around):
-            for offset in chain(*shells):
-                if offset != cell.offset(s, offset.target, offset.cell):
-                    raise PropertyError(
-                        f"on the {lattice} lattice the offset {offset.rest} is none of the cell's: "
-                        "take those of `cell.offsets(sublattice, radius)` as they are"
-                    )
+    for where, cell, s, shells in _tried(subject):
+        for offset in chain(*shells):
+            if offset != cell.offset(s, offset.target, offset.cell):
+                remedy = "take those of `cell.offsets(sublattice, radius)` as they are"
+                fault = f"the offset {offset.rest} is none of the cell's"
+                raise PropertyError(f"{where} {fault}: {remedy}")
 
 
 @asked_of(NeighbourMetric)
 def takes_sublattices_in_any_order(subject: Subject) -> None:
     """The basis sites in another order have the same neighbours: how a cell is written down means
     nothing."""
-    for lattice, cell, around in _tried(subject):
-        backwards = _around(subject.component, replace(cell, sites=cell.sites[::-1]))
-        for s, (one, other) in enumerate(zip(around, backwards[::-1], strict=True)):
-            if [_sites(shell) for shell in one] != [_sites(shell) for shell in other]:
-                raise PropertyError(
-                    f"on the {lattice} lattice basis site {s} has other neighbours where the sites "
-                    "are listed backwards"
-                )
+    for where, cell, s, shells in _tried(subject):
+        backwards = replace(cell, sites=cell.sites[::-1])
+        others = subject.component.shells_around(backwards, len(cell.sites) - 1 - s)
+        if [_sites(shell) for shell in shells] != [_sites(shell) for shell in others]:
+            fault = f"basis site {s} has other neighbours where the sites are listed backwards"
+            raise PropertyError(f"{where} {fault}")
 
 
 @asked_of(NeighbourMetric, is_needed=True)
@@ -124,29 +112,26 @@ def finds_the_same_anew(subject: Subject) -> None:
         raise NotAskedError("its neighbours stay as they are")
     scale = np.sqrt(near.weights)
     far, limit = near.radius / scale.min() * (1 + 1e-6), near.radius * (1 + 1e-9)
-    for lattice, cell, around in _tried(subject):
-        for s, shells in enumerate(around):
-            met = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
-            if _sites(met) != _sites(chain(*shells)):
-                raise PropertyError(
-                    f"on the {lattice} lattice `nearness` finds other neighbours in the reference "
-                    "configuration than `shells_around` chooses"
-                )
+    for where, cell, s, shells in _tried(subject):
+        met = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
+        if _sites(met) != _sites(chain(*shells)):
+            raise PropertyError(
+                f"{where} `nearness` finds other neighbours in the reference configuration than "
+                "`shells_around` chooses"
+            )
 
 
-def _tried(subject: Subject) -> Iterator[tuple[str, Cell, list[Shells]]]:
-    """The lattices to try by name, each with its cell and the shells around its sites, but for
-    those that the metric refuses."""
-    experiments = experiments_with(subject.component, subject.parts)
+def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:
+    """Each basis site of the lattices to try, but for those that the metric refuses: where it is,
+    in which cell, and the shells around it."""
+    metric = subject.component
+    experiments = experiments_with(metric, subject.parts)
     for lattice in dict.fromkeys(experiment.lattice for experiment in experiments):
         cell = lattice.cell()
         with suppress(ExperimentError):
-            around = _around(subject.component, cell)
-            yield lattice.type, cell, around
-
-
-def _around(metric: NeighbourMetric, cell: Cell) -> list[Shells]:
-    return [metric.shells_around(cell, s) for s in range(len(cell.sites))]
+            around = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
+            for s, shells in enumerate(around):
+                yield f"on the {lattice.type} lattice", cell, s, shells
 
 
 def _sites(offsets: Iterable[Offset]) -> set[tuple[int, ...]]:

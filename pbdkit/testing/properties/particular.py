@@ -18,7 +18,7 @@ from pbdkit.interfaces import (
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.testing.properties.elementwise import ROUNDING
-from pbdkit.testing.states import SHAPE, differences, frame_showing, moment_of, remembers, shown
+from pbdkit.testing.states import SHAPE, Shown, differences, frame_showing, moment_of, remembers
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
 CLOSE = 1e-9
@@ -33,10 +33,8 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
     for plane in scene.neighbourhood.planes:
         here, there = model.constants(plane.slot), model.constants(plane.opposite)
         if here != there:
-            raise PropertyError(
-                f"`constants` are {here} for the slot {plane.slot.site} and {there} for its "
-                "opposite: take lengths and shells, not directions"
-            )
+            fault = f"{here} for the slot {plane.slot.site} and {there} for its opposite"
+            raise PropertyError(f"`constants` are {fault}: take lengths and shells, not directions")
     evaluator, own = Evaluator(scene), remembers(model, scene, 0)
     asks = {"breaks": evaluator.breaks}
     if isinstance(model, RenewsBonds):
@@ -47,9 +45,8 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
         for what, ask in asks.items():
             one, other = ask(d, slot.rest, limits, own), ask(-d, -slot.rest, limits, own)
             if not np.array_equal(np.asarray(one), np.asarray(other)):
-                raise PropertyError(
-                    f"`{what}` answers otherwise for (-d, -r) than for (d, r) along {slot.site}"
-                )
+                along = f"for (-d, -r) than for (d, r) along {slot.site}"
+                raise PropertyError(f"`{what}` answers otherwise {along}")
 
 
 @asked_of(FractureModel)
@@ -83,10 +80,9 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
             evaluator.renew_bonds(d, r, limits, now, np.ones(SHAPE, bool))
             wrong = np.broadcast_to(evaluator.breaks(d, r, limits, now), SHAPE) != expected
             if wrong.any():
-                raise PropertyError(
-                    f"`breaking_strain` and `breaks` disagree: at strain {stretch[wrong][0]:.6g} "
-                    f"along {slot.site} the bond {'stays' if expected else 'breaks'}"
-                )
+                where = f"at strain {stretch[wrong][0]:.6g} along {slot.site} the bond"
+                fault = f"{where} {'stays' if expected else 'breaks'}"
+                raise PropertyError(f"`breaking_strain` and `breaks` disagree: {fault}")
 
 
 @asked_of(FramePolicy)
@@ -110,10 +106,8 @@ def takes_every_point_alone(subject: Subject) -> None:
             reason = ""
             for n, one in enumerate(some):
                 if _followed(part, n) != _followed(whole, int(one)):
-                    raise PropertyError(
-                        f"frame point {one} follows somebody else where fewer points are asked "
-                        f"about ({place_of(scene.experiment)})"
-                    )
+                    fault = "follows somebody else where fewer points are asked about"
+                    raise PropertyError(f"frame point {one} {fault} ({place_of(scene.experiment)})")
     if reason:
         raise NotAskedError(reason)
 
@@ -136,9 +130,8 @@ def measures_what_it_declares(subject: Subject) -> None:
     if len(variables) != len(measured):
         raise PropertyError(f"{len(measured)} arrays for {len(variables)} variables")
     if own and not diagnostic.at_end:
-        raise PropertyError(
-            f"its `own_dimension` '{own}' has a length only where it declares `at_end` too"
-        )
+        remedy = "has a length only where it declares `at_end` too"
+        raise PropertyError(f"its `own_dimension` '{own}' {remedy}")
     for variable, value in zip(variables, measured, strict=True):
         if own in variable.dims and value.ndim == len(variable.dims):
             sizes.setdefault(own, value.shape[variable.dims.index(own)])  # as the first has it
@@ -151,10 +144,8 @@ def measures_what_it_declares(subject: Subject) -> None:
         if value.shape != shape:
             raise PropertyError(f"'{variable.name}' has the shape {value.shape}, not {shape}")
         if not np.can_cast(value.dtype, variable.dtype, "same_kind"):
-            raise PropertyError(
-                f"'{variable.name}' is declared as {variable.dtype} and measured as {value.dtype}: "
-                "digits would be lost without a word"
-            )
+            fault = f"is declared as {variable.dtype} and measured as {value.dtype}"
+            raise PropertyError(f"'{variable.name}' {fault}: digits would be lost without a word")
 
 
 @asked_of(Diagnostic)
@@ -163,14 +154,12 @@ def takes_rows_in_any_order(subject: Subject) -> None:
     rounding: rows are found by `now.rows(numbers)` and mean nothing else."""
     diagnostic, scene = subject.component, subject.scene
     moment, order = moment_of(scene, 0), np.random.default_rng(0).permutation(scene.raster.count)
-    values, seen = diagnostic.measure(moment), diagnostic.measure(shown(moment, order))
+    values, seen = diagnostic.measure(moment), diagnostic.measure(Shown(moment, order))
     for variable, one, other in zip(diagnostic.variables(), values, seen, strict=True):
         expected = np.asarray(one)
         for axis, dim in enumerate(variable.dims):
             expected = np.take(expected, order, axis) if dim == "particle" else expected
         size = float(np.nanmax(np.abs(expected), initial=1e-300))
         if not np.allclose(other, expected, rtol=0.0, atol=ROUNDING * size, equal_nan=True):
-            raise PropertyError(
-                f"'{variable.name}' depends on the order of the rows: ask `now.rows(numbers)` for "
-                "particles by number"
-            )
+            remedy = "ask `now.rows(numbers)` for particles by number"
+            raise PropertyError(f"'{variable.name}' depends on the order of the rows: {remedy}")

@@ -70,9 +70,8 @@ def remembers_nothing(subject: Subject) -> None:
         kept = sorted(n for n in before | after if before.get(n) != after.get(n))
         if differing(again, later) and (kept or not differing(one, again)):
             what = f", and keeps {_listed(kept)} from call to call" if kept else ""
-            raise PropertyError(
-                f"`{question.what}` answers the same question otherwise after another one{what}"
-            )
+            told = f"`{question.what}` answers the same question otherwise after another one"
+            raise PropertyError(told + what)
 
 
 @asked_of(is_needed=True)
@@ -89,15 +88,12 @@ def answers_the_same(subject: Subject) -> None:
         random.setstate(kept[0])
         np.random.set_state(kept[1])
         if names:
-            raise PropertyError(
-                f"`{question.what}` answers the same question otherwise the second time "
-                f"({_listed(names)}): it draws numbers at random that nobody gave it, or looks at "
-                "a clock"
-            )
+            fault = f"answers the same question otherwise the second time ({_listed(names)})"
+            cause = "it draws numbers at random that nobody gave it, or looks at a clock"
+            raise PropertyError(f"`{question.what}` {fault}: {cause}")
         if after != before:
-            raise PropertyError(
-                f"`{question.what}` seeds or uses the generator of random numbers that all share"
-            )
+            fault = "seeds or uses the generator of random numbers that all share"
+            raise PropertyError(f"`{question.what}` {fault}")
 
 
 def _shared_generators() -> bytes:

@@ -98,7 +98,5 @@ def _refuse_unheld(number: Remembered, values: Any, how: str) -> None:
     with np.errstate(all="ignore"):
         lost = given[given.astype(number.dtype) != given]
     if lost.size:
-        raise PropertyError(
-            f"'{number.name}' {how} {lost.flat[0]}, which {number.dtype} does not hold: declare "
-            "another `dtype`"
-        )
+        fault = f"'{number.name}' {how} {lost.flat[0]}, which {number.dtype} does not hold"
+        raise PropertyError(f"{fault}: declare another `dtype`")

@@ -37,11 +37,8 @@ STEPS = 4
 def rests(subject: Subject) -> None:
     """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
     by 1e-17 has moved."""
-    quiet = [
-        scene
-        for scene in subject.scenes
-        if not scene.experiment.fracture.check(scene.neighbourhood.shells())
-    ]
+    fracture = [(scene, scene.experiment.fracture) for scene in subject.scenes]
+    quiet = [scene for scene, model in fracture if not model.check(scene.neighbourhood.shells())]
     if not quiet:
         raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
     for scene in quiet:
@@ -53,10 +50,10 @@ def rests(subject: Subject) -> None:
                 broken = int((state.broken_step > 0).sum())
                 raise PropertyError(f"{broken} bonds of a body at rest break {where}")
             if scene.frame and state.u.any():
-                moved = float(np.abs(state.u).max())
+                fault = f"a body at rest moves by {np.abs(state.u).max():.3g} {where}"
                 raise PropertyError(
-                    f"a body at rest moves by {moved:.3g} {where}: zero differences must give a "
-                    "move of exactly zero; let terms of opposite neighbours cancel one by one"
+                    f"{fault}: zero differences must give a move of exactly zero; let terms of "
+                    "opposite neighbours cancel one by one"
                 )
 
 
@@ -76,10 +73,8 @@ def follows_translations(subject: Subject) -> None:
                 remedy = ": use differences `d`, not `here.u`, or declare `uses_reference`"
             elif isinstance(component, FramePolicy):
                 remedy = ": let the weights of each point sum to 1, or take on `pbdkit.Anchors`"
-            raise PropertyError(
-                f"a translated body moves otherwise, by {most:.3g} of its displacement, "
-                f"{place_of(scene.experiment)}{remedy}"
-            )
+            fault = f"a translated body moves otherwise, by {most:.3g} of its displacement"
+            raise PropertyError(f"{fault}, {place_of(scene.experiment)}{remedy}")
     if anchors and most <= ROUNDING:
         raise PropertyError("it says that it `anchors` the body, and follows every translation")
 
@@ -93,10 +88,8 @@ def _free(subject: Subject) -> list[Scene]:
         if not rule.uses_reference and not anchored:
             free.append(scene)
     if not free:
-        raise NotAskedError(
-            f"{_whose(subject)} declares `uses_reference`, or a frame anchors: where a body lies "
-            "may count"
-        )
+        reason = f"{_whose(subject)} declares `uses_reference`, or a frame anchors"
+        raise NotAskedError(f"{reason}: where a body lies may count")
     return free
 
 
@@ -116,11 +109,9 @@ def superposes(subject: Subject) -> None:
         both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
         off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
         if not off <= ROUNDING:
-            told = "do not declare `linear`" if _whose(subject) == "it" else ""
-            raise PropertyError(
-                f"displacements do not superpose, by {off:.3g} of the largest, "
-                f"{place_of(scene.experiment)}: {told}"
-            )
+            remedy = "do not declare `linear`" if _whose(subject) == "it" else ""
+            fault = f"displacements do not superpose, by {off:.3g} of the largest"
+            raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
 def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
@@ -183,7 +174,5 @@ def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) 
         by, one, other = "", np.asarray(found.get(name)), np.asarray(needed.get(name))
         if one.shape == other.shape:
             by = f", by {np.abs(one.astype(float) - other).max():.3g} at most,"
-        raise PropertyError(
-            f"{whose} gives another `{name}`{by} at step {expected.step}, "
-            f"{place_of(scene.experiment)}"
-        )
+        where = f"at step {expected.step}, {place_of(scene.experiment)}"
+        raise PropertyError(f"{whose} gives another `{name}`{by} {where}")
