@@ -109,8 +109,8 @@ def _worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
     env = os.environ | {"PBDKIT_CACHE_DIR": str(cache)}
     done = subprocess.run(call, env=env, input=json.dumps(job), capture_output=True, text=True)
     if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.strip()]
-        why = said[-1] if said else f"it ended with status {done.returncode} (out of memory?)"
+        ended = f"it ended with status {done.returncode} (out of memory?)"
+        why = (done.stderr.strip() or ended).splitlines()[-1]
         raise ExperimentError(f"the measurement failed: {why}")
     result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
     if "fault" in result:
@@ -192,8 +192,7 @@ def _stepped(work: Job, base: Row, exact: dict[str, Any], tolerances: list[float
     needed = dict(zip(tolerances, exact["steps"], strict=True))
     at = sorted({n for n in needed.values() if n and n * wall <= PATIENCE_S})
     if at:
-        asked = (*stepping, f"solver.threads={threads}", f"steps={at[-1]}")
-        found = work("step", *asked, at=at)
+        found = work("step", *stepping, f"solver.threads={threads}", f"steps={at[-1]}", at=at)
     for tolerance, n in needed.items():
         row = replace(base, tolerance=tolerance, steps=n)
         if n is None:

@@ -17,12 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
-COLUMNS = {
-    "size": ("size", "", ""),
-    "particles": ("particles", "", ""),
-    "method": ("method", "", ""),
-    "precision": ("precision", "", ""),
-    "threads": ("threads", "", ""),
+COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", "threads")} | {
     "tolerance": ("tolerance", ".0e", "a share of the largest prescribed displacement"),
     "steps": ("steps", "", "made, or iterations of the linear solver"),
     "setup_first_s": ("set-up", ".2f", "seconds until the first step, with compiling"),
@@ -64,12 +59,9 @@ def _shown(rows: Sequence[Row]) -> list[str]:
 
 def _cell(row: Row, name: str) -> str:
     value = getattr(row, name)
-    if name == "size":
-        return "as it is" if value is None else str(value)
-    if name == "error" and row.reason:
-        return "left out"
     if value is None:
-        return ""
+        missing = {"size": "as it is", "error": "left out" if row.reason else ""}
+        return missing.get(name, "")
     if name == "error":
         return "0" if value == 0 else f"{value:.1e}" if isfinite(value) else "not finite"
     missed = name == "certified" and row.tolerance is not None and value > row.tolerance

@@ -121,11 +121,9 @@ def _step(job: Job) -> Job:
 def _compared(scene: Scene, state: State, truth: Path) -> tuple[float, float]:
     """(largest distance, largest displacement of the truth): of followers where the exact answer is
     known; else of what the first who comes to a step leaves for the others."""
-    file = truth / "exact.npy"
-    if file.exists():
-        u = _of_followers(scene, state)
-    else:
-        file, u = truth / f"{state.step}.npy", state.u.reshape(len(state.u), -1).astype(float)
+    exact, u = truth / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
+    file = exact if exact.exists() else truth / f"{state.step}.npy"
+    u = _of_followers(scene, state) if file == exact else u
     if not file.exists():
         np.save(file, u)
     known = np.load(file)

@@ -23,8 +23,6 @@ from pbdkit.testing.subject import (
 )
 
 State = Literal["held", "failed", "skipped"]
-NEEDED = "has-examples"
-"""The one property of a class: that components can be made of it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,8 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
         try:
             one = examples_of(component)[0]
         except PluginError as error:
-            return Report(component.__name__, (Outcome(NEEDED, "failed", str(error)),))
+            # The one property of a class: that components can be made of it.
+            return Report(component.__name__, (Outcome("has-examples", "failed", str(error)),))
     return Report(full_name(one), tuple(_outcomes(one, parts)))
 
 
@@ -129,12 +128,9 @@ def _examined(one: Component | type[Component], beside: Sequence[type[Component]
     takes_part = all(outcome.property != "takes-part" for outcome in report.failed)
     if takes_part or isinstance(one, (Lattice, NeighbourMetric)):
         return report
-    lattices, metrics = (
-        [example for offered in beside if issubclass(offered, i) for example in _made(offered)]
-        for i in (Lattice, NeighbourMetric)
-    )
-    own = [{"lattice": lattices}, {"neighbours": metrics}]
-    for parts in (*own, own[0] | own[1]):
+    lattices = {"lattice": [e for c in beside if issubclass(c, Lattice) for e in _made(c)]}
+    around = {"neighbours": [e for c in beside if issubclass(c, NeighbourMetric) for e in _made(c)]}
+    for parts in (lattices, around, lattices | around):
         if all(parts.values()) and (found := examine(one, **parts)).holds:
             return found
     return report

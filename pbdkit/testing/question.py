@@ -143,12 +143,10 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
 
         return Question(what, {"total": total} | at, ask, elementwise=True)
 
-    def meet(d: Any, **at: Any) -> Any:
-        return applied(scene, gathered(scene, d), **at)
-
     slots = zip(d, scene.neighbourhood.slots[0], strict=True)
     meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
-    met = Question("apply, where all neighbours meet in the particle,", meeting | at, meet)
+    what = "apply, where all neighbours meet in the particle,"
+    met = Question(what, meeting | at, lambda d, **to: applied(scene, gathered(scene, d), **to))
     return [gather, *map(question, asks), met, *_to_draw(rule, scene)]
 
 

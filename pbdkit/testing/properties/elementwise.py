@@ -93,10 +93,9 @@ def takes_particles_in_any_order(subject: Subject) -> None:
         for name, value in mixed.items():
             expected = _in_order(np.broadcast_to(whole[name], SHAPE), order)
             if (place := _apart(np.broadcast_to(value, SHAPE), expected)) is not None:
-                raise PropertyError(
-                    f"`{question.what}` gives a particle another answer where it stands in another "
-                    f"order ({name}: {value[place]} and {expected[place]})"
-                )
+                fault = "gives a particle another answer where it stands in another order"
+                told = f"({name}: {value[place]} and {expected[place]})"
+                raise PropertyError(f"`{question.what}` {fault} {told}")
     _refuse_an_order_of_rows(subject)
     if isinstance(subject.component, FollowerRule):
         _refuse_an_order_of_slots(subject.scene)
@@ -135,10 +134,9 @@ def _refuse_an_order_of_rows(subject: Subject) -> None:
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
     contributions, at = gathered(scene, differences(scene, 0)), here(scene, 0)
-    one = applied(scene, contributions, **at)
-    other = applied(scene, contributions[::-1], **at)
-    for name, value in one._asdict().items():
-        if _apart(value, getattr(other, name)) is not None:
+    one, other = (flat(applied(scene, c, **at)) for c in (contributions, contributions[::-1]))
+    for name, value in one.items():
+        if _apart(value, other[name]) is not None:
             fault = f"the move depends on the order in which neighbours are summed ({name})"
             raise PropertyError(f"{fault}: do not sum large numbers that cancel")
 
@@ -158,10 +156,9 @@ def is_local(subject: Subject) -> None:
             for name, value in alone.items():
                 among = np.broadcast_to(whole[name], SHAPE)[place]
                 if np.shape(value) or _apart(value, among) is not None:
-                    raise PropertyError(
-                        f"`{question.what}` gives a particle another answer alone than among "
-                        f"others ({name}: {value} and {among}): it is not elementwise"
-                    )
+                    fault = "gives a particle another answer alone than among others"
+                    told = f"({name}: {value} and {among}): it is not elementwise"
+                    raise PropertyError(f"`{question.what}` {fault} {told}")
 
 
 def _single(value: NDArray[Any]) -> NDArray[Any]:

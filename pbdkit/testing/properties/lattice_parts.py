@@ -115,10 +115,8 @@ def finds_the_same_anew(subject: Subject) -> None:
     for where, cell, s, shells in _tried(subject):
         met = (o for o in cell.offsets(s, far) if np.hypot(*(scale * tuple(o.rest))) <= limit)
         if _sites(met) != _sites(chain(*shells)):
-            raise PropertyError(
-                f"{where} `nearness` finds other neighbours in the reference configuration than "
-                "`shells_around` chooses"
-            )
+            fault = "`nearness` finds other neighbours in the reference configuration"
+            raise PropertyError(f"{where} {fault} than `shells_around` chooses")
 
 
 def _tried(subject: Subject) -> Iterator[tuple[str, Cell, int, Sequence[Sequence[Offset]]]]:

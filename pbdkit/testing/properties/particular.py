@@ -39,8 +39,8 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
     asks = {"breaks": evaluator.breaks}
     if isinstance(model, RenewsBonds):
         asks["update"] = evaluator.update
-    slots = scene.neighbourhood.slots[0]
-    for slot, d in zip(slots, differences(scene, 0, share=2.0), strict=True):
+    tried = differences(scene, 0, share=2.0)
+    for slot, d in zip(scene.neighbourhood.slots[0], tried, strict=True):
         limits = scene.constants.limits[slot]
         for what, ask in asks.items():
             one, other = ask(d, slot.rest, limits, own), ask(-d, -slot.rest, limits, own)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import Diagnostic, Draws, FollowerRule, FractureModel, Remembered
-from pbdkit.results.layout import base_columns, bond_columns, broken_columns, reserved_names
+from pbdkit.results.layout import reserved_names
 from pbdkit.scene.declarations import remembered_names
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.states import SEED, numbers_of, owners
@@ -50,13 +50,11 @@ def takes_part(subject: Subject) -> None:
 def declares_what_it_remembers(subject: Subject) -> None:
     """Every number that it remembers has a name in lower case that is free in the dataset, a long
     name, units ("1" where it has none), and an initial value that its dtype holds."""
-    columns = [*base_columns(), *bond_columns(), *broken_columns()]
-    taken = {c.name for c in columns} | {d for c in columns for d in c.dims}
     for scene in subject.scenes:
         numbers = remembered(subject, scene)
         remembered_names(scene.experiment)  # refuses what is declared twice
         for number in numbers:
-            if number.name in taken:
+            if number.name in reserved_names():
                 raise PropertyError(f"every dataset has a '{number.name}': give it another name")
             _refuse_unlabelled(number, f"'{number.name}'", "my_number")
             _refuse_unheld(number, number.initial, "starts at")

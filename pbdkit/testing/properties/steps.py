@@ -51,10 +51,9 @@ def rests(subject: Subject) -> None:
                 raise PropertyError(f"{broken} bonds of a body at rest break {where}")
             if scene.frame and state.u.any():
                 fault = f"a body at rest moves by {np.abs(state.u).max():.3g} {where}"
-                raise PropertyError(
-                    f"{fault}: zero differences must give a move of exactly zero; let terms of "
-                    "opposite neighbours cancel one by one"
-                )
+                wanted = "zero differences must give a move of exactly zero"
+                remedy = "let terms of opposite neighbours cancel one by one"
+                raise PropertyError(f"{fault}: {wanted}; {remedy}")
 
 
 @asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
