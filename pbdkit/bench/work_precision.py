@@ -118,8 +118,9 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
         ticks = [10.0**n for n in range(-16, 1, 4)]
         panels[0].set_yticks([FLOOR, *ticks], ["0", *(f"{tick:.0e}" for tick in ticks)])
     by_step = any(row.ns_per_particle_step for row in measured)
-    drawn.supxlabel("ns a particle and step" if by_step else "seconds of processor time", size=8)
-    drawn.supylabel("largest error, as a share", size=8)
+    for ax in panels[-across:]:
+        ax.set_xlabel("ns a particle and step" if by_step else "seconds of processor time")
+    drawn.supylabel("largest error, as a share", fontsize=8)
     drawn.suptitle(title, fontsize=9)
     named, ncols = panels[0].get_legend_handles_labels(), min(4, len(kinds) or 1)
     drawn.legend(*named, loc="outside lower center", ncols=ncols, fontsize=7, frameon=False)

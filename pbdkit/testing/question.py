@@ -138,8 +138,8 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
         asks["force"] = evaluator.force
 
     def question(what: str) -> Question:
-        def ask(total: Any, **at: Any) -> Any:
-            return asks[what](total, _standing(scene, **at))
+        def ask(total: Any, **to: Any) -> Any:
+            return asks[what](total, _standing(scene, **to))
 
         return Question(what, {"total": total} | at, ask, elementwise=True)
 

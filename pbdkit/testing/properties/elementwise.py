@@ -26,10 +26,8 @@ def returns_a_value_a_particle(subject: Subject) -> None:
     for question in _elementwise(subject):
         for name, value in question.answer().items():
             if value.shape not in ((), SHAPE):
-                fault = f"`{question.what}` returns the shape {value.shape} ({name})"
-                raise PropertyError(
-                    f"{fault} for particles of shape {SHAPE}: it is not elementwise"
-                )
+                fault = f"returns the shape {value.shape} for particles of shape {SHAPE} ({name})"
+                raise PropertyError(f"`{question.what}` {fault}: it is not elementwise")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene
         counts = {len(c) for c in gathered(scene, differences(scene, 0))}
