@@ -49,7 +49,7 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
-        threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
+        threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason)
 
@@ -90,7 +90,8 @@ def _about(seconds: float) -> str:
     return f"about {seconds:.1g} s" if seconds < 10.0 else f"about {seconds:.0f} s"
 
 
-def _processors() -> int:
+def processors() -> int:
+    """Those that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
