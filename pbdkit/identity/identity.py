@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,9 +22,9 @@ from pbdkit.identity.elastic_constants import (
     elasticity,
     second_order,
 )
-from pbdkit.identity.probe import Probed, probed
+from pbdkit.identity.probe import probed
 from pbdkit.identity.verdict import notes_on
-from pbdkit.identity.waves import NoSlowWavesError, Primitive, primitive, slow_waves, spacing_of
+from pbdkit.identity.waves import Primitive, primitive, slow_waves, spacing_of
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 
@@ -125,7 +124,7 @@ def identified(scene: Scene) -> Identity:
     _refuse_no_numbers(answers.stencil, experiment.rule.type)
     stencil, around = primitive(cell, answers.stencil), len(scene.neighbourhood.slots[0])
     long, against = _long_waves(stencil)
-    reasons = (*_reasons(answers, spacing), *against)
+    reasons = (*answers.reasons, *against)
     kind = ELASTICITY if long is not None and long.diffusivity is None else DIFFUSION
     found = Identity(
         name=experiment.name,
@@ -157,26 +156,11 @@ def _refuse_no_numbers(stencil: Stencil, rule: str) -> None:
         )
 
 
-def _reasons(answers: Probed, spacing: float) -> Iterator[str]:
-    """Why the rule is no diffusion and no elasticity, apart from what long waves see."""
-    if not answers.move_at_rest <= SAME * spacing:
-        moved = answers.move_at_rest / spacing
-        yield f"a body at rest does not stay: the rule moves it by {moved:.6g} h a step"
-    if not answers.smooth:
-        yield (
-            "small displacements do not add up, however small: the rule is not differentiable at "
-            "rest, and no plane wave answers for another"
-        )
-    if answers.place_dependence:
-        yield answers.place_dependence
-
-
 def _long_waves(stencil: Primitive) -> tuple[LongWaves | None, list[str]]:
     """What long waves see, and why that is no diffusion and no elasticity."""
-    try:
-        waves = slow_waves(stencil)
-    except NoSlowWavesError as error:
-        return None, [str(error)]
+    waves = slow_waves(stencil)
+    if isinstance(waves, str):
+        return None, [waves]
     along = [waves.series(np.array(k), 2) for k in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
     second = second_order(*(np.array(series[2].real, float) for series in along))
     reasons = [*_drift(np.array([series[1].imag for series in along[:2]], float))]

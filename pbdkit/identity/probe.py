@@ -18,7 +18,7 @@ from pbdkit.scene.scene import Scene, body_box
 Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]
 Differences = dict[Slot, Floats]
-ROUNDING = 1e-9
+ROUNDING, STILL = 1e-9, 1e-8
 SLANT = 0.3137
 """Of a free edge: no row of a lattice lies along it."""
 ANGLE = 1.0
@@ -31,38 +31,47 @@ STRAIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Probed:
-    """What a rule answers: `stencil` in the middle of the body; `move_at_rest`, its largest move
-    of a body at rest (lattice units), and `rests_at_edges`, whether there is none either with half
-    the neighbours missing; `smooth`, `linear` and `turns` anywhere in the body;
-    `place_dependence` in words, None where there is none."""
+    """What a rule answers: `stencil` in the middle of the body; `reasons`, in words, why no long
+    wave tells what it is; `linear` and `turns` anywhere in the body, `symmetric`, and
+    `rests_at_edges`, whether it leaves a body at rest alone with half the neighbours missing."""
 
     stencil: Stencil
-    move_at_rest: float
-    rests_at_edges: bool
-    smooth: bool
+    reasons: tuple[str, ...]
     linear: bool
     turns: bool
     symmetric: bool
-    place_dependence: str | None
+    rests_at_edges: bool
 
 
 def probed(scene: Scene, spacing: float) -> Probed:
     """The answers of the scene's rule, in the middle and, where it asks for the place, in the
     corners of the body."""
     stencils = {at: linearised(scene, at) for at in _places(scene)}
-    middle = next(iter(stencils.values()))
     half = tuple(_one_side(own) for own in scene.neighbourhood.slots)
     passes = [(one, at) for one in _passes(scene) for at in stencils]
     return Probed(
-        middle,
-        max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes),
-        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
-        all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes),
+        next(iter(stencils.values())),
+        tuple(_reasons(scene, passes, stencils, spacing)),
         all(_answers(one, at, AMPLITUDE * spacing, ROUNDING) for one, at in passes),
         all(_turns_with_the_body(one, at, spacing) for one, at in passes),
         all(_is_symmetric(of) for of in stencils.values()),
-        _place_dependence(scene, stencils),
+        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
     )
+
+
+def _reasons(
+    scene: Scene, passes: list[tuple[Scene, Here]], stencils: dict[Here, Stencil], spacing: float
+) -> Iterator[str]:
+    """Why the rule is no diffusion and no elasticity, apart from what long waves see."""
+    moved = max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes) / spacing
+    if not moved <= STILL:
+        yield f"a body at rest does not stay: the rule moves it by {moved:.6g} h a step"
+    if not all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes):
+        yield (
+            "small displacements do not add up, however small: the rule is not differentiable at "
+            "rest, and no plane wave answers for another"
+        )
+    yield from _place_dependence(scene, stencils)
 
 
 def _passes(scene: Scene) -> list[Scene]:
@@ -129,15 +138,14 @@ def _is_symmetric(stencil: Stencil) -> bool:
     return bool(np.abs(apart).max() <= ROUNDING * np.abs(list(by_key.values())).max())
 
 
-def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> str | None:
-    """How the rule differs between the body's middle and the corner where it differs most; None
-    where it does not."""
+def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[str]:
+    """How the rule differs between the body's middle and the corner where it differs most."""
     places, slots = list(stencils), scene.neighbourhood.slots
     weights = np.array([[*of.neighbours.values(), *of.own] for of in stencils.values()])
     differences = weights - weights[0]
     worst = int(np.abs(differences).max(axis=(1, 2, 3)).argmax())
     if not np.abs(differences[worst]).max() > ROUNDING * np.abs(weights[0]).max():
-        return None
+        return
     corner = f"({places[worst].X.x:.6g}, {places[worst].X.y:.6g})"
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
     verdict = f"; no constant of a material does that: {parameters} is no Poisson ratio"
@@ -152,7 +160,7 @@ def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> str | None
             f"{corner} of the body moves {defect.ravel()[pushed]:.6g} more along {to} a step than "
             "the one in the middle"
         )
-    return text + (verdict if parameters else "")
+    yield text + (verdict if parameters else "")
 
 
 def _moved(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:

@@ -119,10 +119,6 @@ ZERO = 1e-8
 """What is smaller, as a share of the stencil's largest entry, is nothing."""
 
 
-class NoSlowWavesError(ValueError):
-    """The rule has no pair of slow waves; the message says why."""
-
-
 @dataclass(frozen=True)
 class SlowWaves:
     """The slow waves of a stencil: see the module."""
@@ -146,8 +142,8 @@ class SlowWaves:
         return a
 
 
-def slow_waves(stencil: Primitive) -> SlowWaves:
-    """The slow waves; NoSlowWavesError where a translation of the whole is not left alone, or
+def slow_waves(stencil: Primitive) -> SlowWaves | str:
+    """The slow waves, or why there are none: a translation of the whole is not left alone, or
     sites move by themselves."""
     rest = operator(stencil, np.zeros((1, 2)))[0].real
     alike = _all_alike(stencil.sites)
@@ -155,7 +151,7 @@ def slow_waves(stencil: Primitive) -> SlowWaves:
     defect = rest @ alike
     if np.abs(defect).max() > ZERO * scale:
         worst = np.unravel_index(np.abs(defect).argmax(), defect.shape)
-        raise NoSlowWavesError(
+        return (
             "a rigid translation is not left alone: when everything moves by 1 along "
             f"{'xy'[worst[1]]}, the rule moves a particle by {-defect[worst]:.6g} along "
             f"{'xy'[worst[0] % 2]} a step"
@@ -163,12 +159,10 @@ def slow_waves(stencil: Primitive) -> SlowWaves:
     u, sizes, _ = np.linalg.svd(rest)
     left = u[:, -2:].T
     if len(rest) > 2 and sizes[-3] < ZERO * scale:
-        raise NoSlowWavesError(
-            "the sublattices can move against each other at no rate at all: not one body"
-        )
+        return "the sublattices can move against each other at no rate at all: not one body"
     shared = left @ alike
     if abs(np.linalg.det(shared)) < ZERO:
-        raise NoSlowWavesError("the sublattices keep moving once they are shifted, ever faster")
+        return "the sublattices keep moving once they are shifted, ever faster"
     left = np.linalg.inv(shared) @ left
     bordered = np.block([[rest, alike], [left, np.zeros((2, 2))]])
     return SlowWaves(stencil, left.astype(complex), np.linalg.inv(bordered).astype(complex))
