@@ -124,9 +124,8 @@ class Settling:
         self._foresight = Foresight(scene, self._scale, watch)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
-        self.obstacle = (
-            "steps are too few" if ends else "leaders do not come to rest before its end"
-        )
+        unended = "leaders do not come to rest before its end"
+        self.obstacle = "steps are too few" if ends else unended
         """Why the run has not settled, as found at the last look."""
 
     def look(self, state: State) -> Certificate | None:
