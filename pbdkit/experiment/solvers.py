@@ -3,7 +3,6 @@ family."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, SerializeAsAny
@@ -27,14 +26,16 @@ class Solver(Component):
     """Whether every step is made, one after the other."""
 
     @property
-    @abstractmethod
     def stepping(self) -> Stepping:
-        """How a step is made, where one is: the rule's own unless the experiment says more."""
+        """How a step is made, where one is: the rule's own unless the experiment says more. Also of
+        an equilibrium: so steps are made until roles change for the last time."""
+        return Stepping()
 
     @property
-    @abstractmethod
     def sought(self) -> Equilibrium:
-        """How an equilibrium is looked for, where one is."""
+        """How an equilibrium is looked for, where one is: as by default, unless the experiment says
+        more."""
+        return Equilibrium()
 
 
 class Stepping(Solver):
@@ -60,11 +61,6 @@ class Stepping(Solver):
         """As the experiment says."""
         return self
 
-    @property
-    def sought(self) -> Equilibrium:
-        """As by default."""
-        return Equilibrium()
-
 
 class Equilibrium(Solver):
     """Straight to where the steps converge to, leaders at their last prescribed position with the
@@ -81,11 +77,6 @@ class Equilibrium(Solver):
     method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-8
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
-
-    @property
-    def stepping(self) -> Stepping:
-        """The rule's own: so steps are made until roles change for the last time."""
-        return Stepping()
 
     @property
     def sought(self) -> Equilibrium:

@@ -57,16 +57,16 @@ def read_file(path: Path) -> Source:
     """The experiment in a file; ExperimentError names what cannot be read, and where."""
     try:
         with path.open("rb") as file:
-            if file.read(4) in (b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05"):
-                raise ExperimentError(
-                    f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
-                    "pbdkit.rerun(pbdkit.open(...)) runs the same again"
-                )
-        if path.stat().st_size > MAX_BYTES:
-            raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
-        raw = path.read_bytes()
+            raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
+    if raw.startswith((b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05")):
+        raise ExperimentError(
+            f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
+            "pbdkit.rerun(pbdkit.open(...)) runs the same again"
+        )
+    if len(raw) > MAX_BYTES:
+        raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -85,11 +85,6 @@ def read_text(text: str, name: str) -> Source:
     if not isinstance(source.data, dict):
         raise ExperimentError(f"{name}:1:1: expected keys such as `lattice:` at the top level")
     return source
-
-
-def read_value(text: str, name: str) -> Any:
-    """One YAML value, as in ``--set PATH=VALUE``."""
-    return _read(text, Source(name))
 
 
 def _read(text: str, source: Source) -> Any:
@@ -210,7 +205,7 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
         raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
     where = _parsed(path)
     changed = Source(source.name, copy.deepcopy(source.data), dict(source.places))
-    _place(changed.data, where, read_value(value, label), label, defaults)
+    _place(changed.data, where, _read(value, Source(label)), label, defaults)
     for known in [k for k in changed.places if k[: len(where)] == where]:
         del changed.places[known]
     for depth in range(1, len(where) + 1):

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import LeaderGroup, Selection
-from pbdkit.experiment.motions import Rotation
+from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
