@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -67,25 +68,22 @@ class Recorder:
         steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
         planned = {"time": recording.count(steps), "step": steps + 1}
         self._sink.begin(self._columns(), self._measured.sizes, planned)
-        for name, values in self._known().items():
-            self._sink.put({name: values()})
+        for values in self._known():
+            self._sink.put(values)
 
-    def _known(self) -> dict[str, Callable[[], Any]]:
+    def _known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
         raster, scene = self._scene.raster, self._scene
         numbers = np.arange(1, raster.count + 1)
-        known: dict[str, Callable[[], Any]] = {
-            "particle": lambda: numbers,
-            "number": lambda: numbers,
-            "axis": lambda: np.array(list("xyz"[: scene.axes])),
-            "site": raster.site_table,
-            "reference": raster.reference,
-        }
+        yield {"particle": numbers, "number": numbers}
+        yield {"axis": np.array(list("xyz"[: scene.axes]))}
+        yield {"site": raster.site_table()}
+        yield {"reference": raster.reference()}
         if scene.shows_bonds:
-            known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
+            yield {"bond": scene.bonds.ends, "shell": scene.bonds.shell}
         if self._measured.shows_leaders:
-            known["leader_group"] = lambda: np.arange(len(scene.leading))
-        return known | self._measured.coordinates()
+            yield {"leader_group": np.arange(len(scene.leading))}
+        yield self._measured.coordinates
 
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False) -> None:
@@ -94,20 +92,18 @@ class Recorder:
         value has left the finite numbers; nothing of that step is kept."""
         moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
-        if (
-            state.step > self._last_recorded
-            if last
-            else experiment.recording.keeps(state.step, experiment.steps)
-        ):
+        if last:
+            recorded = state.step > self._last_recorded
+        else:
+            recorded = experiment.recording.keeps(state.step, experiment.steps)
+        if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
-            values |= self._measured.at_record(moment)
+            values |= self._measured.remembered(moment, first=self._last_recorded < 0)
             values |= self._measured.diagnosed(When.RECORD, moment)
-            if self._last_recorded < 0:
-                values |= self._measured.at_start(moment)
             self._last_recorded = state.step
         if self._measured.every_step and not last:
             values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
@@ -130,16 +126,14 @@ class Recorder:
         self._sink.finish(self._attributes(outcome, prediction))
 
     def _columns(self) -> list[Column]:
-        columns = layout.base_columns()
-        if self._scene.shows_bonds:
-            columns += layout.bond_columns()
-        if self._scene.has_fracture:
-            columns += layout.broken_columns()
-        if self._measured.every_step:
-            columns.append(layout.step_column())
-        if self._measured.shows_leaders:
-            columns.append(layout.leader_column())
-        columns += self._measured.columns()
+        part_of = {
+            "bonds": self._scene.shows_bonds,
+            "fracture": self._scene.has_fracture,
+            "steps": self._measured.every_step,
+            "leader groups": self._measured.shows_leaders,
+        }
+        some = (columns for part, columns in layout.optional_columns().items() if part_of[part])
+        columns = [*layout.base_columns(), *chain(*some), *self._measured.columns()]
         if self._scene.experiment.record.dtype == "float64":
             return columns
         return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

@@ -16,7 +16,7 @@ from pbdkit.interfaces import (
     Remembered,
     Variable,
 )
-from pbdkit.results.layout import base_columns, bond_columns, broken_columns, reserved_names
+from pbdkit.results.layout import reserved_names
 from pbdkit.scene.declarations import remembered_names
 from pbdkit.testing.fault import NotAskedError, PropertyError
 from pbdkit.testing.property import asked_of
@@ -126,12 +126,10 @@ def declares_what_it_remembers(subject: Subject) -> None:
     for scene in subject.scenes:
         numbers = numbers_of(subject.component, scene)
         remembered_names(scene.experiment)  # refuses what is declared twice
-        columns = [*base_columns(), *bond_columns(), *broken_columns()]
-        taken = {c.name for c in columns} | {d for c in columns for d in c.dims}
         for number in numbers:
             if not re.fullmatch(NAME, number.name):
                 raise PropertyError(f"'{number.name}' is not named as `my_number` is")
-            if number.name in taken:
+            if number.name in reserved_names():
                 raise PropertyError(f"every dataset has a '{number.name}': give it another name")
             _refuse_unlabelled(number, f"'{number.name}'")
             _refuse_unheld(number, number.initial, "starts at")
