@@ -43,7 +43,8 @@ def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]
             corner.of(area)[...] += whole * share
             for plane, middle, place in zip(offset, centre, r, strict=True):
                 corner.of(plane)[...] += (middle - place) * whole * share
-            corner.of(gradient)[...] += slopes * share
+            for plane, slope in zip(gradient, slopes, strict=True):
+                corner.of(plane)[...] += slope * share
     some = np.where(area > 0.0, area, 1.0)
     gradient /= some
     offset /= some
@@ -62,7 +63,8 @@ def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]])
         usable = np.where(whole > FLAT * signed_area(rest), share, 0.0)
         for corner in patch.corners:
             corner.of(area)[...] += whole * usable
-            corner.of(slope)[...] += slopes * usable
+            for plane, part in zip(slope, slopes, strict=True):
+                corner.of(plane)[...] += part * usable
     slope /= np.where(area > 0.0, area, 1.0)
     beyond: Floats = slope[:, 0] * offset[0] + slope[:, 1] * offset[1]
     return beyond
@@ -71,11 +73,11 @@ def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]])
 def _around(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
     """The area of a polygon with corners r, and area times the mean gradient of d, (component of d,
     axis, ...)."""
-    slopes: Any = 0.0
+    slopes = np.zeros((len(d[0]), 2, *d[0].shape[1:]))
     for k, value in enumerate(d):
         ahead, behind = r[(k + 1) % len(r)], r[k - 1]
-        normal = (ahead.y - behind.y) / 2, (behind.x - ahead.x) / 2
-        slopes = slopes + np.stack([value * part for part in normal], axis=1)
+        slopes[:, 0] += value * ((ahead.y - behind.y) / 2)
+        slopes[:, 1] += value * ((behind.x - ahead.x) / 2)
     return signed_area(r), slopes
 
 
