@@ -108,16 +108,11 @@ class Path(Motion):
         return self
 
     def offset(self, n: int, start: Floats) -> Floats:
-        """Linear interpolation."""
-        after = bisect_left(self.steps, n)
-        if after == len(self.steps):
-            return np.array(self.displacements[-1])
-        before = (
-            (self.steps[after - 1], self.displacements[after - 1]) if after else (0, (0.0, 0.0))
-        )
-        between = (before[0], self.steps[after])
-        ways = zip(before[1], self.displacements[after], strict=True)
-        return np.array([np.interp(n, between, way) for way in ways])
+        """Linear interpolation; beyond the last step its displacement."""
+        k = min(bisect_left(self.steps, n), len(self.steps) - 1)
+        begin, before = (self.steps[k - 1], self.displacements[k - 1]) if k else (0, (0.0, 0.0))
+        ways = zip(before, self.displacements[k], strict=True)
+        return np.array([np.interp(n, (begin, self.steps[k]), way) for way in ways])
 
     def knots(self) -> tuple[int, ...]:
         """Its steps."""

@@ -136,6 +136,10 @@ class Experiment(Strict):
         """How a step of it is made, whatever the solver."""
         return self.solver.stepping
 
+    def records(self, step: int) -> bool:
+        """Whether that step is recorded."""
+        return self.recording.keeps(step, self.steps)
+
     def next_wanted(self, step: int) -> int:
         """The next step after `step` of which something is recorded."""
         if any(d.every_step for d in self.diagnostics):

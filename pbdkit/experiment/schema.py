@@ -29,7 +29,10 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
     for field, components in offered.items():
         for component, spellings in components.items():
             described = names[component, "validation"]["$ref"].rsplit("/", 1)[-1]
-            _close(definitions[described]["properties"]["type"], spellings)
+            named = definitions[described]["properties"]["type"]
+            named.pop("const", None)
+            named |= {"const": spellings[0]} if len(spellings) == 1 else {"enum": spellings}
+            named["default"] = spellings[0]
         part, choice = top["properties"][field], [dict(names[c, "validation"]) for c in components]
         if field == "diagnostics":
             part["items"] = {"oneOf": choice}
@@ -40,10 +43,3 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
     used = sorted(name for name in definitions if f'"#/$defs/{name}"' in everything)
     top |= {"title": "pbdkit experiment", "$defs": {name: definitions[name] for name in used}}
     return {"$schema": DIALECT, "title": top["title"], **top}
-
-
-def _close(kind: dict[str, Any], names: list[str]) -> None:
-    """`type` is one of these names."""
-    kind.pop("const", None)
-    kind |= {"const": names[0]} if len(names) == 1 else {"enum": names}
-    kind["default"] = names[0]

@@ -22,7 +22,7 @@ class Settle(Strict):
 class Solver(Component):
     """What takes a scene from its start to its end."""
 
-    makes_steps: ClassVar[bool]
+    makes_steps: ClassVar[bool] = True
     """Whether every step is made, one after the other."""
 
     @property
@@ -47,7 +47,6 @@ class Stepping(Solver):
     `settle` the run ends where it has settled, after `steps` at the latest.
     """
 
-    makes_steps: ClassVar[bool] = True
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import chain
@@ -90,30 +91,30 @@ def base_columns() -> list[Column]:
     ]
 
 
-def optional_columns() -> dict[str, list[Column]]:
+def optional_columns() -> list[list[Column]]:
     """What only some datasets have, whatever their diagnostics: the table of bonds, when each
     broke, the coordinate of what is measured at every step, and that of leader groups."""
     bond, ends = ("bond",), "the two particles of the bond, as positions along `particle` from 0"
     step = "step at which the bond broke, -1 if it has not"
     strain = "strain with which the bond broke, NaN if it has not or was broken from the start"
     group = "leader group, by its place among the experiment's leaders, from 0"
-    return {
-        "bonds": [
+    return [
+        [
             Column("bond", ("bond", "end"), "i8", When.START, f"{ends}, lower first", "", True),
             Column("shell", bond, "i1", When.START, "shell of the bond, from 1"),
         ],
-        "fracture": [
+        [
             Column("broken_step", bond, "i4", When.END, step),
             Column("broken_strain", bond, "f8", When.END, strain, "1"),
         ],
-        "steps": [coordinate("step", "step", when=When.STEP, units="step")],
-        "leader groups": [coordinate("leader_group", group)],
-    }
+        [coordinate("step", "step", when=When.STEP, units="step")],
+        [coordinate("leader_group", group)],
+    ]
 
 
 def reserved_names() -> set[str]:
     """The names that nobody else can give to a variable or a dimension."""
-    ours = chain(base_columns(), *optional_columns().values())
+    ours = chain(base_columns(), *optional_columns())
     return {name for column in ours for name in (column.name, *column.dims)}
 
 
@@ -144,7 +145,7 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
     `installed`, of those of the built-in diagnostics alone."""
     base = base_columns()
     diagnostics = registry.components(Diagnostic, installed=installed).values()
-    columns = list(chain(base, *optional_columns().values(), *map(_columns_of, diagnostics)))
+    columns = list(chain(base, *optional_columns(), *map(_columns_of, diagnostics)))
     strings: dict[str, Any] = {name: {"type": "string"} for name in ATTRIBUTES}
     strings |= {"status": {"enum": list(STATUSES)}, "schema_version": {"const": SCHEMA_VERSION}}
 
@@ -167,26 +168,22 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
     """The columns of a diagnostic, asked of one whose parameters are not set; where variables
     depend on parameters, or cannot be had, the schema leaves them open."""
     assert issubclass(diagnostic, Diagnostic)
-    try:
+    with suppress(Exception):  # it is somebody's code, which nobody asked to run
         variables = diagnostic.model_construct(type="").variables()
         columns = [diagnostic_column(v, diagnostic) for v in variables]
         json.dumps([_schema_of(column) for column in columns])
-    except Exception:  # it is somebody's code, which nobody asked to run
-        return []
-    return columns
+        return columns
+    return []
 
 
 def _schema_of(column: Column) -> dict[str, Any]:
-    attributes = {
-        name: {"const": value}
-        for name, value in column.attributes.items()
-        if not isinstance(value, np.ndarray)
-    }
+    said = {k: v for k, v in column.attributes.items() if not isinstance(v, np.ndarray)}
+    attributes = {name: {"const": value} for name, value in said.items()}
     parts = {"dims": {"const": list(column.dims)}, "attrs": _object(attributes, sorted(attributes))}
     if column.dtype != "str":
         parts["dtype"] = {"const": np.dtype(column.dtype).name}
-    said = f"{column.long_name}; written {column.when.value}"
-    return {"description": said} | _object(parts, ["dims", "attrs", "dtype"])
+    described = {"description": f"{column.long_name}; written {column.when.value}"}
+    return described | _object(parts, ["dims", "attrs", "dtype"])
 
 
 def _object(properties: dict[str, Any], required: list[str]) -> dict[str, Any]:

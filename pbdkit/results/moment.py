@@ -136,13 +136,11 @@ class StateMoment(Moment):
     def broken_strain(self) -> NDArray[np.float64]:
         """From the lengths, in float64 whatever the run's precision."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
-        strains = np.full(len(steps), np.nan)
-        if lengths is not None:
-            rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
-            broken = steps > 0
-            rest = rests[scene.bonds.plane[broken]]
-            strains[broken] = self._of_bonds(lengths)[broken] / rest - 1
-        return strains
+        if lengths is None:
+            return np.full(len(steps), np.nan)
+        rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
+        strains = self._of_bonds(lengths) / rests[scene.bonds.plane] - 1
+        return np.where(steps > 0, strains, np.nan)
 
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""

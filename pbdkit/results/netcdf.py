@@ -81,7 +81,6 @@ class NetcdfSink(Sink):
             self._file.setncatts(attributes)
             self._file.close()
             _sync(self._temporary)
-        with self._storing():
             self._give_name(attributes["status"] in WHOLE)
         with suppress(OSError):  # the result is there; some file systems cannot sync a folder
             _sync(self._temporary.parent)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from itertools import chain
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
@@ -92,11 +92,8 @@ class Recorder:
         value has left the finite numbers; nothing of that step is kept."""
         moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
-        if last:
-            recorded = state.step > self._last_recorded
-        else:
-            recorded = experiment.recording.keeps(state.step, experiment.steps)
-        if recorded:
+        late = last and state.step > self._last_recorded
+        if late or (not last and experiment.records(state.step)):
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
@@ -126,14 +123,10 @@ class Recorder:
         self._sink.finish(self._attributes(outcome, prediction))
 
     def _columns(self) -> list[Column]:
-        part_of = {
-            "bonds": self._scene.shows_bonds,
-            "fracture": self._scene.has_fracture,
-            "steps": self._measured.every_step,
-            "leader groups": self._measured.shows_leaders,
-        }
-        some = (columns for part, columns in layout.optional_columns().items() if part_of[part])
-        columns = [*layout.base_columns(), *chain(*some), *self._measured.columns()]
+        scene, measured = self._scene, self._measured
+        wanted = scene.shows_bonds, scene.has_fracture, measured.every_step, measured.shows_leaders
+        some = chain(*compress(layout.optional_columns(), wanted))
+        columns = [*layout.base_columns(), *some, *measured.columns()]
         if self._scene.experiment.record.dtype == "float64":
             return columns
         return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

@@ -99,12 +99,10 @@ class Stepwise(Driver):
     def _advance(self) -> None:
         """To the next step at which to look. Raises FloatingPointError."""
         experiment, state = self.scene.experiment, self.state
-        reached = min(
-            experiment.next_wanted(state.step), self.guard.next_look, state.step + self._patience
-        )
-        if self.settling:
-            reached = min(reached, self.settling.pace.next_look)
-        looks = reached == self.guard.next_look or self._records(reached)
+        stops = [experiment.next_wanted(state.step), self.guard.next_look]
+        stops += [self.settling.pace.next_look] if self.settling else []
+        reached = min(*stops, state.step + self._patience)
+        looks = reached == self.guard.next_look or experiment.records(reached)
         self.state = self._engine.advance(state, reached - state.step)
         if looks:
             self.guard.look(self.scene, self.state)
@@ -113,12 +111,8 @@ class Stepwise(Driver):
         """Raises what whoever looked at the state has against it."""
         if self.rejection:
             raise self.rejection
-        if self._records(self.state.step):
+        if self.scene.experiment.records(self.state.step):
             self.kept = self.state.step
-
-    def _records(self, step: int) -> bool:
-        experiment = self.scene.experiment
-        return experiment.recording.keeps(step, experiment.steps)
 
     def _settled(self) -> Outcome | None:
         state = self.state
