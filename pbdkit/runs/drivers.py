@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING
 
 from pbdkit.equilibrium.watch import StoppedError, Watch
@@ -76,21 +76,18 @@ class Stepwise(Driver):
     def _stepped(self) -> States:
         steps = self.scene.experiment.steps
         try:
-            yield self.state
-            self._heed()
+            yield from self._given_out()
             while not (outcome := self._settled()) and (step := self.state.step) < steps:
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
-                yield self.state
-                self._heed()
+                yield from self._given_out()
         except StoppedError:
             step = self.state.step
             stopped = Outcome("interrupted", f"stopped after step {step}", step)
             outcome = stopped if step < steps else None
         if self.kept < self.state.step:
             self.ending = True
-            yield self.state
-            self._heed()
+            yield from self._given_out()
         if outcome:
             return outcome
         unsettled = f", not settled: {self.settling.obstacle}" if self.settling else ""
@@ -107,8 +104,9 @@ class Stepwise(Driver):
         if looks:
             self.guard.look(self.scene, self.state)
 
-    def _heed(self) -> None:
-        """Raises what whoever looked at the state has against it."""
+    def _given_out(self) -> Iterator[State]:
+        """The state. Raises what whoever looked at it has against it."""
+        yield self.state
         if self.rejection:
             raise self.rejection
         if self.scene.experiment.records(self.state.step):
