@@ -19,7 +19,7 @@ from pbdkit.experiment.source import Source, with_setting
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.progress import progress_bar
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
-from pbdkit.experiment.motions import Oscillation
+from pbdkit.experiment.leaders import Oscillation
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 

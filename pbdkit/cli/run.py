@@ -38,9 +38,8 @@ def run(
     from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
     from pbdkit.equilibrium.watch import Watch
-    from pbdkit.results.netcdf import NetcdfSink
+    from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
     from pbdkit.results.progress import progress_bar
-    from pbdkit.results.sinks import OverlappingSink
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 

@@ -23,7 +23,13 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
         nonlocal bar, due
         if not wanted or time.perf_counter() < due:
             return
-        bar = bar or _new_bar()
+        if bar is None:
+            from rich.console import Console
+            from rich.progress import Progress
+
+            bar = Progress(console=Console(file=sys.stderr), transient=True)
+            bar.start()
+            bar.add_task("", total=1)
         due = time.perf_counter() + REFRESH_S
         bar.update(bar.task_ids[0], description=what, completed=done)
 
@@ -32,13 +38,3 @@ def progress_bar(wanted: bool) -> Iterator[Callable[[str, float], None]]:
     finally:
         if bar is not None:
             bar.stop()
-
-
-def _new_bar() -> Any:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    bar = Progress(console=Console(file=sys.stderr), transient=True)
-    bar.start()
-    bar.add_task("", total=1)
-    return bar

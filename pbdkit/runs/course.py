@@ -12,8 +12,7 @@ from pbdkit.analysis.forecast import prediction, quick_warnings
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
-from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.recorder import MemorySink, Outcome, Recorder, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import LeaderGroup, Selection
+from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.motions import Rotation
 from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Floats
