@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import sys
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
+from pbdkit.runs.course import peak_memory
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene, build_scene
@@ -52,20 +52,6 @@ def main(answer: Path) -> None:
     except PbdkitError as error:
         found = {"fault": type(error).__name__, "message": str(error)}
     answer.write_text(json.dumps(found), encoding="utf-8")
-
-
-def peak_memory() -> int:
-    """Bytes at most resident in this process.
-
-    Linux counts what the process that started this one had resident into ru_maxrss, so the
-    figure of this program's own memory is taken where there is one.
-    """
-    status = Path("/proc/self/status")
-    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
-        return int(found[1]) * 1024
-    from resource import RUSAGE_SELF, getrusage
-
-    return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _import(*modules: str) -> int:

@@ -105,27 +105,20 @@ def _say(report: Report, path: Path, *, settling: bool) -> None:
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
+    from pbdkit.runs.course import peak_memory
+
+    peak = peak_memory()
     return {
         "status": report.outcome.status,
         "steps": report.outcome.steps,
         "particles": report.particles,
         "wall_s": round(report.wall_s, 6),
         "ns_per_particle_step": round(report.ns_per_particle_step, 3),
-        "peak_memory_mib": _peak_memory_mib(),
+        "peak_memory_mib": round(peak / 2**20, 1) if peak else None,
         "engine": report.choice.engine,
         "threads": report.choice.threads,
         "output": str(path),
     }
-
-
-def _peak_memory_mib() -> float | None:
-    """Of this process; None where the system does not tell."""
-    try:
-        from resource import RUSAGE_SELF, getrusage
-    except ImportError:
-        return None
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return round(getrusage(RUSAGE_SELF).ru_maxrss / unit, 1)
 
 
 def _exit_code(report: Report, path: Path, written: Path) -> int:

@@ -142,7 +142,7 @@ class Experiment(Strict):
 
     def next_wanted(self, step: int) -> int:
         """The next step after `step` of which something is recorded."""
-        if any(d.every_step for d in self.diagnostics):
+        if any(d.every_step and not d.at_end for d in self.diagnostics):
             return step + 1
         return self.recording.next_after(step, self.steps)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FollowerRule, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.places import distinct
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
 
 Floats = NDArray[np.floating[Any]]
@@ -98,7 +99,7 @@ class RasterFrame(FrameSites):
         """Searches outwards from every frame point, shell of sites by shell, until all have met
         the body and every tie is in."""
         sublattice = self.raster.cells_of(self.frame_rows)[0]
-        own = ((s, np.flatnonzero(sublattice == s)) for s in np.unique(sublattice))
+        own = ((s, np.flatnonzero(sublattice == s)) for s in distinct(sublattice))
         pairs = [pair for s, points in own for pair in self._nearest_of(s, points)]
         point, body = (np.concatenate(part) for part in zip(*pairs, strict=True))
         order = np.lexsort((body, point))

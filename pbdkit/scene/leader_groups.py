@@ -15,7 +15,7 @@ from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.places import Floats
+from pbdkit.scene.places import Floats, distinct
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
 SHOWN = 5
@@ -125,7 +125,7 @@ class Selecting:
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
             text = f"selects no particle; the body reaches from {low} to {high}"
             raise ExperimentError(text, where)
-        return np.unique(rows)
+        return distinct(rows)
 
     def _edge(self, edge: str) -> Indices:
         """The body particle of smallest or largest i in every row j, or j in every column i."""

@@ -19,6 +19,11 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
+    """Those that occur, from 0 on, sorted: np.unique loads numpy.ma, a tenth of a small `check`."""
+    return np.flatnonzero(np.bincount(numbers))
+
+
 @dataclass(frozen=True)
 class Block:
     """A rectangle of repeat cells of one sublattice; `stop` is excluded."""

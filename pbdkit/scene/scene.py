@@ -22,7 +22,7 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.places import Mask, hull
+from pbdkit.scene.places import Mask, distinct, hull
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
@@ -75,7 +75,7 @@ class Scene:
     def leaders_overlap(self) -> bool:
         """Whether any particle belongs to two leader groups."""
         rows = [leading.rows for leading in self.leading]
-        return len(np.unique(np.concatenate([*rows, []]))) < sum(map(len, rows))
+        return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
 
     @cached_property
     def bonds(self) -> BondTable:
