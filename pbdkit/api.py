@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source, with_setting
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.progress import progress_bar
+from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene

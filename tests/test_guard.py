@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.watch import Watch
+from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene

@@ -22,9 +22,9 @@ from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
+from pbdkit.results.progress import Watch
 from pbdkit.runs.course import peak_memory
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER

@@ -37,9 +37,8 @@ def run(
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
-    from pbdkit.equilibrium.watch import Watch
     from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
-    from pbdkit.results.progress import progress_bar
+    from pbdkit.results.progress import Watch, progress_bar
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of

@@ -6,8 +6,8 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
-from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine

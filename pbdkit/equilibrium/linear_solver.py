@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import DENSE
 from pbdkit.equilibrium.dissection import dissected
 from pbdkit.equilibrium.multigrid import aggregated, classical
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
 Preconditioner = Callable[[Floats], Floats]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, Foresight, Outlook, scale_of
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.prescription import is_cut_short, last_event

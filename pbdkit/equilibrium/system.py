@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 

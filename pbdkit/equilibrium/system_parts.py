@@ -21,7 +21,7 @@ from pbdkit.equilibrium.linear_solver import (
     is_symmetric,
     linear_solver,
 )
-from pbdkit.equilibrium.watch import Watch
+from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
 SAFETY = 3.0

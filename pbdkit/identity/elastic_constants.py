@@ -79,10 +79,12 @@ class Elasticity:
         return float(sizes[0] / sizes[-1])
 
     @property
-    def zener(self) -> float:
-        """4 C66 / (C11 + C22 - 2 C12), in x and y: 1 for isotropic bodies."""
+    def zener(self) -> float | None:
+        """4 C66 / (C11 + C22 - 2 C12), in x and y: 1 for isotropic bodies; None where stretching
+        one way and shrinking the other costs nothing."""
         (c11, c12, _), (_, c22, _), (*_, c66) = self.stiffness
-        return float(4 * c66 / (c11 + c22 - 2 * c12))
+        stretching = c11 + c22 - 2 * c12
+        return float(4 * c66 / stretching) if stretching else None
 
     def youngs_modulus(self, degrees: float) -> float:
         """Of a bar in plane stress cut along that direction, in the units of `stiffness`; 0 where

@@ -68,9 +68,9 @@ def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
         yield "Poisson's ratio", f"{_number(ratio)} in plane stress{strain}"
         return
     along = [body.poisson_ratio(angle) for angle in (0.0, 90.0)]
-    texts = ["none" if r is None else _number(r) for r in along]
+    *texts, zener = ["none" if r is None else _number(r) for r in (*along, body.zener)]
     yield "Poisson's ratio", f"{texts[0]} pulled along x, {texts[1]} along y (plane stress)"
-    yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {_number(body.zener)}, isotropic 1"
+    yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {zener}, isotropic 1"
     if body.axis is not None:
         yield "axis of symmetry", f"at {_number(body.axis)}°"
 

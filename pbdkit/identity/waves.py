@@ -158,7 +158,7 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
         )
     u, sizes, _ = np.linalg.svd(rest)
     left = u[:, -2:].T
-    if len(rest) > 2 and sizes[-3] < ZERO * scale:
+    if len(rest) > 2 and sizes[-3] <= ZERO * scale:
         return "the sublattices can move against each other at no rate at all: not one body"
     shared = left @ alike
     if abs(np.linalg.det(shared)) < ZERO:

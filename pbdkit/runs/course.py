@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 
 from pbdkit.analysis.forecast import prediction, quick_warnings
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
+from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import MemorySink, Outcome, Recorder, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.scene.scene import Scene

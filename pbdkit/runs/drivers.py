@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING
 
-from pbdkit.equilibrium.watch import StoppedError, Watch
+from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
