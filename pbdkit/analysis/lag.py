@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -112,7 +112,7 @@ def _fastest(scene: Scene) -> tuple[int, int, float]:
     """(first, last, speed): the steps, two at least, in which all leaders keep their velocities and
     one moves fastest."""
     steps, moments = scene.experiment.steps, [_moments(each, scene) for each in scene.leading]
-    every = np.unique([1, steps + 1, *(m for own in moments for m in own)])
+    every = np.array(sorted({1, steps + 1, *chain(*moments)}))
     speeds = np.zeros(len(every) - 1)
     for leading, own in zip(scene.leading, moments, strict=True):
         for first, after in pairwise(own):

@@ -139,7 +139,8 @@ def _groups(matrix: Any) -> Iterator[Any]:
     order = np.argsort(label, kind="stable")
     bounds = np.searchsorted(label[order], np.arange(count + 1))
     alone = np.diff(bounds) == 1
-    yield from (np.array([[v]]) for v in np.unique(matrix.diagonal()[order[bounds[:-1][alone]]]))
+    values = matrix.diagonal()[order[bounds[:-1][alone]]].tolist()
+    yield from (np.array([[v]]) for v in sorted(set(values)))
     seen = set()
     for n in np.flatnonzero(~alone):
         own = np.sort(order[bounds[n] : bounds[n + 1]])

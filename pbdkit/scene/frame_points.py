@@ -45,7 +45,7 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
     follow = policy.follow(frame)
     _refuse_unfit(follow, len(rows), raster)
     says = np.abs(follow.weight).reshape(len(follow.point), -1).max(axis=1, initial=0.0) > 0.0
-    alone = np.setdiff1d(np.arange(len(rows)), follow.point[says])
+    alone = np.flatnonzero(np.bincount(follow.point[says], minlength=len(rows)) == 0)
     if len(alone):
         raise ExperimentError(
             f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
