@@ -96,5 +96,3 @@ AnyBody = Annotated[
     ),
 ]
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]
-for _composed in (Composed, Union, Intersection, Difference):
-    _composed.model_rebuild()
