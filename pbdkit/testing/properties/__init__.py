@@ -7,7 +7,7 @@ from pbdkit.testing.properties import (
     elementwise,
     every,
     lattice_parts,
-    particular,
+    particulars,
     repetition,
     start,
     steps,
@@ -16,7 +16,7 @@ from pbdkit.testing.subject import Property
 
 PROPERTIES: tuple[Property, ...] = tuple(
     found
-    for page in (every, lattice_parts, start, repetition, elementwise, particular, steps)
+    for page in (every, lattice_parts, start, repetition, elementwise, particulars, steps)
     for found in vars(page).values()
     if isinstance(found, Property)
 )
