@@ -77,24 +77,21 @@ if TYPE_CHECKING:
 
 _HOME = {
     "pbdkit.errors": (
-        "DivergedError", "ExperimentError", "PbdkitError", "PbdkitWarning", "PluginError",
-        "StorageError",
+        "DivergedError ExperimentError PbdkitError PbdkitWarning PluginError StorageError"
     ),
-    "pbdkit.experiment.model": ("Experiment",),
+    "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
-        "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell",
-        "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-        "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "Moment",
-        "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers",
-        "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
-        "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length",
-        "squared_length", "where",
+        "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
+        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here Lattice "
+        "LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles Remembered Remembers "
+        "RenewsBonds RenewsParticles Setting Slot Softens SpaceVector StartsCracked Stiffness "
+        "StoresEnergy Variable Vector dot length squared_length where"
     ),
-    "pbdkit.registry.discovery": ("hookimpl",),
-    "pbdkit.results.accessor": ("open",),
-    "pbdkit.api": ("analyse", "identify", "load", "rerun", "run"),
-}  # fmt: skip
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+    "pbdkit.registry.discovery": "hookimpl",
+    "pbdkit.results.accessor": "open",
+    "pbdkit.api": "analyse identify load rerun run",
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:

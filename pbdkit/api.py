@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.forecast import refuse_too_much_output
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source, with_setting
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.progress import progress_bar
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.progress import Watch, progress_bar
+from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from pbdkit.identity.identity import Identity
 
 Components = Iterable[type[Component]]
+Given = Experiment | Mapping[str, Any] | str | Path
+"""An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
 
 def load(
@@ -45,12 +46,7 @@ def load(
     return Experiment.build(source, components)
 
 
-def run(
-    experiment: Experiment | Mapping[str, Any] | str | Path,
-    *,
-    components: Components = (),
-    progress: bool = True,
-) -> xarray.Dataset:
+def run(experiment: Given, *, components: Components = (), progress: bool = True) -> xarray.Dataset:
     """Runs an experiment and returns its dataset; nothing is written.
 
     `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
@@ -82,20 +78,16 @@ def _warn(texts: Iterable[str]) -> None:
         warnings.warn(text, PbdkitWarning, stacklevel=4)
 
 
-def analyse(
-    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
-) -> Analysis:
+def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
     return Analysis(build_scene(_experiment(experiment, components)))
 
 
-def identify(
-    experiment: Experiment | Mapping[str, Any] | str | Path, *, components: Components = ()
-) -> Identity:
+def identify(experiment: Given, *, components: Components = ()) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
     elastic body, with its constants, from the rule's answer to plane waves."""
-    from pbdkit.identity.identification import identified
+    from pbdkit.identity.identity import identified
 
     return identified(build_scene(_experiment(experiment, components)))
 
@@ -149,9 +141,7 @@ def _carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     return found
 
 
-def _experiment(
-    given: Experiment | Mapping[str, Any] | str | Path, components: Components
-) -> Experiment:
+def _experiment(given: Given, components: Components) -> Experiment:
     if isinstance(given, Experiment):
         Registry(components)  # what is handed over is checked, needed or not
         return given

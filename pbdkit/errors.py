@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     import xarray
@@ -15,10 +15,18 @@ MOST_LINES = 20
 
 class PbdkitError(Exception):
     """The common ancestor; its text is one message for the user, with place and remedy. Whatever it
-    repeats of the input is made fit to be shown."""
+    repeats of the input is made fit to be shown.
 
-    def __init__(self, message: str) -> None:
+    `where` is the path of the faulty field in the experiment, for instance
+    ``("leaders", 1, "select")``; it is empty when no single field is to blame. `exit_status` is
+    that of the program which ends with it.
+    """
+
+    exit_status: ClassVar[int] = 1
+
+    def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
         super().__init__(printable(message))
+        self.where = tuple(where)
 
 
 def printable(text: str) -> str:
@@ -39,26 +47,16 @@ def _escaped(line: str) -> str:
 
 
 class ExperimentError(PbdkitError):
-    """The experiment or the call is wrong.
+    """The experiment or the call is wrong."""
 
-    `where` is the path of the faulty field in the experiment, for instance
-    ``("leaders", 1, "select")``; it is empty when no single field is to blame.
-    """
-
-    def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
-        super().__init__(message)
-        self.where = tuple(where)
+    exit_status = 2
 
 
 class PluginError(PbdkitError):
-    """A distribution that the experiment names is missing or broken, or a component of it fails.
+    """A distribution that the experiment names is missing or broken, or a component of it fails;
+    `where` is then the path of the field that asks for it, where one does."""
 
-    `where` is the path of the field that asks for it, where one does.
-    """
-
-    def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
-        super().__init__(message)
-        self.where = tuple(where)
+    exit_status = 3
 
 
 class DivergedError(PbdkitError):
@@ -68,6 +66,8 @@ class DivergedError(PbdkitError):
     writing to a file, which then holds the same.
     """
 
+    exit_status = 4
+
     def __init__(self, message: str, dataset: xarray.Dataset | None = None) -> None:
         super().__init__(message)
         self.dataset = dataset
@@ -75,6 +75,8 @@ class DivergedError(PbdkitError):
 
 class StorageError(PbdkitError):
     """A result could not be written or read; nothing that existed before was touched."""
+
+    exit_status = 6
 
 
 class PbdkitWarning(UserWarning):

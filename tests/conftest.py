@@ -28,10 +28,11 @@ settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
 def pytest_configure(config: pytest.Config) -> None:
     """What every worker, and every process that a test starts, finds in its environment: one folder
     of compiled kernels, kept from run to run, and one thread of linear algebra, as the systems here
-    are small and the workers take the processors."""
+    are small and the workers take the processors; and they keep the bytecode that they make."""
     if cache := getattr(config, "cache", None):
         os.environ.setdefault("PBDKIT_CACHE_DIR", str(cache.mkdir("kernels")))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 Build = Callable[..., Scene]

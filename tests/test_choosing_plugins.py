@@ -19,7 +19,7 @@ from plugin_sources import hook, listed, rule
 import pbdkit
 from pbdkit.cli import program
 from pbdkit.experiment.schema import experiment_schema
-from pbdkit.registry.discovery import DISABLE, installed_points
+from pbdkit.registry.discovery import DISABLE, installed_plugins
 from pbdkit.registry.registry import Registry
 
 Install = Callable[..., None]
@@ -194,7 +194,7 @@ def test_of_fifty_plugins_that_no_part_needs_none_is_looked_at(
 ) -> None:
     for n in range(50):
         install(f"pbdkit-unused-{n}", "raise ImportError")
-    assert len(installed_points()) == 50
+    assert len(installed_plugins()) == 50
     words = [sys.executable, "-c", SEEN, command, "e.json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.watch import Watch
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.progress import Watch
+from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import guard

@@ -19,6 +19,7 @@ from identity_cases import (
 from remembering_parts import Tiring
 
 import pbdkit
+from pbdkit.identity.elastic_constants import Elasticity
 
 HONEYCOMB = {"type": "honeycomb"}
 
@@ -127,6 +128,17 @@ def test_what_is_neither_is_told_why(rule, reason):
     assert (found.kind, found.symmetry, found.poisson_ratio) == ("neither", None, None)
     assert reason in found.reasons
     json.dumps(found.as_dict())
+
+
+def test_sites_that_never_move_are_not_one_body():
+    found = identity(HONEYCOMB, NEAREST, "idle")
+    said = "the sublattices can move against each other at no rate at all: not one body"
+    assert (found.kind, found.reasons) == ("neither", (said,))
+
+
+def test_where_stretching_costs_nothing_no_anisotropy_is_told():
+    costless = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.5]])
+    assert Elasticity(costless, np.eye(2)).zener is None
 
 
 def test_a_rule_that_remembers_is_identified_as_it_starts():

@@ -10,7 +10,7 @@ import pytest
 import pbdkit
 from pbdkit.equilibrium import linear_solver as linear
 from pbdkit.equilibrium.linear_solver import linear_solver
-from pbdkit.equilibrium.watch import StoppedError, Watch
+from pbdkit.results.progress import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
 NAMES = ["lu", "multigrid", "conjugate-gradients"]

@@ -11,8 +11,7 @@ from remembering_parts import Tiring, Weakest
 import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.remembered_values import generator_for
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import generator_for, initial_state
 
 PARTS = [Weakest, Tiring]
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

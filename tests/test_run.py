@@ -14,9 +14,9 @@ import pytest
 
 import pbdkit
 from pbdkit.equilibrium.settlement import Pace
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Equilibrium, Solver
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.progress import Watch
+from pbdkit.results.recorder import MemorySink
 from pbdkit.runs.course import DRIVERS, Run, record
 from pbdkit.runs.drivers import Stepwise
 from pbdkit.scene.scene import Scene, build_scene

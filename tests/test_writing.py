@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.watch import Watch
-from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.results.netcdf import LARGE_BYTES, MOST_WAITING, NetcdfSink, OverlappingSink
+from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Sink
-from pbdkit.results.sinks import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

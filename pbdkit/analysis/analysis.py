@@ -162,10 +162,8 @@ class Analysis:
     def steps_to(self) -> dict[str, int | None]:
         """ln(tolerance) / ln ρ: the steps after which the slowest mode has shrunk to that."""
         radius = self.spectral_radius
-        if radius is None or radius >= 1.0 - 1e-14:
-            return dict.fromkeys(TOLERANCES)
-        if radius == 0.0:
-            return dict.fromkeys(TOLERANCES, 1)
+        if radius is None or radius >= 1.0 - 1e-14 or radius == 0.0:
+            return dict.fromkeys(TOLERANCES, 1 if radius == 0.0 else None)
         return {t: math.ceil(math.log(float(t)) / math.log(radius)) for t in TOLERANCES}
 
     @cached_property
@@ -193,7 +191,7 @@ class Analysis:
         graph = Entries(both.rows, both.columns, np.ones(len(both.rows)), both.shape)
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
-        led[label[np.unique(operator.couplings_led.entries().rows)]] = True
+        led[label[operator.couplings_led.entries().rows]] = True
         numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)
@@ -202,14 +200,13 @@ class Analysis:
         """What stands in the way of settling, with the remedy."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored else self.parts_without_leader
+        found = [
+            f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
+            "nothing holds it"
+            for part in parts
+        ]
         if len(parts) > 3:
             found = [f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"]
-        else:
-            found = [
-                f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
-                "nothing holds it"
-                for part in parts
-            ]
         if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
             pass  # it makes no steps, and steps with that relaxation would lead there too
         elif self.stable is False:

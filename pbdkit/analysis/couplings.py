@@ -27,13 +27,11 @@ class Entries:
     shape: tuple[int, int]
 
     def plus(self, other: Entries, factor: float = 1.0) -> Entries:
-        """The sum with `factor` times a matrix of the same shape."""
-        return Entries(
-            np.concatenate([self.rows, other.rows]),
-            np.concatenate([self.columns, other.columns]),
-            np.concatenate([self.values, factor * other.values]),
-            self.shape,
-        )
+        """The sum with `factor` times a matrix, in the shape of that."""
+        rows = np.concatenate([self.rows, other.rows])
+        columns = np.concatenate([self.columns, other.columns])
+        values = np.concatenate([self.values, factor * other.values])
+        return Entries(rows, columns, values, other.shape)
 
     def matrix(self) -> Any:
         """Dense up to DENSE rows, else sparse."""
@@ -144,9 +142,7 @@ class Couplings:
 
 def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """Those chosen; still a view where all are one."""
-    if is_one(blocks):
-        return blocks[: np.count_nonzero(chosen)]
-    return blocks[chosen]
+    return blocks[: np.count_nonzero(chosen)] if is_one(blocks) else blocks[chosen]
 
 
 def scaled(factor: float, blocks: Floats) -> Floats:

@@ -42,39 +42,38 @@ class Forecast:
     exact: bool
     lag: float | None
     lag_reached: float | None
-    warnings: tuple[str, ...]
+    warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain values, for JSON."""
-        return asdict(self) | {"warnings": list(self.warnings)}
+        return asdict(self)
+
+
+ANALYSED = (
+    *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
+    *("exact", "lag"),
+)
+"""What the analysis calls by the same names."""
 
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
     kinds = kinds_at(scene.raster, scene.leading, 1)
-    analysis = Analysis(scene)
-    exact = analysis.warnings()
-    waves = [] if analysis.spectrum else _growing_waves(scene)
-    solver = scene.experiment.stepping
+    analysis, solver = Analysis(scene), scene.experiment.stepping
     swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
+    waves = [] if analysis.spectrum else _growing_waves(scene)
     return Forecast(
         particles=scene.raster.count,
         followers=int(np.count_nonzero(kinds == FOLLOWER)),
         bonds=count_bonds(scene.raster, scene.neighbourhood),
         memory_mib=round(sizes.memory / MIB, 3),
         output_mib=round(sizes.output / MIB, 3),
-        spectral_radius=analysis.spectral_radius,
-        smallest_eigenvalue=analysis.smallest_eigenvalue,
-        largest_stable_relaxation=analysis.largest_stable_relaxation,
-        stable=analysis.stable,
-        steps_to=analysis.steps_to,
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
-        exact=analysis.exact,
-        lag=analysis.lag,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
-        warnings=(*_doubts(scene), *exact, *waves),
+        warnings=[*_doubts(scene), *analysis.warnings(), *waves],
+        **{name: getattr(analysis, name) for name in ANALYSED},
     )
 
 
@@ -122,10 +121,8 @@ def _growing_waves(scene: Scene) -> list[str]:
     if stable and not scene.experiment.solver.makes_steps:
         return []
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
-    return [
-        f"solver.relaxation: {solver.relaxation:g} can diverge, some waves grow by "
-        f"{bound.radius:.4g} a step{remedy}"
-    ]
+    grows = f"can diverge, some waves grow by {bound.radius:.4g} a step"
+    return [f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"]
 
 
 def refuse_too_much_output(scene: Scene) -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,11 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
-from pbdkit.experiment.motions import Oscillation
+from pbdkit.experiment.leaders import Oscillation
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 
 Floats = NDArray[np.float64]
-Solve = Callable[[Floats], Floats]
 DEAREST = 2e8
 """Products of numbers that are made at most to know the lag at the end of an interval."""
 WORST = 1e12
@@ -84,18 +83,15 @@ def lag_of(scene: Scene) -> Lag | None:
     for leading in scene.leading:
         if leading.group.leads(first):
             v[np.searchsorted(operator.leaders, leading.rows)] = _velocity(leading, first)
-    pull = operator.couplings_led.times(v).ravel()
-    shown = operator.couplings_shown.times(v).ravel()
+    pull, shown = (c.times(v).ravel() for c in (operator.couplings_led, operator.couplings_shown))
     both = operator.couplings_both.entries().matrix()
     _, label = connected(both, strongly=False)
     who = np.flatnonzero(np.isin(label, label[pull != 0.0]))
     solve = _solver(both[who][:, who]) if len(who) else None
     if solve is None:
         return None
-    now, before = (
-        couplings.entries().matrix()[who][:, who]
-        for couplings in (operator.couplings_now, operator.couplings_before)
-    )
+    parts = operator.couplings_now, operator.couplings_before
+    now, before = (couplings.entries().matrix()[who][:, who] for couplings in parts)
     delta = solve(pull[who])
     first_push = delta - (pull - shown)[who]
     push = first_push + before @ delta + scene.lag * shown[who]
@@ -103,20 +99,20 @@ def lag_of(scene: Scene) -> Lag | None:
     def largest(error: Floats) -> float:
         return float(np.sqrt(np.bincount(who // 2, error * error).max()))
 
-    steady, reached, steps = largest(solve(push)), None, last - first + 1
-    if steps * (now.size if isinstance(now, np.ndarray) else now.nnz) <= DEAREST:
-        earlier, error = np.zeros_like(push), first_push
-        for _ in range(steps - 1):
-            earlier, error = error, now @ error + before @ earlier + push
-        reached = largest(error)
-    return Lag(first, last, speed, steady, reached)
+    steady, steps = largest(solve(push)), last - first + 1
+    if steps * (now.size if isinstance(now, np.ndarray) else now.nnz) > DEAREST:
+        return Lag(first, last, speed, steady, None)
+    earlier, error = np.zeros_like(push), first_push
+    for _ in range(steps - 1):
+        earlier, error = error, now @ error + before @ earlier + push
+    return Lag(first, last, speed, steady, largest(error))
 
 
 def _fastest(scene: Scene) -> tuple[int, int, float]:
     """(first, last, speed): the steps, two at least, in which all leaders keep their velocities and
     one moves fastest."""
     steps, moments = scene.experiment.steps, [_moments(each, scene) for each in scene.leading]
-    every = np.unique([1, steps + 1, *(m for own in moments for m in own)])
+    every = np.array(sorted({1, steps + 1, *chain(*moments)}))
     speeds = np.zeros(len(every) - 1)
     for leading, own in zip(scene.leading, moments, strict=True):
         for first, after in pairwise(own):
@@ -145,13 +141,12 @@ def _velocity(leading: Leading, step: int) -> Floats:
     return np.zeros_like(at) + (motion.offset(n, at) - before)
 
 
-def _solver(step: Any) -> Solve | None:
+def _solver(step: Any) -> Callable[[Floats], Floats] | None:
     """What solves (1 - step) x = b; None for a singular matrix."""
     matrix = one_minus(step)
     if isinstance(matrix, np.ndarray):
-        if not np.linalg.cond(matrix) < WORST:
-            return None
-        return lambda b: np.asarray(np.linalg.solve(matrix, b))
+        regular = np.linalg.cond(matrix) < WORST
+        return (lambda b: np.asarray(np.linalg.solve(matrix, b))) if regular else None
     from scipy.sparse.linalg import splu
 
     try:
@@ -159,6 +154,4 @@ def _solver(step: Any) -> Solve | None:
     except RuntimeError:  # "Factor is exactly singular"
         return None
     pivots = np.abs(factors.U.diagonal())
-    if not pivots.max() < WORST * pivots.min():
-        return None
-    return lambda b: np.asarray(factors.solve(b))
+    return factors.solve if pivots.max() < WORST * pivots.min() else None

@@ -32,24 +32,13 @@ Present = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Response:
-    """The move of some followers, linearised.
+    """The move of some followers, linearised: ∂move/∂u_k for each slot and ∂move/∂u_j, (follower,
+    axis of the move, axis of u), and the move itself, (follower, axis); views of one where all
+    followers answer alike. `neighbours` is gone through once, for they are large."""
 
-    ∂move/∂u_k for each slot and ∂move/∂u_j, (kind, axis of the move, axis of u), and the move
-    itself, (kind, axis); `kind` says for each follower which of the kinds it is, and `steps` how
-    far along the flat raster a slot reaches.
-    """
-
-    neighbours: dict[Slot, Floats]
+    neighbours: Iterator[tuple[Slot, Floats]]
     own: Floats
     move: Floats
-    kind: Indices
-    steps: dict[Slot, int]
-
-    def of_each(self, values: Floats) -> Floats:
-        """The values of the kinds, for each follower; a view where there is one kind only."""
-        if len(values) == 1:
-            return np.broadcast_to(values[0], (len(self.kind), *values.shape[1:]))
-        return values[self.kind]
 
 
 def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
@@ -57,8 +46,6 @@ def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Resp
 
     Raises PluginError where the rule's functions fail, or are not finite at rest.
     """
-    slots = scene.neighbourhood.slots[sublattice]
-    steps = {slot: slot_step(scene.raster.shape, slot) for slot in slots}
     kinds = np.arange(len(place))
     same = not scene.experiment.rule.uses_reference and not _differ(scene, state)
     at_rest = not state.u.any()
@@ -66,10 +53,18 @@ def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Resp
         if same and at_rest:
             kinds, place = _alike(scene, state, sublattice, place)
         some = _Followers(scene, state, sublattice, place)
-        answers, move = some.derivatives(), some.move()
-        if at_rest and not all(np.isfinite(v).all() for v in (move, *answers.values())):
+        move, own = some.move(), some.derivative(None)
+        neighbours = {slot: some.derivative(slot) for slot in some.slots}
+        if at_rest and not all(np.isfinite(v).all() for v in (move, own, *neighbours.values())):
             raise ValueError("its move at rest, or a derivative of it, is not finite")
-    return Response({slot: answers[slot] for slot in slots}, answers[None], move, kinds, steps)
+
+    def of_each(values: Floats) -> Floats:
+        if len(values) == 1:
+            return np.broadcast_to(values[0], (len(kinds), *values.shape[1:]))
+        return values[kinds]
+
+    each = ((slot, of_each(found)) for slot, found in neighbours.items())
+    return Response(each, of_each(own), of_each(move))
 
 
 def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
@@ -127,44 +122,40 @@ class _Followers:
         self._evaluator = Evaluator(scene)
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
         u = state.u.astype(float, copy=False)
-        self._slots, self._axes = around.slots, scene.axes
-        self._here = around.here(u, state)
-        d = around.differences(u)
-        self._d = dict(zip(self._slots, d, strict=True))
-        to = around.neighbours(state)
-        self._neighbours = dict(zip(self._slots, to, strict=True))
-        with np.errstate(all="ignore"):
-            self._still = {slot: self._contribution(slot, self._here.u) for slot in self._slots}
+        self._here, self.slots = around.here(u, state), around.slots
+        self._d = dict(zip(around.slots, around.differences(u), strict=True))
+        self._neighbours = dict(zip(around.slots, around.neighbours(state), strict=True))
+        self._still = self._contributions(self._d, self._here.u)
 
     def move(self) -> Floats:
         """(place, axis)."""
         moved = self._applied(self._still, self._here.u)
         return np.stack([np.broadcast_to(m, self._here.u.x.shape) for m in moved], axis=-1)
 
-    def derivatives(self) -> dict[Slot | None, Floats]:
-        """∂move/∂u_k through every slot and, under None, ∂move/∂u_j with all neighbours where they
-        are; (place, axis of the move, axis of u)."""
-        found, shape, unit = {}, self._here.u.x.shape, np.eye(self._axes)
-        for mover in (*self._slots, None):
-            columns = [derivative(partial(self._moved, mover, e), shape) for e in unit]
-            found[mover] = np.moveaxis(np.array(columns), (0, 1), (2, 1))
-        return found
+    def derivative(self, mover: Slot | None) -> Floats:
+        """∂move/∂u_k through a slot or, for None, ∂move/∂u_j with all neighbours where they are;
+        (place, axis of the move, axis of u)."""
+        shape, axes = self._here.u.x.shape, np.eye(len(self._here.u))
+        columns = [derivative(partial(self._moved, mover, e), shape) for e in axes]
+        return np.moveaxis(np.array(columns), (0, 1), (2, 1))
 
     def _moved(self, mover: Slot | None, along: Floats, step: complex) -> Any:
         """The moves (place) after a step of the neighbour at a slot, or of one's own."""
         here, nudge = self._here.u, vector(step * component for component in along)
         if mover is not None:
-            contributions = self._still | {mover: self._contribution(mover, here, nudge)}
-            return self._applied(contributions, here)
-        here = here + nudge
-        stepped = {slot: self._contribution(slot, here, -nudge) for slot in self._slots}
-        return self._applied(stepped, here)
+            nudged = {mover: self._d[mover] + nudge}
+            return self._applied(self._still | self._contributions(nudged, here), here)
+        stepped = {slot: d - nudge for slot, d in self._d.items()}
+        return self._applied(self._contributions(stepped, here + nudge), here + nudge)
 
-    def _contribution(
-        self, slot: Slot, here: Components, nudge: Components | None = None
-    ) -> Contributions:
-        d = self._d[slot] if nudge is None else self._d[slot] + nudge
-        return self._evaluator.contribution(d, here, self._neighbours[slot])
+    def _contributions(
+        self, differences: dict[Slot, Components], here: Components
+    ) -> dict[Slot, Contributions]:
+        with np.errstate(all="ignore"):
+            return {
+                slot: self._evaluator.contribution(d, here, self._neighbours[slot])
+                for slot, d in differences.items()
+            }
 
     def _applied(self, contributions: dict[Slot, Contributions], here: Components) -> Any:
         parts = [(contributions[slot], to.present) for slot, to in self._neighbours.items()]

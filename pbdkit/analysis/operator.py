@@ -18,6 +18,7 @@ from pbdkit.analysis.linear_response import by_sublattice, has_neighbours, respo
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import kinds_at
+from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
@@ -73,13 +74,9 @@ class StepOperator:
         if not len(before.values):
             return now
         size = now.shape[0]
-        every = np.arange(size)
-        return Entries(
-            np.concatenate([now.rows, before.rows, every + size]),
-            np.concatenate([now.columns, before.columns + size, every]),
-            np.concatenate([now.values, before.values, np.ones(size)]),
-            (2 * size, 2 * size),
-        )
+        every, shape = np.arange(size), (2 * size, 2 * size)
+        earlier = Entries(before.rows, before.columns + size, before.values, shape)
+        return now.plus(earlier).plus(Entries(every + size, every, np.ones(size), shape))
 
 
 def step_operator(
@@ -94,9 +91,8 @@ def step_operator(
         raise ExperimentError(
             "neighbours that are found anew have no step operator", ("neighbours",)
         )
-    return _Assembly(
-        scene, state or initial_state(scene), step or scene.experiment.steps
-    ).operator()
+    state, step = state or initial_state(scene), step or scene.experiment.steps
+    return _Assembly(scene, state, step).operator()
 
 
 def moves_and_couplings(scene: Scene, state: State, place: Indices) -> tuple[Floats, Couplings]:
@@ -144,12 +140,12 @@ def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Coupl
     for s, own in by_sublattice(scene, place[moving]):
         some = moving[own]
         response = respond(scene, state, s, place[some])
-        moves[some] = response.of_each(response.move)
-        couplings.add(some, place[some], response.of_each(response.own))
-        for slot, derivative in response.neighbours.items():
-            there = place[some] + response.steps[slot]
+        moves[some] = response.move
+        couplings.add(some, place[some], response.own)
+        for slot, derivative in response.neighbours:
+            there = place[some] + slot_step(scene.raster.shape, slot)
             has = kind[there] != EMPTY
-            couplings.add(some[has], there[has], some_of(response.of_each(derivative), has))
+            couplings.add(some[has], there[has], some_of(derivative, has))
     return moves, couplings
 
 
@@ -168,45 +164,31 @@ class _Assembly:
             self._unknown[place] = np.arange(len(some))
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
-        axes = scene.axes
-        self._now, self._before = Couplings((free, free), axes), Couplings((free, free), axes)
-        self._led, self._shown = Couplings((free, led), axes), Couplings((free, led), axes)
+        self._now, self._before = (Couplings((free, free), scene.axes) for _ in range(2))
+        self._led, self._shown = (Couplings((free, led), scene.axes) for _ in range(2))
 
     def operator(self) -> StepOperator:
-        solver, place = (
-            self._scene.experiment.stepping,
-            self._scene.raster.place_of(self._followers),
-        )
-        moves, couplings = moves_and_couplings(self._scene, self._state, place)
+        scene, solver, u = self._scene, self._scene.experiment.stepping, self._state.u
+        place = scene.raster.place_of(self._followers)
+        moves, couplings = moves_and_couplings(scene, self._state, place)
         self._now.add_scaled_identity(np.arange(len(place), dtype=np.int32), 1.0)
         for rows, there, blocks in couplings.parts:
             self._see(rows, there, scaled(solver.relaxation, blocks))
         if solver.memory:
-            moving = np.flatnonzero(has_neighbours(self._scene, place))
+            moving = np.flatnonzero(has_neighbours(scene, place))
             self._now.add_scaled_identity(moving, solver.memory)
             self._before.add_scaled_identity(moving, -solver.memory)
-        if self._state.u.any():
-            u = self._state.u.reshape(self._scene.axes, -1).astype(float, copy=False)
-            moves = moves - couplings.times(u.T)
-        return StepOperator(
-            self._followers,
-            self._leaders,
-            self._now,
-            self._before,
-            self._led,
-            self._shown,
-            (solver.relaxation * moves).ravel(),
-        )
+        if u.any():
+            moves = moves - couplings.times(u.reshape(scene.axes, -1).T.astype(float, copy=False))
+        source, who = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
+        return StepOperator(*who, self._now, self._before, self._led, self._shown, source)
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
         kinds = self._kind[there]
         for kind, couplings in ((FOLLOWER, self._now), (LEADER, self._led)):
             some = kinds == kind
-            if some.all():
-                couplings.add(rows, self._unknown[there], weight)
-            elif some.any():
-                couplings.add(rows[some], self._unknown[there[some]], some_of(weight, some))
+            couplings.add(rows[some], self._unknown[there[some]], some_of(weight, some))
         frame, some = self._scene.frame, kinds == FRAME
         if frame is None or not some.any():
             return

@@ -127,11 +127,9 @@ def just_below(matrix: Any, edge: float) -> Complex:
     smaller real part, by a shifted inverse iteration; those of small groups `spectrum` has. Raises
     TooDearError where that would take long."""
     meter = _Meter()
-    found = [
-        meter.nearest(group, edge, symmetric=False, k=1, which="SR")
-        for group in (_groups(matrix) if matrix.shape[0] > DENSE else ())
-        if group.shape[0] > DENSE
-    ]
+    groups = _groups(matrix) if matrix.shape[0] > DENSE else ()
+    large = (group for group in groups if group.shape[0] > DENSE)
+    found = [meter.nearest(group, edge, symmetric=False, k=1, which="SR") for group in large]
     return np.concatenate([np.empty(0, complex), *found])
 
 
@@ -141,7 +139,8 @@ def _groups(matrix: Any) -> Iterator[Any]:
     order = np.argsort(label, kind="stable")
     bounds = np.searchsorted(label[order], np.arange(count + 1))
     alone = np.diff(bounds) == 1
-    yield from (np.array([[v]]) for v in np.unique(matrix.diagonal()[order[bounds[:-1][alone]]]))
+    values = matrix.diagonal()[order[bounds[:-1][alone]]].tolist()
+    yield from (np.array([[v]]) for v in sorted(set(values)))
     seen = set()
     for n in np.flatnonzero(~alone):
         own = np.sort(order[bounds[n] : bounds[n + 1]])
@@ -204,7 +203,5 @@ def _extremes(block: Any, symmetric: bool, meter: _Meter) -> Complex:
     diagonal = block.diagonal()
     spread = np.asarray(abs(block).sum(axis=1)).ravel() - abs(diagonal)
     ends = ((diagonal + spread).max() + BEYOND, (diagonal - spread).min() - BEYOND)
-    nearest = [
-        meter.nearest(block, end, symmetric=True, k=2, which="LM", tol=1e-10) for end in ends
-    ]
-    return np.concatenate(nearest).astype(complex)
+    how: dict[str, Any] = {"symmetric": True, "k": 2, "which": "LM", "tol": 1e-10}
+    return np.concatenate([meter.nearest(block, end, **how) for end in ends]).astype(complex)

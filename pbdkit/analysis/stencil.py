@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from operator import add
 from typing import Any
 
@@ -65,14 +66,6 @@ class Stencil:
     neighbours: dict[Slot, Floats]
 
 
-def stencil_of(scene: Scene, at: Here = NOWHERE) -> Stencil:
-    """The stencil of the scene's rule alone; `at` says where for rules that ask."""
-    every = scene.neighbourhood.slots
-    own = np.array([_derivative(scene, slots, None, at) for slots in every])
-    neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
-    return Stencil(own, neighbours)
-
-
 def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:
     """The rule's move of a particle with all its neighbours, d = difference(slot) along each."""
     evaluator = Evaluator(scene)
@@ -102,7 +95,10 @@ def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Here) 
 def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
     """The stencil of the scene's rule, of all its rules together where it works on the moves of
     another; `at` says where for rules that ask."""
-    stencil = stencil_of(scene, at)
+    every = scene.neighbourhood.slots
+    own = np.array([_derivative(scene, slots, None, at) for slots in every])
+    neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
+    stencil = Stencil(own, neighbours)
     return _composed(stencil, linearised(scene.inner, at)) if scene.inner else stencil
 
 
@@ -111,17 +107,15 @@ def _composed(outer: Stencil, inner: Stencil) -> Stencil:
     own = np.zeros_like(outer.own)
     neighbours: dict[Slot, Floats] = {}
     known: dict[tuple[int, int, Index], Slot] = {}
-    for first, W in _with_itself(outer):
-        for second, V in _with_itself(inner):
-            if first.target != second.source:
-                continue
-            slot = _after(first, second)
-            key = slot.source, slot.target, slot.cell
-            if slot.source == slot.target and not any(slot.cell):
-                own[slot.source] += W @ V
-            else:
-                slot = known.setdefault(key, slot)
-                neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
+    for (first, W), (second, V) in product(_with_itself(outer), _with_itself(inner)):
+        if first.target != second.source:
+            continue
+        slot = _after(first, second)
+        if slot.source == slot.target and not any(slot.cell):
+            own[slot.source] += W @ V
+        else:
+            slot = known.setdefault((slot.source, slot.target, slot.cell), slot)
+            neighbours[slot] = neighbours.get(slot, 0.0) + W @ V
     return Stencil(own, neighbours)
 
 
@@ -134,14 +128,9 @@ def _with_itself(stencil: Stencil) -> Iterator[tuple[Slot, Floats]]:
 
 def _after(first: Slot, second: Slot) -> Slot:
     """Where two slots lead, one after the other."""
-    return Slot(
-        first.source,
-        second.target,
-        tuple(map(add, first.cell, second.cell)),
-        tuple(map(add, first.site, second.site)),
-        first.rest + second.rest,
-        first.shell + second.shell,
-    )
+    cell, site = map(add, first.cell, second.cell), map(add, first.site, second.site)
+    rest, shell = first.rest + second.rest, first.shell + second.shell
+    return Slot(first.source, second.target, tuple(cell), tuple(site), rest, shell)
 
 
 WAVES = 48
@@ -191,12 +180,9 @@ def wave_bound(scene: Scene) -> Bound | None:
         return None
     if not np.isfinite(eigenvalues).all():
         return None
-    return Bound(
-        float(eigenvalues.real.min()),
-        float(eigenvalues.real.max()),
-        float(np.abs(eigenvalues.imag).max()),
-        float(np.abs(modes(eigenvalues, solver.relaxation, solver.memory)).max()),
-    )
+    radius = float(np.abs(modes(eigenvalues, solver.relaxation, solver.memory)).max())
+    real, imaginary = eigenvalues.real, float(np.abs(eigenvalues.imag).max())
+    return Bound(float(real.min()), float(real.max()), imaginary, radius)
 
 
 def bounds_the_body(scene: Scene) -> bool:
@@ -222,18 +208,14 @@ def _symbols(scene: Scene) -> Complex:
     """(wave, axes · S, axes · S): the rule's step on plane waves; opposite ones answer
     alike."""
     stencil = linearised(scene)
-    angle = 2 * np.pi * np.arange(WAVES) / WAVES
-    half = angle[: WAVES // 2 + 1]
-    axes, waves = scene.axes, [half, *[angle] * (scene.axes - 1)]
+    angle, axes, sites = 2 * np.pi * np.arange(WAVES) / WAVES, scene.axes, len(stencil.own)
+    waves = [angle[: WAVES // 2 + 1], *[angle] * (axes - 1)]
     theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
-    size = axes * len(stencil.own)
-    symbols: Complex = np.zeros((len(theta), size, size), complex)
-    symbols += np.eye(size)
-    of = [slice(axes * s, axes * (s + 1)) for s in range(len(stencil.own))]
+    symbols: Complex = np.zeros((len(theta), sites, axes, sites, axes), complex)
+    symbols += np.eye(sites * axes).reshape(symbols.shape[1:])
     for s, own in enumerate(stencil.own):
-        symbols[:, of[s], of[s]] += own
+        symbols[:, s, :, s] += own
     for slot, matrix in stencil.neighbours.items():
-        here, there = of[slot.source], of[slot.target]
         phase = np.exp(1j * theta @ np.array(slot.cell, float))
-        symbols[:, here, there] += phase[:, None, None] * matrix
-    return symbols
+        symbols[:, slot.source, :, slot.target] += phase[:, None, None] * matrix
+    return symbols.reshape(len(theta), sites * axes, sites * axes)

@@ -17,6 +17,7 @@ import numpy as np
 from pbdkit.api import load
 from pbdkit.bench.size import resized
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.stepping.choice import processors
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
@@ -70,18 +71,10 @@ class Row:
         return self.method + (f", {self.threads} threads" if (self.threads or 1) > 1 else "")
 
 
-def processors() -> int:
-    """Those that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def engines() -> list[tuple[str, str, int]]:
     """Engine, precision and threads of all ways to step, the reference first."""
-    alone = [("numpy", "float64", 1), ("numpy", "float32", 1)]
-    counts, precisions = dict.fromkeys((1, processors())), ("float64", "float32")
-    return [*alone, *(("compiled", p, threads) for threads in counts for p in precisions)]
+    ways = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
+    return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
 
 
 def measure(
@@ -112,17 +105,12 @@ def measure(
 def _worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
     """The result of a job (worker.py) in a fresh process, with a cache folder of its own."""
     (answer := folder / "answer.json").unlink(missing_ok=True)
-    done = subprocess.run(
-        [sys.executable, "-m", "pbdkit.bench.worker", str(answer)],
-        env=os.environ | {"PBDKIT_CACHE_DIR": str(cache)},
-        input=json.dumps(job),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    call = [sys.executable, "-m", "pbdkit.bench.worker", str(answer)]
+    env = os.environ | {"PBDKIT_CACHE_DIR": str(cache)}
+    done = subprocess.run(call, env=env, input=json.dumps(job), capture_output=True, text=True)
     if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.strip()]
-        why = said[-1] if said else f"it ended with status {done.returncode} (out of memory?)"
+        ended = f"it ended with status {done.returncode} (out of memory?)"
+        why = (done.stderr.strip() or ended).splitlines()[-1]
         raise ExperimentError(f"the measurement failed: {why}")
     result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
     if "fault" in result:
@@ -138,34 +126,25 @@ def _step_by_step(work: Job, base: Row, steps: int) -> Iterator[Row]:
         chosen = {"engine": engine, "precision": precision, "threads": threads}
         settings = [f"solver.{key}={value}" for key, value in chosen.items()]
         try:
-            first = work("step", *settings, at=[], cache=row.line + precision)
-            found = work("step", *settings, at=looks, cache=row.line + precision)
+            cache = row.line + precision
+            first, found = (work("step", *settings, at=at, cache=cache) for at in ([], looks))
         except (ExperimentError, PluginError) as error:
             if n == 0:
                 raise
             yield replace(row, reason=" ".join(str(error).split()))
             continue
-        per_step = found["seconds"][-1] / steps / found["particles"]
-        yield replace(
-            row,
-            particles=found["particles"],
-            setup_first_s=first["setup_s"],
-            setup_s=found["setup_s"],
-            ns_per_particle_step=1e9 * per_step,
-            peak_memory_mib=found["peak_memory_mib"],
-            error=_share(np.max(found["distances"]), np.max(found["sizes"])),
-        )
+        same = {key: found[key] for key in ("particles", "setup_s", "peak_memory_mib")}
+        ns = 1e9 * (found["seconds"][-1] / steps / found["particles"])
+        share = _error(np.max(found["distances"]), np.max(found["sizes"]))
+        row = replace(row, **same, setup_first_s=first["setup_s"])
+        yield replace(row, ns_per_particle_step=ns, error=share)
 
 
-def _share(distance: float, size: float) -> float:
+def _error(distance: float, size: float, within: float = 0.0) -> float:
+    """At most, as a share: what it is measured against is known `within` a share itself."""
     if not np.isfinite(distance) or not np.isfinite(size):
         return np.inf
-    return float(distance / size) if distance else 0.0
-
-
-def _error(distance: float, exact: dict[str, Any]) -> float:
-    """At most: the answer that it is measured against is known within a share itself."""
-    return _share(distance, exact["scale"]) + float(exact["within"])
+    return (float(distance / size) if distance else 0.0) + within
 
 
 def _to_equilibrium(work: Job, base: Row, steps: int) -> Iterator[Row]:
@@ -192,7 +171,8 @@ def _settled(work: Job, base: Row, tolerances: list[float], exact: dict[str, Any
         return
     made = found["rows"]
     for tolerance, row in zip(tolerances, made, strict=False):
-        memory, share = found["peak_memory_mib"], _error(row.pop("distance"), exact)
+        share = _error(row.pop("distance"), exact["scale"], exact["within"])
+        memory = found["peak_memory_mib"]
         yield replace(base, tolerance=tolerance, peak_memory_mib=memory, error=share, **row)
     for tolerance in tolerances[len(made) :]:
         reason = f"{made[-1]['seconds']:.0f} s for the tolerance before"
@@ -212,8 +192,7 @@ def _stepped(work: Job, base: Row, exact: dict[str, Any], tolerances: list[float
     needed = dict(zip(tolerances, exact["steps"], strict=True))
     at = sorted({n for n in needed.values() if n and n * wall <= PATIENCE_S})
     if at:
-        asked = (*stepping, f"solver.threads={threads}", f"steps={at[-1]}")
-        found = work("step", *asked, at=at)
+        found = work("step", *stepping, f"solver.threads={threads}", f"steps={at[-1]}", at=at)
     for tolerance, n in needed.items():
         row = replace(base, tolerance=tolerance, steps=n)
         if n is None:
@@ -221,9 +200,9 @@ def _stepped(work: Job, base: Row, exact: dict[str, Any], tolerances: list[float
             yield replace(row, reason=f"steps do not settle: {rate}")
         elif n in at:
             i, (built, built_cpu) = at.index(n), found["built"]
-            error = _error(found["distances"][i], exact)
+            error = _error(found["distances"][i], exact["scale"], exact["within"])
             seconds, cpu_s = built + found["seconds"][i], built_cpu + found["cpu_s"][i]
             yield replace(row, seconds=seconds, cpu_s=cpu_s, error=error)
         else:
-            seconds, cpu_s = n * wall, n * cpu
-            yield replace(row, seconds=seconds, cpu_s=cpu_s, error=tolerance, is_predicted=True)
+            predicted = replace(row, error=tolerance, is_predicted=True)
+            yield replace(predicted, seconds=n * wall, cpu_s=n * cpu)

@@ -22,23 +22,23 @@ def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
     """
     for n, group in enumerate(experiment.leaders):
         if group.select.numbers is not None:
-            raise experiment.located(
-                ExperimentError(
-                    "leaders chosen by number cannot be resized: numbers change with the size; "
-                    "choose them by edge, box or nearest, or leave --sizes out to run it as it is",
-                    ("leaders", n, "select", "numbers"),
-                )
+            raise _refusal(
+                experiment,
+                "leaders chosen by number cannot be resized: numbers change with the size; choose "
+                "them by edge, box or nearest, or leave --sizes out to run it as it is",
+                *("leaders", n, "select", "numbers"),
             )
-    if isinstance(experiment.body, Grid):
-        return tuple(_setting(*pair) for pair in _larger_grid(experiment, experiment.body, size))
-    return tuple(_setting(*pair) for pair in _finer_lattice(experiment, size))
+    change = _larger_grid if isinstance(experiment.body, Grid) else _finer_lattice
+    return tuple(f"{path}={json.dumps(value)}" for path, value in change(experiment, size))
 
 
-def _setting(path: str, value: Any) -> str:
-    return f"{path}={json.dumps(value)}"
+def _refusal(experiment: Experiment, why: str, *where: str | int) -> ExperimentError:
+    return experiment.located(ExperimentError(why, where))
 
 
-def _larger_grid(experiment: Experiment, grid: Grid, size: int) -> Iterator[tuple[str, Any]]:
+def _larger_grid(experiment: Experiment, size: int) -> Iterator[tuple[str, Any]]:
+    grid = experiment.body
+    assert isinstance(grid, Grid)
     yield "body.columns", size
     yield "body.rows", max(1, round(grid.rows * size / grid.columns))
     factor = (size - 1) / max(1, grid.columns - 1)
@@ -61,19 +61,18 @@ def _larger_grid(experiment: Experiment, grid: Grid, size: int) -> Iterator[tupl
 def _finer_lattice(experiment: Experiment, size: int) -> Iterator[tuple[str, Any]]:
     boxes = experiment.body.boxes()
     if any(box.in_sites for box in boxes):
-        raise experiment.located(
-            ExperimentError(
-                "a grid within another body cannot be resized: its outline moves with the "
-                "lattice; write a rectangle, or leave --sizes out to run it as it is",
-                ("body",),
-            )
+        raise _refusal(
+            experiment,
+            "a grid within another body cannot be resized: its outline moves with the lattice; "
+            "write a rectangle, or leave --sizes out to run it as it is",
+            "body",
         )
     sides = [max(box.high[n] for box in boxes) - min(box.low[n] for box in boxes) for n in (0, 1)]
     constants = {name: getattr(experiment.lattice, name, None) for name in ("a", "b")}
     along = constants["b"] if sides[1] > sides[0] and constants["b"] else constants["a"]
     if along is None:
         what = f"the lattice '{experiment.lattice.type}' has no constant `a` to divide"
-        raise experiment.located(ExperimentError(f"{what}; leave --sizes out", ("lattice",)))
+        raise _refusal(experiment, f"{what}; leave --sizes out", "lattice")
     factor = max(sides) / max(1, size - 1) / along
     for name, value in constants.items():
         if value is not None:

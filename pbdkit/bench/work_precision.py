@@ -6,23 +6,18 @@ import platform
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import groupby
-from math import isfinite
+from itertools import cycle, groupby
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.bench.measurement import Row, processors
+from pbdkit.bench.measurement import Row
+from pbdkit.stepping.choice import processors
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from rich.table import Table
 
-COLUMNS = {
-    "size": ("size", "", ""),
-    "particles": ("particles", "", ""),
-    "method": ("method", "", ""),
-    "precision": ("precision", "", ""),
-    "threads": ("threads", "", ""),
+COLUMNS = {n: (n, "", "") for n in ("size", "particles", "method", "precision", "threads")} | {
     "tolerance": ("tolerance", ".0e", "a share of the largest prescribed displacement"),
     "steps": ("steps", "", "made, or iterations of the linear solver"),
     "setup_first_s": ("set-up", ".2f", "seconds until the first step, with compiling"),
@@ -59,18 +54,14 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def _shown(rows: Sequence[Row]) -> list[str]:
-    given = [name for name in COLUMNS if any(getattr(row, name) is not None for row in rows)]
-    return list(dict.fromkeys(["size", *given]))
+    return [n for n in COLUMNS if n == "size" or any(getattr(r, n) is not None for r in rows)]
 
 
 def _cell(row: Row, name: str) -> str:
     value = getattr(row, name)
-    if name == "size":
-        return "as it is" if value is None else str(value)
-    if name == "error" and row.reason:
-        return "left out"
     if value is None:
-        return ""
+        missing = {"size": "as it is", "error": "left out" if row.reason else ""}
+        return missing.get(name, "")
     if name == "error":
         return "0" if value == 0 else f"{value:.1e}" if isfinite(value) else "not finite"
     missed = name == "certified" and row.tolerance is not None and value > row.tolerance
@@ -81,31 +72,19 @@ def _cell(row: Row, name: str) -> str:
 def lines(rows: Sequence[Row]) -> list[str]:
     """What the columns are, and why rows are left out."""
     told = [f"{COLUMNS[n][0]}: {COLUMNS[n][2]}" for n in _shown(rows) if COLUMNS[n][2]]
-    for row in rows:
-        if row.reason:
-            tolerance = f", {row.tolerance:.0e}" if row.tolerance else ""
-            told.append(
-                f"left out: {row.line} at size {_cell(row, 'size')}{tolerance}: {row.reason}"
-            )
+    for row in (row for row in rows if row.reason):
+        place = f"size {_cell(row, 'size')}" + (f", {row.tolerance:.0e}" if row.tolerance else "")
+        told.append(f"left out: {row.line} at {place}: {row.reason}")
     return list(dict.fromkeys(told))
 
 
 def as_dict(name: str, settings: Sequence[str], steps: int, rows: Sequence[Row]) -> dict[str, Any]:
     """What ``--json`` writes (docs/performance.md lists the keys)."""
-    return {
-        "experiment": name,
-        "settings": list(settings),
-        "steps": steps,
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "processors": processors(),
-            "system": platform.system(),
-            "python": sys.version.split()[0],
-        },
-        "rows": [
-            {k: v if v != float("inf") else None for k, v in asdict(row).items()} for row in rows
-        ],
-    }
+    machine = {"processor": platform.processor() or platform.machine(), "processors": processors()}
+    machine |= {"system": platform.system(), "python": sys.version.split()[0]}
+    figures = [{k: v if v != inf else None for k, v in asdict(row).items()} for row in rows]
+    asked = {"experiment": name, "settings": list(settings), "steps": steps}
+    return asked | {"machine": machine, "rows": figures}
 
 
 def picture(rows: Sequence[Row], title: str) -> Figure:
@@ -114,44 +93,39 @@ def picture(rows: Sequence[Row], title: str) -> Figure:
     at the bottom; runs that left the finite numbers are not drawn."""
     from matplotlib.figure import Figure
 
-    drawn_rows = [row for row in rows if row.error is not None and isfinite(row.error) and _x(row)]
-    sizes = list(dict.fromkeys(row.particles for row in drawn_rows)) or [0]
-    columns = min(2, len(sizes))
-    down = -(-len(sizes) // columns)
-    drawn = Figure(figsize=(1.6 + 3.6 * columns, 1.0 + 2.9 * down), dpi=150, layout="constrained")
-    panels = drawn.subplots(down, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    kinds = list(dict.fromkeys(row.line for row in drawn_rows))
+    measured = [row for row in rows if row.error is not None and isfinite(row.error) and _x(row)]
+    sizes = list(dict.fromkeys(row.particles for row in measured)) or [0]
+    kinds = list(dict.fromkeys(row.line for row in measured))
+    across = min(2, len(sizes))
+    down = -(-len(sizes) // across)
+    drawn = Figure(figsize=(1.6 + 3.6 * across, 1.0 + 2.9 * down), dpi=150, layout="constrained")
+    panels = drawn.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for ax, particles in zip(panels, sizes, strict=False):
-        for n, kind in enumerate(kinds):
-            some = [row for row in drawn_rows if row.line == kind and row.particles == particles]
-            _draw(ax, some, kind, COLOURS[n % len(COLOURS)], MARKERS[n % len(MARKERS)])
+        for kind, colour, marker in zip(kinds, cycle(COLOURS), cycle(MARKERS)):
+            some = [row for row in measured if row.line == kind and row.particles == particles]
+            x, y = [_x(row) for row in some], [max(row.error or 0.0, FLOOR) for row in some]
+            face = ["white" if row.is_predicted else colour for row in some]
+            ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
+            ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
+            ax.scatter([], [], color=colour, marker=marker, label=kind)
         ax.set_title(f"{particles:,} particles".replace(",", " "), fontsize=8)
         ax.set(xscale="log", yscale="log")
         ax.grid(visible=True, linewidth=0.3, alpha=0.6)
         ax.tick_params(labelsize=7)
     for ax in panels[len(sizes) :]:
         ax.set_visible(False)
-    if any(row.error == 0 for row in drawn_rows):
+    if any(row.error == 0 for row in measured):
         ticks = [10.0**n for n in range(-16, 1, 4)]
         panels[0].set_yticks([FLOOR, *ticks], ["0", *(f"{tick:.0e}" for tick in ticks)])
-    by_step = any(row.ns_per_particle_step for row in drawn_rows)
-    for ax in panels[-columns:]:
+    by_step = any(row.ns_per_particle_step for row in measured)
+    for ax in panels[-across:]:
         ax.set_xlabel("ns a particle and step" if by_step else "seconds of processor time")
     drawn.supylabel("largest error, as a share", fontsize=8)
     drawn.suptitle(title, fontsize=9)
-    named = panels[0].get_legend_handles_labels()
-    columns = min(4, len(kinds) or 1)
-    drawn.legend(*named, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
+    named, ncols = panels[0].get_legend_handles_labels(), min(4, len(kinds) or 1)
+    drawn.legend(*named, loc="outside lower center", ncols=ncols, fontsize=7, frameon=False)
     return drawn
 
 
 def _x(row: Row) -> float:
     return row.ns_per_particle_step or row.cpu_s or 0.0
-
-
-def _draw(ax: Axes, rows: Sequence[Row], kind: str, colour: str, marker: str) -> None:
-    x, y = [_x(row) for row in rows], [max(row.error or 0.0, FLOOR) for row in rows]
-    face = ["white" if row.is_predicted else colour for row in rows]
-    ax.plot(x, y, color=colour, linewidth=0.9, linestyle=":")
-    ax.scatter(x, y, s=22, marker=marker, facecolor=face, edgecolor=colour, zorder=2)
-    ax.scatter([], [], color=colour, marker=marker, label=kind)

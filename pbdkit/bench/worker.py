@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -21,9 +22,10 @@ from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import peak_memory
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene, build_scene
@@ -52,22 +54,6 @@ def main(answer: Path) -> None:
     answer.write_text(json.dumps(found), encoding="utf-8")
 
 
-def peak_memory() -> int:
-    """Bytes at most resident in this process.
-
-    Linux counts what the process that started this one had resident into ru_maxrss, so the
-    figure of this program's own memory is taken where there is one.
-    """
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    from resource import RUSAGE_SELF, getrusage
-
-    return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
 def _import(*modules: str) -> int:
     """Imports are no part of what is measured; peak memory after them."""
     for module in modules:
@@ -80,51 +66,50 @@ def _clock() -> Floats:
     return np.array([time.perf_counter(), time.process_time()])
 
 
+def _turns(spent: list[Floats]) -> Iterator[int]:
+    """Turns to go a way, until they are enough; each adds what it `spent`, (..., clock)."""
+    for turn in range(REPEATS):
+        yield turn
+        took = [float(one[..., 0].max(initial=0.0)) for one in spent]
+        if sum(took) + took[-1] > PATIENCE_S:
+            break
+
+
 def _step(job: Job) -> Job:
     """Set-up, and for each number of steps `at`: the seconds to there, the best of several runs;
     the largest distance from the truth in `sizes`, the largest displacements."""
-    experiment = load(job["experiment"], settings=job["settings"])
+    experiment, at = load(job["experiment"], settings=job["settings"]), job["at"]
     imports = _import(*[COMPILED] * (experiment.stepping.engine == "compiled"))
     begun = _clock()
     scene = build_scene(experiment)
     built = _clock() - begun
     engine, _ = make_engine(scene, choose(scene))
     setup_s, _ = _clock() - begun
-    best, there, total, memory = np.full((len(job["at"]), 2), np.inf), [], 0.0, imports
-    for turn in range(REPEATS if job["at"] else 0):
-        state, spent = initial_state(scene), np.zeros(2)
-        for n, step in enumerate(job["at"]):
+    runs: list[Floats] = []
+    there, memory = [], imports
+    for turn in _turns(runs):
+        state, spent = initial_state(scene), np.zeros((len(at), 2))
+        for n, step in enumerate(at):
             begun = _clock()
             state = engine.advance(state, step - state.step)
-            spent += _clock() - begun
-            best[n] = np.minimum(best[n], spent)
+            spent[n:] += _clock() - begun
             if turn == 0:
                 there.append(_compared(scene, state, Path(job["truth"])))
                 memory = peak_memory()
-        total += spent[0]
-        if total + spent[0] > PATIENCE_S:
-            break
-    seconds, cpu = best.T.tolist()
-    distances, sizes = np.array(there).reshape(-1, 2).T.tolist()
-    return {
-        "particles": scene.raster.count,
-        "built": built.tolist(),
-        "setup_s": setup_s,
-        "seconds": seconds,
-        "cpu_s": cpu,
-        "distances": distances,
-        "sizes": sizes,
-        "peak_memory_mib": (memory - imports) / 2**20,
-    }
+        runs.append(spent)
+    seconds, cpu = np.min(runs, axis=0).T.tolist()
+    distances, sizes = np.reshape(there, (-1, 2)).T.tolist()
+    found = {"particles": scene.raster.count, "built": built.tolist(), "setup_s": setup_s}
+    found |= {"seconds": seconds, "cpu_s": cpu, "distances": distances, "sizes": sizes}
+    return found | {"peak_memory_mib": (memory - imports) / 2**20}
 
 
 def _compared(scene: Scene, state: State, truth: Path) -> tuple[float, float]:
     """(largest distance, largest displacement of the truth): of followers where the exact answer is
     known; else of what the first who comes to a step leaves for the others."""
     exact, u = truth / "exact.npy", state.u.reshape(len(state.u), -1).astype(float)
-    if exact.exists():
-        u = u[:, followers_of(scene)]
     file = exact if exact.exists() else truth / f"{state.step}.npy"
+    u = _of_followers(scene, state) if file == exact else u
     if not file.exists():
         np.save(file, u)
     known = np.load(file)
@@ -142,24 +127,16 @@ def _settle(job: Job) -> Job:
     for tolerance in job["tolerances"]:
         settings = [*job["settings"], f"solver.tolerance={tolerance:g}"]
         experiment = load(job["experiment"], settings=settings)
-        best, total = np.full(2, np.inf), 0.0
-        for _ in range(REPEATS):
+        runs: list[Floats] = []
+        for _ in _turns(runs):
             begun = _clock()
             scene, state, certificate = _settled(experiment)
-            spent = _clock() - begun
-            best, total = np.minimum(best, spent), total + spent[0]
-            if total + spent[0] > PATIENCE_S:
-                break
-        rows.append(
-            {
-                "steps": certificate.inner_iterations,
-                "seconds": best[0],
-                "cpu_s": best[1],
-                "certified": certificate.share,
-                "distance": _compared(scene, state, Path(job["truth"]))[0],
-            }
-        )
-        if best[0] > LONGEST_S:
+            runs.append(_clock() - begun)
+        seconds, cpu_s = np.min(runs, axis=0)
+        distance, _ = _compared(scene, state, Path(job["truth"]))
+        told = {"steps": certificate.inner_iterations, "certified": certificate.share}
+        rows.append(told | {"seconds": seconds, "cpu_s": cpu_s, "distance": distance})
+        if seconds > LONGEST_S:
             break
     return {"rows": rows, "peak_memory_mib": (peak_memory() - imports) / 2**20}
 
@@ -182,17 +159,13 @@ def _find_exact(job: Job) -> Job:
         why = "speed against error is measured where no bond can break; set fracture={type: none}"
         raise experiment.located(ExperimentError(why, ("fracture",)))
     scene, state, certificate = _settled(experiment)
-    exact = state.u.reshape(len(state.u), -1)[:, followers_of(scene)].astype(float)
+    exact = _of_followers(scene, state)
     np.save(Path(job["truth"]) / "exact.npy", exact)
     decay = decay_of(scene, exact)
-    return {
-        "particles": scene.raster.count,
-        "how": certificate.method,
-        "within": certificate.share,
-        "scale": scale_of(scene, initial_state(scene)),
-        "rate": decay.rate,
-        "steps": [decay.steps_to(tolerance) for tolerance in job["tolerances"]],
-    }
+    known = {"how": certificate.method, "within": certificate.share, "rate": decay.rate}
+    steps = [decay.steps_to(tolerance) for tolerance in job["tolerances"]]
+    scale = scale_of(scene, initial_state(scene))
+    return known | {"particles": scene.raster.count, "scale": scale, "steps": steps}
 
 
 @dataclass(frozen=True)
@@ -216,12 +189,17 @@ def followers_of(scene: Scene) -> NDArray[np.intp]:
     return scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
 
 
+def _of_followers(scene: Scene, state: State) -> Floats:
+    """Their displacements, (axis, follower)."""
+    return state.u.reshape(len(state.u), -1)[:, followers_of(scene)].astype(float)
+
+
 def decay_of(scene: Scene, exact: NDArray[np.float64]) -> Decay:
     """Of the slowest mode that the start excites, by inverse iteration from the way that is to go
     to `exact`, (axis, follower): v ← A⁻¹ v, A = 1 - (step operator). Its share is the projection of
     that way onto it."""
     start = initial_state(scene)
-    way = (exact - start.u.reshape(len(exact), -1)[:, followers_of(scene)]).T.astype(float)
+    way = (exact - _of_followers(scene, start)).T
     if not way.any():
         return Decay(0.0, 0.0)
     resting = initial_state(scene)

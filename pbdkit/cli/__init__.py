@@ -13,21 +13,14 @@ import click
 from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 
-COMMANDS = {
+MODULES = {
     "run": "run",
-    "check": "studies",
-    "identify": "studies",
-    "experiments": "experiments",
-    "init": "experiments",
-    "plot": "result",
-    "explain": "result",
-    "bench": "studies",
+    "experiments": "check identify experiments init schema bench",
+    "result": "plot explain",
     "plugins": "plugins",
-    "schema": "experiments",
 }
+COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
 """Every command with the module of pbdkit.cli in which it stands."""
-COMPLETING = "_PBDKIT_COMPLETE"
-"""The variable by which a shell asks how a line goes on."""
 
 
 class Commands(click.Group):
@@ -89,9 +82,9 @@ def main(arguments: list[str] | None = None) -> None:
         code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
-    except (Exception, SystemExit) as error:  # pbdkit itself exits below, click after completing
-        if isinstance(error, SystemExit) and COMPLETING in os.environ:
-            raise
+    except (Exception, SystemExit) as error:  # pbdkit itself exits below
+        if isinstance(error, SystemExit) and "_PBDKIT_COMPLETE" in os.environ:
+            raise  # click has told a shell how the line goes on
         if debug:
             traceback.print_exc()
         code = _report(error)
@@ -99,21 +92,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(error: BaseException) -> int:
-    codes = {
-        errors.ExperimentError: 2,
-        errors.PluginError: 3,
-        errors.DivergedError: 4,
-        errors.StorageError: 6,
-    }
-    for kind, code in codes.items():
-        if isinstance(error, kind):
-            return _failed(str(error), code)
+    if isinstance(error, errors.PbdkitError):
+        return _failed(str(error), error.exit_status)
     if isinstance(error, MemoryError):
         return _failed("out of memory; `pbdkit check` estimates what an experiment needs", 6)
-    what = f"{type(error).__name__}: {error}"
-    return _failed(
-        f"a bug in pbdkit, please report it: {what} (`pbdkit --debug ...` shows where)", 1
-    )
+    what = f"a bug in pbdkit, please report it: {type(error).__name__}: {error}"
+    return _failed(f"{what} (`pbdkit --debug ...` shows where)", 1)
 
 
 def _failed(message: str, code: int) -> int:

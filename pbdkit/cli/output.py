@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,18 +26,27 @@ KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: 
 """What may be at a path and no plain file, by the type that the system gives it."""
 
 
+FORMATS = (".png", ".svg", ".pdf")
+UNLIMITED = 10_000
+
+
+@contextmanager
+def refusals_as(what: str) -> Iterator[None]:
+    """What the system refuses in the block becomes a StorageError that begins with `what`."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{what}: {error.strerror}") from None
+
+
 @contextmanager
 def folder_kept() -> Iterator[None]:
     """Goes back to the current folder: a plugin may change it when it is imported. Raises
     StorageError where there is none."""
-    try:
+    with refusals_as("the current folder"):
         here = Path.cwd()
-    except OSError as error:
-        raise StorageError(f"the current folder: {error.strerror}") from None
-    try:
+    with chdir(here):
         yield
-    finally:
-        os.chdir(here)
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
@@ -49,12 +58,11 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     except UnicodeEncodeError:
         shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
         raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
-    try:
-        mode = path.lstat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except OSError as error:
-        raise StorageError(f"{str(path)[:80]}...: {error.strerror}") from None
+    with refusals_as(f"{str(path)[:80]}..."):
+        try:
+            mode = path.lstat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            return
     if stat.S_ISDIR(mode):
         raise ExperimentError(f"{path}: is a folder; name a file with -o")
     if not stat.S_ISREG(mode):
@@ -68,33 +76,16 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
         raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 
-def disk_warnings(path: Path, scene: Scene) -> tuple[str, ...]:
+def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """What is to be said where the output may not fit on its disk."""
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output
-    try:
-        free = shutil.disk_usage(path.parent).free
-    except OSError:  # no such folder: said when the file is opened
-        return ()
-    if output <= free:
-        return ()
-    return (
-        f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
-        f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or name a file "
-        "on another disk with -o",
-    )
-
-
-FORMATS = (".png", ".svg", ".pdf")
-UNLIMITED = 10_000
-
-
-@contextmanager
-def storing(path: Path) -> Iterator[None]:
-    """StorageError where the system refuses to write the file in the block."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
+    with suppress(OSError):  # no such folder: said when the file is opened
+        if output > (free := shutil.disk_usage(path.parent).free):
+            yield (
+                f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
+                f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or "
+                "name a file on another disk with -o"
+            )
 
 
 def show_table(table: Table) -> None:
@@ -118,9 +109,8 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
             raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
+def save(picture: Path, drawn: Figure) -> None:
     """Writes a figure and says so; StorageError where the system refuses."""
-    with storing(picture):
+    with refusals_as(f"{picture}: cannot be written"):
         drawn.savefig(picture)
-    if not quiet:
-        click.echo(f"{picture} written")
+    click.echo(f"{picture} written")

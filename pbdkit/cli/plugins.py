@@ -12,17 +12,12 @@ import click
 from pbdkit.cli.options import json_option
 
 if TYPE_CHECKING:
-    from pbdkit.registry.plugin import Offer, Plugin
+    from pbdkit.registry.discovery import Offer, Plugin
     from pbdkit.testing import Report
 
 INTERFACES = (
-    "FollowerRule",
-    "Lattice",
-    "NeighbourMetric",
-    "FramePolicy",
-    "FractureModel",
-    "Diagnostic",
-)
+    "FollowerRule", "Lattice", "NeighbourMetric", "FramePolicy", "FractureModel", "Diagnostic",
+)  # fmt: skip
 """The open interfaces by name, here so that `--help` imports none of them."""
 
 
@@ -43,8 +38,18 @@ def list_(as_json: bool) -> None:
         click.echo(f"warning: {warning}", err=True)
     if as_json:
         click.echo(json.dumps(rows))
-    else:
-        _print(rows)
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    from pbdkit.cli.output import show_table
+
+    table = Table(box=None, pad_edge=False)
+    for column in rows[0]:
+        table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
+    for row in rows:
+        table.add_row(*map(Text, row.values()))  # no markup: [x] is what it says
+    show_table(table)
 
 
 @plugins.command()
@@ -100,7 +105,7 @@ def check(
             holds = holds and report.holds
             rows.append({"distribution": plugin.distribution} | asdict(report))
             if not as_json:
-                click.echo(_told(report, verbose))
+                click.echo(report if verbose else _told(report))
     if as_json:
         click.echo(json.dumps({"holds": holds, "reports": rows}))
     elif holds:
@@ -111,28 +116,13 @@ def check(
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
     """One of the plugin and one of each of its components."""
+    rows: list[tuple[str, Plugin | Offer]] = [("plugin", plugin)]
+    rows += [(o.interface.__name__ if o.interface else "", o) for o in plugin.offers]
     origin = {"distribution": plugin.distribution, "version": plugin.version}
-
-    def row(interface: str, each: Plugin | Offer) -> dict[str, str]:
-        judged = {"state": each.state, "reason": each.reason}
-        return {"interface": interface, "type": each.name} | origin | judged
-
-    named = ((o.interface.__name__ if o.interface else "", o) for o in plugin.offers)
-    return [row("plugin", plugin), *(row(*each) for each in named)]
-
-
-def _print(rows: list[dict[str, str]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    from pbdkit.cli.output import show_table
-
-    table = Table(box=None, pad_edge=False)
-    for column in rows[0]:
-        table.add_column(column, overflow="fold", no_wrap=column not in ("reason", "type"))
-    for row in rows:
-        table.add_row(*(Text(value) for value in row.values()))  # no markup: [x] is what it says
-    show_table(table)
+    return [
+        {"interface": kind, "type": row.name, **origin, "state": row.state, "reason": row.reason}
+        for kind, row in rows
+    ]
 
 
 def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
@@ -142,28 +132,25 @@ def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
     """
     from pbdkit.errors import PluginError
     from pbdkit.interfaces.component import did_you_mean
+    from pbdkit.registry import BUILTIN
     from pbdkit.registry.discovery import canonical
     from pbdkit.registry.registry import Registry
 
-    plugins = Registry().plugins
-    if not distributions:
-        if not plugins[1:]:
-            raise PluginError(
-                "no plugin is installed; `pbdkit plugins check pbdkit` tries what is built in"
-            )
-        return plugins[1:]
-    found = []
-    for name in distributions:
-        own = [p for p in plugins if canonical(p.distribution) == canonical(name)]
-        if not own:
-            hint = did_you_mean(name, [p.distribution for p in plugins])
+    known: dict[str, list[Plugin]] = {}
+    for plugin in Registry().plugins:
+        known.setdefault(canonical(plugin.distribution), []).append(plugin)
+    asked = distributions or [name for name in known if name != BUILTIN]
+    if not asked:
+        raise PluginError(
+            "no plugin is installed; `pbdkit plugins check pbdkit` tries what is built in"
+        )
+    for name in asked:
+        if canonical(name) not in known:
+            hint = did_you_mean(name, [own[0].distribution for own in known.values()])
             raise PluginError(f"'{name}' is not installed, or is no plugin{hint}")
-        found += own
-    return found
+    return [plugin for name in asked for plugin in known[canonical(name)]]
 
 
-def _told(report: Report, verbose: bool) -> str:
-    if verbose:
-        return str(report)
+def _told(report: Report) -> str:
     faults = [f"  failed  {outcome.property}: {outcome.reason}" for outcome in report.failed]
     return "\n".join([report.summary(), *faults])

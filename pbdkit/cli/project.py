@@ -4,9 +4,11 @@ distribution."""
 from __future__ import annotations
 
 import keyword
+import os
 import re
 import shutil
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
@@ -14,9 +16,11 @@ from pathlib import Path
 from string import Template
 
 from pbdkit import __version__
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.cli.output import refusals_as
+from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import INTERFACES
-from pbdkit.registry.discovery import BUILTIN, canonical
+from pbdkit.registry import BUILTIN
+from pbdkit.registry.discovery import canonical
 from pbdkit.registry.registry import Registry
 
 PREFIX = f"{BUILTIN}-"
@@ -57,9 +61,8 @@ class Project:
 
     def files(self) -> dict[str, str]:
         """The text of each file, by its place in the project's folder."""
-        own = (
-            f"[{{type: {self.type}}}]" if self.field == "diagnostics" else f"{{type: {self.type}}}"
-        )
+        listed = self.field == "diagnostics"
+        own = f"[{{type: {self.type}}}]" if listed else f"{{type: {self.type}}}"
         parts = DEFAULT_PARTS | {self.field: own}
         known = {
             **vars(self),
@@ -69,12 +72,11 @@ class Project:
             "parts": "\n".join(f"{name}: {part}" for name, part in parts.items()),
         }
         folder = files("pbdkit.cli").joinpath("templates")
-        return {
-            file.format(**known): Template(
-                folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
-            ).substitute(known)
-            for file, template in TEMPLATES.items()
-        }
+        texts = {}
+        for file, template in TEMPLATES.items():
+            text = folder.joinpath(template.format(**known) + ".txt").read_text("utf-8")
+            texts[file.format(**known)] = Template(text).substitute(known)
+        return texts
 
     def write(self, parent: Path) -> Path:
         """Writes it into a new folder of `parent`, named as the distribution, and returns that.
@@ -84,22 +86,19 @@ class Project:
         """
         folder = parent / self.distribution
         texts = self.files()
-        try:
-            folder.mkdir()
-        except FileExistsError:
+        if os.path.lexists(folder):
             raise ExperimentError(
                 f"{folder}: exists and is left as it is; take another name or --dir"
-            ) from None
-        except OSError as error:
-            raise StorageError(f"{folder}: cannot be made: {error.strerror}") from None
-        try:
+            )
+        with refusals_as(f"{folder}: cannot be made"):
+            folder.mkdir()
+        with refusals_as(f"{folder}: cannot be written"), ExitStack() as undo:
+            undo.callback(shutil.rmtree, folder, ignore_errors=True)
             for file, text in texts.items():
                 path = folder / file
                 path.parent.mkdir(exist_ok=True)
                 path.write_text(text, "utf-8")
-        except OSError as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise StorageError(f"{folder}: cannot be written: {error.strerror}") from None
+            undo.pop_all()
         return folder
 
 
@@ -119,15 +118,11 @@ def project_of(name: str, interface: str) -> Project:
     module, instead = distribution.replace("-", "_"), f"; try {PREFIX}my-{kind}"
     if not class_name.isidentifier() or class_name in TAKEN:
         raise ExperimentError(f"'{name}' makes no name for a class{instead}")
-    if module in keyword.kwlist or _is_module(module):
+    taken = {*keyword.kwlist, *sys.stdlib_module_names}
+    spec = None if module in taken else find_spec(module)
+    if module in taken or (spec and spec.origin):  # a mere folder has no origin
         raise ExperimentError(f"there is a module {module} already{instead}")
     field, own = next((field, i) for field, i in INTERFACES.items() if i.__name__ == interface)
-    if kind in Registry().components(own, installed=False):
+    if [kind] in Registry().spellings(own, installed=False).values():
         raise ExperimentError(f"'{kind}' is a built-in {interface}{instead}")
     return Project(distribution, module, kind, class_name, interface, field)
-
-
-def _is_module(name: str) -> bool:
-    """Whether Python finds a module of that name; a mere folder is none."""
-    spec = None if name in sys.stdlib_module_names else find_spec(name)
-    return name in sys.stdlib_module_names or (spec is not None and spec.origin is not None)

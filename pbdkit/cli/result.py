@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
+from operator import eq, gt, lt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,10 +67,8 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     with reading(file) as dataset:
         explained = Explained(dataset, build_scene(experiment_of(dataset)))
         found = _of_one(explained, *bond) if bond else _of_all(explained)
-        if as_json:
-            said = json.dumps(found, default=asdict)
-        else:
-            said = "\n".join(_bond_in_words(found) if bond else _run_in_words(found))
+        words = _bond_in_words(found) if bond else _run_in_words(found)
+        said = json.dumps(found, default=asdict) if as_json else "\n".join(words)
     click.echo(said)
 
 
@@ -89,12 +88,12 @@ def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
     import numpy as np
 
     row = explained.row(a, b)
-    most = explained.most_strained(row)
+    step, strain = explained.most_strained(row)
     (standing,) = explained.standings(np.array([row]))
     return {
         "fracture": explained.model.type,
         "bond": standing,
-        "most_strained": {"step": most[0], "strain": most[1]},
+        "most_strained": {"step": step, "strain": strain},
         "remembered": explained.remembered(row),
         "broken_in_all": len(explained.order),
         "around": explained.standings(explained.around(row), standing.step),
@@ -102,75 +101,71 @@ def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
 
 
 def _run_in_words(found: dict[str, Any]) -> Iterator[str]:
-    broken, cut = found["broken"], found["broken_from_the_start"]
+    broken, cut, model = found["broken"], found["broken_from_the_start"], found["fracture"]
     start = f", {cut} broken from the start" if cut else ""
-    yield f"fracture {found['fracture']}: {broken} of {found['bonds']} bonds broke{start}"
+    yield f"fracture {model}: {broken} of {found['bonds']} bonds broke{start}"
     rows = [s for s in found["in_order"] if s.step]
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
         yield "order  step  bond           strain       breaks above"
     for s in rows[:SHOWN]:
-        bond = "-".join(map(str, s.bond))
         strain, limit = _number(s.strain_at_break), _number(s.breaks_above)
-        yield f"{s.order:>5}  {s.step:>4}  {bond:<13}  {strain:<11}  {limit}"
+        yield f"{s.order:>5}  {s.step:>4}  {_name(s):<13}  {strain:<11}  {limit}"
     if rows and all(s.breaks_above is None for s in rows):
-        yield (
-            f"{found['fracture']} does not say above which strain a bond breaks: a model does by "
-            "`breaking_strain`"
-        )
+        does = "a model does by `breaking_strain`"
+        yield f"{model} does not say above which strain a bond breaks: {does}"
     if len(rows) > SHOWN:
         yield f"and {len(rows) - SHOWN} more: --json lists all"
     if found["nearest"]:
-        yield f"nearest to breaking: {_standing(found['nearest'])}"
+        yield f"nearest to breaking: {_name(found['nearest'])}: {_standing(found['nearest'])}"
 
 
 def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
     s: Standing = found["bond"]
-    yield f"bond {s.bond[0]}-{s.bond[1]}: shell {s.shell}, rest length {s.rest_length:.6g}"
+    yield f"bond {_name(s)}: shell {s.shell}, rest length {s.rest_length:.6g}"
     if s.state == "broken":
-        strain = "an unknown strain" if s.strain_at_break is None else f"{s.strain_at_break:.6g}"
-        yield (
-            f"broke in step {s.step} at strain {strain}, number {s.order} of the "
-            f"{found['broken_in_all']} broken"
-        )
+        strain = _number(s.strain_at_break, "an unknown strain")
+        order = f"number {s.order} of the {found['broken_in_all']} broken"
+        yield f"broke in step {s.step} at strain {strain}, {order}"
         if s.breaks_above is not None:
             yield f"fracture {found['fracture']} breaks it above {s.breaks_above:.6g}"
     else:
-        yield _standing(s).split(": ", 1)[1]
+        yield _standing(s)
     if s.state == "intact":
         most = found["most_strained"]
         yield f"longest of the recorded steps in step {most['step']}: strain {most['strain']:.6g}"
-    for name, value in found["remembered"].items():
-        yield f"{name} {value:.6g}"
-    yield from _around_in_words(found["around"], s)
+    yield from (f"{name} {value:.6g}" for name, value in found["remembered"].items())
+    yield from _around_in_words(found["around"], s.step)
 
 
-def _around_in_words(around: list[Standing], s: Standing) -> Iterator[str]:
+def _around_in_words(around: list[Standing], step: int | None) -> Iterator[str]:
     """The other bonds at its ends: what broke before it, with it and after it."""
-    broken = [(other.step, other) for other in around if other.step is not None]
+    broken = [s for s in around if s.step is not None]
     groups = {"broken around it": broken}
-    if (step := s.step) is not None:
+    if step is not None:
+        when: dict[str, Any] = {"broken around it before": lt, "in the same step": eq, "after": gt}
         groups = {
-            "broken around it before": [each for each in broken if each[0] < step],
-            "in the same step": [each for each in broken if each[0] == step],
-            "after": [each for each in broken if each[0] > step],
+            title: [s for s in broken if is_so(s.step, step)] for title, is_so in when.items()
         }
     for title, group in groups.items():
-        listed = ", ".join(f"{o.bond[0]}-{o.bond[1]} (step {at})" for at, o in group)
-        yield f"{title}: {listed or 'none'}"
-    whole = [o for o in around if o.step is None]
-    yield f"not broken around it: {len(whole)}" + (
-        f", the most strained {_standing(max(whole, key=lambda o: o.strain))}" if whole else ""
-    )
+        yield f"{title}: {', '.join(f'{_name(s)} (step {s.step})' for s in group) or 'none'}"
+    whole = [s for s in around if s.step is None]
+    most = max(whole, key=lambda s: s.strain, default=None)
+    strained = f", the most strained {_name(most)}: {_standing(most)}" if most else ""
+    yield f"not broken around it: {len(whole)}{strained}"
+
+
+def _name(s: Standing) -> str:
+    return f"{s.bond[0]}-{s.bond[1]}"
 
 
 def _standing(s: Standing) -> str:
-    """An unbroken bond in a few words; what stands before the colon is its name."""
-    words = f"{s.bond[0]}-{s.bond[1]}: {s.state}, strain {s.strain:.6g} in step {s.at_step}"
+    """An unbroken bond in a few words."""
+    words = f"{s.state}, strain {s.strain:.6g} in step {s.at_step}"
     if s.breaks_above is not None and s.share is not None:
         words += f", breaks above {s.breaks_above:.6g} ({s.share:.3g} of the way)"
     return words
 
 
-def _number(value: float | None) -> str:
-    return "not known" if value is None else f"{value:.6g}"
+def _number(value: float | None, unknown: str = "not known") -> str:
+    return unknown if value is None else f"{value:.6g}"

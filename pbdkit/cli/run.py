@@ -37,10 +37,8 @@ def run(
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
-    from pbdkit.equilibrium.watch import Watch
-    from pbdkit.results.netcdf import NetcdfSink
-    from pbdkit.results.progress import progress_bar
-    from pbdkit.results.sinks import OverlappingSink
+    from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
+    from pbdkit.results.progress import Watch, progress_bar
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 
@@ -70,20 +68,18 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
     A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
     """
-    asked = False
+    asked: list[int] = []
 
     def note(number: int, frame: Any) -> None:
-        nonlocal asked
         if asked:
             raise KeyboardInterrupt
-        asked = True
+        asked.append(number)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if ours else ()
+    before = {number: signal.signal(number, note) for number in numbers}
     try:
-        yield lambda: asked
+        yield lambda: bool(asked)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -108,37 +104,26 @@ def _say(report: Report, path: Path, *, settling: bool) -> None:
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
+    from pbdkit.runs.course import peak_memory
+
+    peak = peak_memory()
     return {
         "status": report.outcome.status,
         "steps": report.outcome.steps,
         "particles": report.particles,
         "wall_s": round(report.wall_s, 6),
         "ns_per_particle_step": round(report.ns_per_particle_step, 3),
-        "peak_memory_mib": _peak_memory_mib(),
+        "peak_memory_mib": round(peak / 2**20, 1) if peak else None,
         "engine": report.choice.engine,
         "threads": report.choice.threads,
         "output": str(path),
     }
 
 
-def _peak_memory_mib() -> float | None:
-    """Of this process; None where the system does not tell."""
-    try:
-        from resource import RUSAGE_SELF, getrusage
-    except ImportError:
-        return None
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return round(getrusage(RUSAGE_SELF).ru_maxrss / unit, 1)
-
-
 def _exit_code(report: Report, path: Path, written: Path) -> int:
-    codes = {"diverged": 4, "unconverged": 4, "interrupted": 130}
-    code = codes.get(report.outcome.status, 0)
-    if code:
-        left = "" if written == path else f"; {path} is left as it was"
-        click.echo(
-            f"pbdkit: {report.outcome.status}: {report.outcome.stop_reason}; "
-            f"what was recorded until then is in {written}{left}",
-            err=True,
-        )
-    return code
+    if report.outcome.status in ("complete", "settled"):
+        return 0
+    left = "" if written == path else f"; {path} is left as it was"
+    what = f"{report.outcome.status}: {report.outcome.stop_reason}"
+    click.echo(f"pbdkit: {what}; what was recorded until then is in {written}{left}", err=True)
+    return 130 if report.outcome.status == "interrupted" else 4

@@ -25,8 +25,8 @@ COMPONENTS = {
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
     """The built-in components of the six interfaces."""
-    found = []
-    for module, names in COMPONENTS.items():
-        offered = import_module(f"{__name__}.{module}")
-        found += [getattr(offered, name) for name in names.split()]
-    return found
+    return [
+        getattr(import_module(f"{__name__}.{module}"), name)
+        for module, names in COMPONENTS.items()
+        for name in names.split()
+    ]

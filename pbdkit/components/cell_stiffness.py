@@ -13,20 +13,18 @@ from pbdkit.interfaces.polygons import Tiling
 
 Floats = NDArray[np.float64]
 
-CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
-"""Of a rectangular cell, counterclockwise, in units of its sides."""
-HOURGLASS = np.array([1.0, -1.0, 1.0, -1.0])
-"""The displacement of the corners that no mean strain knows."""
+CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Of a rectangular cell from its middle, counterclockwise, in units of half its sides."""
 
 
 @cache
 def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     """The stiffness of a cell a × b over modulus and thickness, (corner, axis, corner, axis)."""
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
-    signs = 2 * np.array(CORNERS) - 1.0
-    K = _of_mean_strain(c, signs / (2 * np.array([a, b])), a * b)
+    K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)
     stiffness = c.shear * (a / b + b / a) / 4
-    K += stiffness * np.einsum("m,n,ab->manb", HOURGLASS, HOURGLASS, np.eye(2))
+    hourglass = CORNERS.prod(axis=1)  # the displacement that no mean strain knows
+    K += stiffness * np.einsum("m,n,ab->manb", hourglass, hourglass, np.eye(2))
     K.flags.writeable = False
     return K
 
@@ -41,24 +39,18 @@ def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
     return K
 
 
-def in_rectangles(slot: Slot, c: Stiffness, cells: Tiling) -> tuple[Floats, Floats]:
-    """-K_jk in the rectangle to the left and in that to the right of a slot, half of it in each
-    where both are one cell."""
-    assert cells.rectangle
+def on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:
+    """-K_jk in the cell to the left and in that to the right of a slot, half of it in each where
+    both are one cell."""
+    if not cells.rectangle:
+        return [_in_triangle(slot, c, turn) for turn in (1, -1)]
     K, share = rectangle_matrix(c, *cells.rectangle), 2 if cells.is_diagonal(slot) else 1
-    left, right = (-K[side.start, :, side.end, :] / share for side in cells.beside[slot])
-    return left, right
-
-
-def in_triangles(slot: Slot, c: Stiffness) -> tuple[Floats, Floats]:
-    """-K_jk in the equilateral triangle to the left and in that to the right of a slot."""
-    return _in_triangle(slot, c, 1), _in_triangle(slot, c, -1)
+    return [-K[side.start, :, side.end, :] / share for side in cells.beside[slot]]
 
 
 def _in_triangle(slot: Slot, c: Stiffness, turn: int) -> Floats:
-    x, y = slot.rest
-    half, height = 0.5, turn * math.sqrt(0.75)
-    corners = np.array([[0.0, 0.0], [x, y], [half * x - height * y, height * x + half * y]])
+    (x, y), height = slot.rest, turn * math.sqrt(0.75)
+    corners = np.array([[0.0, 0.0], [x, y], [0.5 * x - height * y, height * x + 0.5 * y]])
     gradient = np.linalg.inv(np.column_stack([np.ones(3), corners]))[1:].T
     area = math.sqrt(0.75) * (x * x + y * y) / 2
     block: Floats = -_of_mean_strain(c, gradient, area)[0, :, 1, :]

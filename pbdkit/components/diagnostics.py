@@ -183,7 +183,5 @@ def refuse_numbers_beyond(particles: int, numbers: tuple[int, ...]) -> None:
     """Raises ExperimentError for a number that no particle has."""
     for n, number in enumerate(numbers):
         if number > particles:
-            raise ExperimentError(
-                f"there is no particle {number}; they are numbered 1 to {particles}",
-                ("numbers", n),
-            )
+            text = f"there is no particle {number}; they are numbered 1 to {particles}"
+            raise ExperimentError(text, ("numbers", n))

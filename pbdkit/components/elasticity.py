@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import in_rectangles, in_triangles
+from pbdkit.components.cell_stiffness import on_both_sides
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
@@ -37,41 +37,37 @@ class CellElastic(Calibrated, FollowerRule):
     uses_cells: ClassVar[bool] = True
 
     @abstractmethod
-    def modulus(self) -> float:
-        """What the ratios are multiplied with to be stiffnesses over Young's modulus."""
-
-    @abstractmethod
-    def ratios(self) -> Stiffness:
-        """The stiffness over `modulus`: finite for every material that the rule takes."""
+    def material(self) -> tuple[float, Stiffness]:
+        """A modulus over Young's, and the stiffness over that modulus: its ratios are finite for
+        every material that the rule takes."""
 
     def stiffness(self) -> Stiffness | None:
         """Ratios times modulus, where that is finite."""
-        modulus = self.modulus()
-        if not math.isfinite(modulus):
-            return None
-        return Stiffness(*(modulus * ratio for ratio in self.ratios()))
+        modulus, ratios = self.material()
+        finite = math.isfinite(modulus)
+        return Stiffness(*(modulus * ratio for ratio in ratios)) if finite else None
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """The modulus; ExperimentError where the lattice has no such cells."""
+        modulus, ratios = self.material()
         if not (setting.cells.rectangle or setting.cells.regular == 3):
             raise ExperimentError(
                 f"'{self.type}' works on the square and the rectangular lattice with 8 neighbours "
                 "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
                 "lattice with 6 ({type: coordination, shells: 1})"
             )
-        if setting.cells.regular == 3 and not _is_isotropic(self.ratios()):
+        xx, yy, xy, shear = ratios
+        isotropic = xx == yy and math.isclose(xx, xy + 2 * shear, rel_tol=1e-12)
+        if setting.cells.regular == 3 and not isotropic:
             raise ExperimentError(
                 f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
             )
-        return {"modulus": self.modulus()}
+        return {"modulus": modulus}
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
         to the right the transpose; a cell on both sides counts half on each."""
-        if setting.cells.rectangle:
-            left, right = in_rectangles(slot, self.ratios(), setting.cells)
-        else:
-            left, right = in_triangles(slot, self.ratios())
+        left, right = on_both_sides(slot, self.material()[1], setting.cells)
         mean = (left + right.T) / 2
         return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
 
@@ -119,22 +115,16 @@ class IsotropicElastic(CellElastic):
             raise ValueError("in plane strain poisson_ratio must be at most 0.49")
         return self
 
-    def modulus(self) -> float:
-        """1/(1 - ν'²) in plane stress, in plane strain the same over 1 - ν²; ν' = ν/(1 - ν)."""
-        nu, effective = self.poisson_ratio, self._in_plane()
+    def material(self) -> tuple[float, Stiffness]:
+        """1/(1 - ν²) in plane stress, in plane strain ν' = ν/(1 - ν) for ν and all over 1 - ν²;
+        1, 1, ν', (1 - ν')/2."""
+        nu, in_plane, out_of_plane = self.poisson_ratio, self.poisson_ratio, 1.0
+        if self.plane == "strain":
+            in_plane, out_of_plane = nu / (1 - nu), 1 - nu * nu
+        ratios = Stiffness(1.0, 1.0, in_plane, (1 - in_plane) / 2)
         if nu == -1.0:
-            return math.nan  # no positive stiffness belongs to it
-        out_of_plane = 1 - nu * nu if self.plane == "strain" else 1.0
-        return 1 / (out_of_plane * (1 - effective * effective))
-
-    def ratios(self) -> Stiffness:
-        """1, 1, ν', (1 - ν')/2."""
-        nu = self._in_plane()
-        return Stiffness(1.0, 1.0, nu, (1 - nu) / 2)
-
-    def _in_plane(self) -> float:
-        nu = self.poisson_ratio
-        return nu / (1 - nu) if self.plane == "strain" else nu
+            return math.nan, ratios  # no positive stiffness belongs to it
+        return 1 / (out_of_plane * (1 - in_plane * in_plane)), ratios
 
 
 class Elastic(IsotropicElastic):
@@ -176,18 +166,11 @@ class Orthotropic(CellElastic):
             )
         return self
 
-    def modulus(self) -> float:
-        """1/(1 - ν_xy ν_yx)."""
-        return 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
-
-    def ratios(self) -> Stiffness:
-        """1, E_y/E_x, ν_xy E_y/E_x, and the shear ratio over the modulus."""
+    def material(self) -> tuple[float, Stiffness]:
+        """1/(1 - ν_xy ν_yx); 1, E_y/E_x, ν_xy E_y/E_x, and the shear ratio over the modulus."""
+        modulus = 1 / (1 - self.poisson_ratio**2 * self.modulus_ratio)
         coupled = self.poisson_ratio * self.modulus_ratio
-        return Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / self.modulus())
-
-
-def _is_isotropic(c: Stiffness) -> bool:
-    return c.xx == c.yy and math.isclose(c.xx, c.xy + 2 * c.shear, rel_tol=1e-12)
+        return modulus, Stiffness(1.0, self.modulus_ratio, coupled, self.shear_ratio / modulus)
 
 
 class StrainGradient(AppliesTwice, IsotropicElastic):

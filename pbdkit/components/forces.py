@@ -41,8 +41,7 @@ class StrainEnergy(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`strain_energy`."""
-        units = "unit of youngs_modulus * unit of thickness * lattice unit^2"
-        return (Variable("strain_energy", (), "strain energy", units),)
+        return (Variable("strain_energy", (), "strain energy", f"{FORCE}^2"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """E t times the rule's."""
@@ -125,12 +124,9 @@ class StressStrain(Diagnostic):
         refuse_numbers_beyond(particles, self.numbers or ())
         by_leaders = not (self.points or self.numbers)
         for name in ("group", "against") if by_leaders else ("group",):
-            if getattr(self, name) >= leader_groups:
-                raise ExperimentError(
-                    f"there is no leader group {getattr(self, name)}; they are numbered from 0, "
-                    f"and there are {leader_groups}",
-                    (name,),
-                )
+            if (group := getattr(self, name)) >= leader_groups:
+                known = f"they are numbered from 0, and there are {leader_groups}"
+                raise ExperimentError(f"there is no leader group {group}; {known}", (name,))
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """Stress and strain."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Anchors, FrameMap, FramePolicy, FrameSites, Stiffness
+from pbdkit.interfaces import Anchors, Cell, FrameMap, FramePolicy, FrameSites, Stiffness
 from pbdkit.interfaces.rule import material_of
 
 NEGLIGIBLE = 1e-17
@@ -92,8 +93,7 @@ class MirrorFrame(Anchors, LayeredFrame):
 
     def follow(self, frame: FrameSites) -> FrameMap:
         """One entry a point, with the matrix R."""
-        a, b = frame.cell.vectors
-        if frame.cell.period != (1, 1) or a.y != 0.0 or b.x != 0.0:
+        if not _is_upright(frame.cell):
             raise ExperimentError("a mirror frame needs a square or rectangular lattice")
         edge = np.clip(frame.site, frame.low, frame.high)
         outside, body = frame.site != edge, frame.body_at(2 * edge - frame.site)
@@ -152,21 +152,22 @@ class TractionFree(FramePolicy):
         return equations.solved()
 
 
+def _is_upright(cell: Cell) -> bool:
+    """Whether it is that of a square or rectangular lattice along the axes."""
+    a, b = cell.vectors
+    return cell.period == (1, 1) and a.y == b.x == 0.0
+
+
 class _Equations:
-    """A g = B f for the displacements g of the points and f of the body particles next to them;
-    unknown 2n is x of the n-th, 2n + 1 its y."""
+    """M u = 0 for the displacements u at all sites of a box, of the points around it and of the
+    body particles in it. Unknown 2n is x of the n-th, 2n + 1 its y; the rows count likewise, the
+    points alone."""
 
     def __init__(self, frame: FrameSites) -> None:
-        self._frame = frame
-        a, b = frame.cell.vectors
         low, high = np.array(frame.low), np.array(frame.high)
-        self._site, self._spacings = frame.site, (a.x, b.y)
         self._beyond = (frame.site > high).astype(int) - (frame.site < low)
-        self._point = np.full(high - low + 3, -1)
         if (
-            frame.cell.period != (1, 1)
-            or a.y != 0.0
-            or b.x != 0.0
+            not _is_upright(frame.cell)
             or not self._beyond.any(axis=1).all()
             or len(frame.site) != 2 * (high - low + 1).sum() + 4
         ):
@@ -174,12 +175,11 @@ class _Equations:
                 "a traction-free frame needs a body that fills a rectangle of sites of a square or "
                 "rectangular lattice; 'natural' takes every body"
             )
-        self._first = low - 1
-        self._point[tuple((frame.site - self._first).T)] = np.arange(len(frame.site))
-        self._A: list[tuple[Any, Any, Any]] = []
-        self._B: list[tuple[Any, Any, Any]] = []
-        for axis in (0, 1):
-            self._add(np.arange(len(frame.site)), axis, frame.site, axis, 1.0)
+        a, b = frame.cell.vectors
+        self._frame, self._site, self._spacings = frame, frame.site, (a.x, b.y)
+        self._first, self._shape = low - 1, tuple(high - low + 3)
+        self._entries: list[tuple[Any, Any, Any]] = []
+        self._add_both(np.arange(len(frame.site)), frame.site, 1.0)
 
     def balance_edges(self, c: Stiffness) -> None:
         """No shear and no tension across the edges."""
@@ -189,8 +189,7 @@ class _Equations:
             side, step = self._beyond[points, across], np.eye(2, dtype=int)[along]
             inner = self._site[points] - side[:, None] * np.eye(2, dtype=int)[across]
             slope = side * self._spacings[across] / (2 * self._spacings[along])
-            for axis in (0, 1):
-                self._add(points, axis, inner, axis, -1.0)
+            self._add_both(points, inner, -1.0)
             for some, steps in self._differences(self._site[points, along], along):
                 for n, weight in steps.items():
                     for row in (self._site[points], inner):
@@ -201,7 +200,7 @@ class _Equations:
     def _differences(self, site: Any, along: int) -> Iterator[tuple[Any, dict[int, float]]]:
         """Which sites take which difference along the edge, as weights by step: the central one,
         and where the edge ends the one that is exact for parabolas."""
-        low, high = self._first[along] + 1, self._first[along] + self._point.shape[along] - 2
+        low, high = self._first[along] + 1, self._first[along] + self._shape[along] - 2
         ends = {0: -1.5, 1: 2.0, 2: -0.5} if high - low > 1 else {0: -1.0, 1: 1.0}
         if high > low:
             yield (site > low) & (site < high), {-1: -0.5, 1: 0.5}
@@ -213,38 +212,39 @@ class _Equations:
         points = np.flatnonzero(self._beyond.all(axis=1))
         site, beyond = self._site[points], self._beyond[points]
         for back, factor in (([1, 0], -1.0), ([0, 1], -1.0), ([1, 1], 1.0)):
-            for axis in (0, 1):
-                self._add(points, axis, site - beyond * back, axis, factor)
+            self._add_both(points, site - beyond * back, factor)
 
     def solved(self) -> FrameMap:
         """The points' weights of the body particles."""
-        from scipy.sparse import coo_array, vstack
+        from scipy.sparse import coo_array, hstack
         from scipy.sparse.linalg import splu
 
-        size = 2 * len(self._site)
-        row, column, value = (np.concatenate(part) for part in zip(*self._A, strict=True))
-        A = coo_array((value, (row, column)), (size, size)).tocsc()
-        row, column, value = (np.concatenate(part) for part in zip(*self._B, strict=True))
-        body, column = np.unique(column, return_inverse=True)
-        B = coo_array((value, (row, column)), (size, len(body))).tocsc()
+        row, column, value = map(np.concatenate, zip(*self._entries, strict=True))
+        ring = self._place(self._site)
+        inner = np.setdiff1d(column // 2, ring)
+        size = 2 * len(ring), 2 * math.prod(self._shape)
+        M = coo_array((value, (row, column)), size).tocsc()
+        A, B = (M[:, (2 * places[:, None] + (0, 1)).ravel()] for places in (ring, inner))
         inverse, parts = splu(A), []
-        for first in range(0, len(body), COLUMNS):
-            answers = inverse.solve(B[:, first : first + COLUMNS].toarray())
+        for first in range(0, B.shape[1], COLUMNS):
+            answers = inverse.solve(-B[:, first : first + COLUMNS].toarray())
             answers[np.abs(answers) < NEGLIGIBLE] = 0.0
-            parts.append(coo_array(answers.T))
-        found = vstack(parts).T.tocoo()
-        point, body = found.row, body[found.col]
-        places = np.stack([point // 2, body // 2])
-        (points, bodies), entry = np.unique(places, axis=1, return_inverse=True)
-        weight = np.zeros((len(points), 2, 2))
-        weight[entry.ravel(), point % 2, body % 2] = found.data
-        return FrameMap(points, bodies, weight)
+            parts.append(coo_array(answers))
+        weights = hstack(parts).tobsr((2, 2))
+        weights.sort_indices()
+        point = np.repeat(np.arange(len(ring)), np.diff(weights.indptr))
+        sites = np.column_stack(np.unravel_index(inner, self._shape)) + self._first
+        body = self._frame.body_at(sites.astype(np.int32))[weights.indices]
+        return FrameMap(point, body, weights.data)
+
+    def _add_both(self, points: Any, site: Any, factor: float) -> None:
+        for axis in (0, 1):
+            self._add(points, axis, site, axis, factor)
 
     def _add(self, points: Any, row: int, site: Any, axis: int, factor: Any) -> None:
         """Adds factor · (component `axis` at some sites) to the equations `row` of some points."""
-        factor = np.broadcast_to(factor, points.shape)
-        point = self._point[tuple((site - self._first).T)]
-        ours = point >= 0
-        self._A.append((2 * points[ours] + row, 2 * point[ours] + axis, factor[ours]))
-        body = self._frame.body_at(site[~ours].astype(np.int32))
-        self._B.append((2 * points[~ours] + row, 2 * body + axis, -factor[~ours]))
+        column = 2 * self._place(site) + axis
+        self._entries.append((2 * points + row, column, np.broadcast_to(factor, points.shape)))
+
+    def _place(self, site: Any) -> Any:
+        return np.ravel_multi_index(tuple((site - self._first).T), self._shape)

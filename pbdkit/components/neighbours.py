@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
@@ -65,17 +66,10 @@ class Chebyshev(LatticeNeighbours):
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Every offset up to index distance `shells`, grouped by it."""
         shells: list[list[Offset]] = [[] for _ in range(self.shells)]
-        m_max, n_max = self._cells(cell)
-        near = sorted(
-            (
-                cell.offset(sublattice, target, (m, n))
-                for target in range(len(cell.sites))
-                for m in range(-m_max, m_max + 1)
-                for n in range(-n_max, n_max + 1)
-            ),
-            key=lambda o: (o.length, o.site),
-        )
-        for offset in near:
+        m, n = self._cells(cell)
+        ends = product(range(len(cell.sites)), product(range(-m, m + 1), range(-n, n + 1)))
+        near = [cell.offset(sublattice, target, step) for target, step in ends]
+        for offset in sorted(near, key=lambda o: (o.length, o.site)):
             distance = max(abs(offset.primitive[0]), abs(offset.primitive[1]))
             if offset.site != (0, 0) and distance <= self.shells:
                 shells[distance - 1].append(offset)
@@ -113,12 +107,9 @@ class Euclidean(NeighbourMetric):
     def shells_around(self, cell: Cell, sublattice: int) -> list[list[Offset]]:
         """Ranked by weighted distance: by distance, where the plane is stretched by √w."""
         near, (wx, wy) = self.radius * (1 + 1e-9), map(math.sqrt, self.weights)
-        a, b = (Vector(wx * v.x, wy * v.y) for v in cell.vectors)
-        stretched = replace(
-            cell,
-            vectors=(a, b),
-            sites=tuple(replace(s, at=Vector(wx * s.at.x, wy * s.at.y)) for s in cell.sites),
-        )
+        vectors = tuple(Vector(wx * v.x, wy * v.y) for v in cell.vectors)
+        sites = tuple(replace(s, at=Vector(wx * s.at.x, wy * s.at.y)) for s in cell.sites)
+        stretched = replace(cell, vectors=vectors, sites=sites)
         if not (count := cells_within(stretched, near) * len(cell.sites)) <= MOST_NEIGHBOURS:
             raise ExperimentError(
                 f"a radius of {self.radius:g} holds some {count:.3g} neighbours on this lattice, "

@@ -27,8 +27,12 @@ Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
 SCATTER = "s: strengths are drawn from 1 ± s, uniformly, by the seed."
 
 
-def _factors(bonds: Bonds, scatter: float, generator: np.random.Generator) -> Any:
-    return 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
+def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strains: float) -> Drawn:
+    """Each strain times one number a bond, by name; nothing where there is no scatter."""
+    if not scatter:
+        return {}
+    factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
+    return {name: strain * factors for name, strain in strains.items()}
 
 
 class StrainFracture(Draws, Parting):
@@ -59,9 +63,7 @@ class StrainFracture(Draws, Parting):
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
-        if not self.scatter:
-            return {}
-        return {"failure_strain": self.failure * _factors(owners, self.scatter, generator)}
+        return _drawn(owners, self.scatter, generator, failure_strain=self.failure)
 
     @staticmethod
     def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
@@ -106,9 +108,8 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
 
     def constants(self, slot: Slot) -> dict[str, float]:
         """`per_rest` = 1/|r|; `onset_strain` and `failure_strain` unless each bond has its own."""
-        rest = {"per_rest": 1.0 / length(slot.rest)}
-        own = {} if self.scatter else {"onset_strain": self.onset, "failure_strain": self.failure}
-        return rest | own
+        own = {} if self.scatter else self._strains()
+        return {"per_rest": 1.0 / length(slot.rest)} | own
 
     def remembered(self) -> tuple[Remembered, ...]:
         """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
@@ -116,10 +117,10 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
-        if not self.scatter:
-            return {}
-        factors = _factors(owners, self.scatter, generator)
-        return {"onset_strain": self.onset * factors, "failure_strain": self.failure * factors}
+        return _drawn(owners, self.scatter, generator, **self._strains())
+
+    def _strains(self) -> dict[str, float]:
+        return {"onset_strain": self.onset, "failure_strain": self.failure}
 
     @staticmethod
     def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
@@ -74,6 +74,11 @@ def spacing_of(scene: Scene) -> float:
     return min(min(lengths) for lengths in scene.neighbourhood.shells())
 
 
+def broken_bonds(state: State) -> int:
+    """How many bonds are broken."""
+    return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step >= 0))
+
+
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -82,10 +87,8 @@ class Moves:
     frame standing where the body tells it to."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._followers = SlotFollowers(
-            scene, Stepping(relaxation=scene.experiment.stepping.relaxation)
-        )
+        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation)
+        self._scene, self._followers = scene, SlotFollowers(scene, stepping)
         self._after: Floats | None = None
 
     def at(self, state: State, place: Indices) -> NDArray[np.float64]:
@@ -159,7 +162,7 @@ class Foresight:
         """
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         here = replace(state, u=u, previous=previous)
-        broken = 0 if state.broken_step is None else int((state.broken_step >= 0).sum())
+        broken = broken_bonds(state)
         if self._at_rest is None or broken != self._broken:
             self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
             self._linear = self._is_linear(here, self._at_rest)
@@ -184,9 +187,10 @@ class Foresight:
             left = self._moves.at(replace(here, u=ahead), known.place)
             bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
             distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
-            if anew and not _smaller(left, moves, rounding(ahead)):
+            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding(ahead)
+            if anew and not np.abs(left).max(initial=0.0) <= most:
                 distance, obstacle = math.inf, BENT
-        distance = distance if math.isfinite(distance) else math.inf
+        distance = math.inf if math.isnan(distance) else distance
         assert self._at_rest is not None
         own = known.iterations if anew else 0
         certificate = Certificate(
@@ -220,14 +224,7 @@ class Foresight:
         put = np.random.default_rng(0).uniform(-size, size, shape)
         there = here.u.copy()
         there.reshape(len(there), -1)[:, known.place] += put.T
-        change = self._moves.at(replace(here, u=there), known.place) - self._moves.at(
-            here, known.place
-        )
+        moved, moves = (self._moves.at(replace(here, u=u), known.place) for u in (there, here.u))
         with np.errstate(all="ignore"):
-            wrong = float(np.linalg.norm(change + known.times(put)))
+            wrong = float(np.linalg.norm(moved - moves + known.times(put)))
         return wrong <= LINEAR * float(np.linalg.norm(put))
-
-
-def _smaller(left: NDArray[np.float64], moves: NDArray[np.float64], rounding: float) -> bool:
-    most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding
-    return bool(np.abs(left).max(initial=0.0) <= most)

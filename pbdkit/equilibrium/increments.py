@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import Certificate, scale_of
+from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
-from pbdkit.equilibrium.watch import StoppedError, Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine
@@ -108,22 +108,17 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     """Whether bonds break or change in the settled state; changes within the tolerance are left
     out, so that the certificate speaks of the bonds as they are."""
     before = [value.copy() for value in state.bond_values]
-    broken = _broken(state)
+    broken = broken_bonds(state)
     fracturing.break_bonds(state.u, state, step)
-    if _broken(state) > broken:
+    if broken_bonds(state) > broken:
         return True
     tolerance = scene.experiment.solver.sought.tolerance
-    for old, new in zip(before, state.bond_values, strict=True):
-        if (np.abs(new - old) > tolerance * np.maximum(1.0, np.abs(old))).any():
-            return True
-    for old, new in zip(before, state.bond_values, strict=True):
+    pairs = list(zip(before, state.bond_values, strict=True))
+    if any((abs(b - a) > tolerance * np.maximum(1.0, abs(a))).any() for a, b in pairs):
+        return True
+    for old, new in pairs:
         new[...] = old
     return False
-
-
-def _broken(state: State) -> int:
-    assert state.broken_step is not None
-    return int(np.count_nonzero(state.broken_step >= 0))
 
 
 def _last_change_of_roles(scene: Scene) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import DENSE
 from pbdkit.equilibrium.dissection import dissected
 from pbdkit.equilibrium.multigrid import aggregated, classical
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
 Preconditioner = Callable[[Floats], Floats]
@@ -43,13 +43,17 @@ class LinearSolver(ABC):
     name: str
     iterations = 0
 
-    @abstractmethod
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
+        return self._solved(b, accuracy, transposed=False)
 
-    @abstractmethod
     def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
         """The same for Aᵀ."""
+        return self._solved(b, accuracy, transposed=True)
+
+    @abstractmethod
+    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
+        """By the method."""
 
 
 class Dense(LinearSolver):
@@ -60,13 +64,8 @@ class Dense(LinearSolver):
     def __init__(self, matrix: Floats) -> None:
         self.inverse = np.linalg.inv(matrix)
 
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        return self.inverse @ b
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        return self.inverse.T @ b
+    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
+        return (self.inverse.T if transposed else self.inverse) @ b
 
 
 class SparseLU(LinearSolver):
@@ -95,15 +94,8 @@ class SparseLU(LinearSolver):
         except RuntimeError as error:  # "Factor is exactly singular"
             raise np.linalg.LinAlgError(str(error)) from None
 
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        return self._solved(b, "N")
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        return self._solved(b, "T")
-
-    def _solved(self, b: Floats, how: str) -> Floats:
+    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
+        how = "T" if transposed else "N"
         if self._order is None:
             return np.asarray(self._factors.solve(b, trans=how))
         x = np.empty_like(b, dtype=float)
@@ -126,27 +118,19 @@ class Krylov(LinearSolver):
         self.name = f"multigrid, {inner}" if grids else inner
         self._symmetric, self._grids, self._watch = symmetric, grids, watch
         self._upright = self._prepared(matrix)
-        self._transposed = self._upright if symmetric else None
-
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        return self._iterated(*self._upright, b, max(accuracy, FINEST))
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By this method."""
-        if self._transposed is None:
-            self._transposed = self._prepared(self._upright[0].T.tocsr())
-        return self._iterated(*self._transposed, b, max(accuracy, FINEST))
 
     def _prepared(self, matrix: Any) -> tuple[Any, Preconditioner]:
         return matrix, self._grids(matrix) if self._grids else np.copy
 
-    def _iterated(
-        self, matrix: Any, preconditioner: Preconditioner, b: Floats, accuracy: float
-    ) -> Floats:
+    @cached_property
+    def _transposed(self) -> tuple[Any, Preconditioner]:
+        return self._upright if self._symmetric else self._prepared(self._upright[0].T.tocsr())
+
+    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
         from scipy.sparse.linalg import LinearOperator, cg, gmres
 
-        whole = float(np.linalg.norm(b))
+        matrix, preconditioner = self._transposed if transposed else self._upright
+        accuracy, whole = max(accuracy, FINEST), float(np.linalg.norm(b))
         if not 0.0 < whole < math.inf:
             return np.zeros_like(b)
 
@@ -160,11 +144,8 @@ class Krylov(LinearSolver):
             return preconditioner(r)
 
         first = told if self._symmetric else preconditioner
-        how = {
-            "M": LinearOperator(matrix.shape, matvec=first, dtype=float),
-            "rtol": accuracy,
-            "atol": 0.0,
-        }
+        M = LinearOperator(matrix.shape, matvec=first, dtype=float)
+        how: dict[str, Any] = {"M": M, "rtol": accuracy, "atol": 0.0}
         with np.errstate(all="ignore"):  # A that is no matrix for it: what comes out shows it
             if self._symmetric:
                 most = MOST_ITERATIONS + (0 if self._grids else 20 * math.isqrt(len(b)))
@@ -206,11 +187,9 @@ def linear_solver(
         raise ExperimentError(
             "method multigrid needs pyamg: pip install 'pbdkit[fast]'", ("solver", "method")
         )
-    grids = (
-        classical
-        if near_kernel is None
-        else partial(aggregated, near_kernel=near_kernel, symmetric=symmetric)
-    )
+    grids: Callable[[Any], Preconditioner] = classical
+    if near_kernel is not None:
+        grids = partial(aggregated, near_kernel=near_kernel, symmetric=symmetric)
     return Krylov(matrix, symmetric, watch or Watch(), grids)
 
 

@@ -47,11 +47,9 @@ def classical(matrix: Any) -> Grids:
 
     # One way down the unknowns, the other way up: half the work of both ways each time, for an
     # iteration or two more, and symmetric all the same.
-    ways = {
-        f"{when}smoother": ("gauss_seidel", {"sweep": way})
-        for when, way in (("pre", "forward"), ("post", "backward"))
-    }
-    return Grids(pyamg.ruge_stuben_solver(_narrow(matrix, np.float32), **ways))
+    down, up = (("gauss_seidel", {"sweep": way}) for way in ("forward", "backward"))
+    narrow = _narrow(matrix, np.float32)
+    return Grids(pyamg.ruge_stuben_solver(narrow, presmoother=down, postsmoother=up))
 
 
 def aggregated(matrix: Any, near_kernel: Floats, *, symmetric: bool) -> Grids:

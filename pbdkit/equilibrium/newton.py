@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.watch import Watch
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -89,7 +89,8 @@ class _Search:
             self._owed = None
             after, floor = _size(self._left), self._floor()
             if n == 0:
-                self._linear = before > 1e3 * floor and after <= self._expected(before, accuracy)
+                expected = max(LINEAR, 10 * accuracy) * before + floor
+                self._linear = before > 1e3 * floor and after <= expected
             if not self._linear or not math.isfinite(after):
                 return False
             if self._distance() <= self._finder.tolerance:
@@ -162,17 +163,13 @@ class _Search:
 
     def _distance(self) -> float:
         bound = self._system.distance(self._left, self._rounding())
-        bound = bound if self._linear else FIRST_ORDER * bound
-        return bound if math.isfinite(bound) else math.inf
+        return math.inf if math.isnan(bound) else bound * (1.0 if self._linear else FIRST_ORDER)
 
     def _accuracy(self) -> float:
         """How well a linear system must be solved for the tolerance."""
         distance = self._distance()
         wanted = self._finder.tolerance / distance if distance > 0.0 else 1.0
         return min(1e-6, max(1e-13, wanted))
-
-    def _expected(self, before: float, accuracy: float) -> float:
-        return max(LINEAR, 10 * accuracy) * before + self._floor()
 
     def _rounding(self) -> float:
         return self._system.amplification * rounding(self._state.u)

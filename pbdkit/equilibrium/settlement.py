@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, Foresight, Outlook, scale_of
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.experiment.solvers import Settle
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.prescription import is_cut_short, last_event
@@ -124,9 +124,8 @@ class Settling:
         self._foresight = Foresight(scene, self._scale, watch)
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         self._carrying = _carrying(scene)
-        self.obstacle = (
-            "steps are too few" if ends else "leaders do not come to rest before its end"
-        )
+        unended = "leaders do not come to rest before its end"
+        self.obstacle = "steps are too few" if ends else unended
         """Why the run has not settled, as found at the last look."""
 
     def look(self, state: State) -> Certificate | None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -54,15 +54,12 @@ class System:
         first = 1 if both.couples(0, 1) else 0
         self._stages = [] if both.couples(first, 1 - first) else [self._stage([first])]
         # One axis has a share in the invariants of the other, where it moves it.
-        coupled = both.couples(1 - first, first)
-        if not self._stages or (coupled and self._has_floating(self._stages[0])):
+        parts = [part for stage in self._stages for _, part in stage.parts]
+        floats = any(isinstance(part, Floating) for part in parts)
+        if not self._stages or (floats and both.couples(1 - first, first)):
             self._stages = [self._stage([0, 1])]
         else:
             self._stages.append(self._following(first))
-
-    @staticmethod
-    def _has_floating(stage: _Stage) -> bool:
-        return any(isinstance(part, Floating) for _, part in stage.parts)
 
     @property
     def methods(self) -> str:

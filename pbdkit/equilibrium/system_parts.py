@@ -21,7 +21,7 @@ from pbdkit.equilibrium.linear_solver import (
     is_symmetric,
     linear_solver,
 )
-from pbdkit.equilibrium.watch import Watch
+from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
 SAFETY = 3.0
@@ -127,17 +127,10 @@ class Held(Part):
             from scipy.sparse import csr_array
 
             matrix = csr_array(matrix)
-        self._matrix, self._symmetric = matrix, is_symmetric(matrix)
+        self._how: dict[str, Any] = {"symmetric": is_symmetric(matrix), "places": places}
+        self._matrix = matrix
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
-        self._places = places
-        solver = linear_solver(
-            matrix,
-            method,
-            symmetric=self._symmetric,
-            near_kernel=near_kernel,
-            places=places,
-            watch=watch,
-        )
+        solver = linear_solver(matrix, method, near_kernel=near_kernel, watch=watch, **self._how)
         super().__init__(matrix.shape[0], solver, watch)
         ones = np.ones(self._size)
         most = self.farthest(ones) if isinstance(solver, Dense) else np.abs(self._of_ones).max()
@@ -154,9 +147,7 @@ class Held(Part):
         if isinstance(self._solver, Krylov) and self._has_choice:
             left = float(np.linalg.norm(r - self._matrix @ x))
             if not left <= 100 * accuracy * float(np.linalg.norm(r)):  # the iteration got stuck
-                self._solver = linear_solver(
-                    self._matrix, "lu", symmetric=self._symmetric, places=self._places
-                )
+                self._solver = linear_solver(self._matrix, "lu", **self._how)
                 x = self._solver.solve(r, accuracy)
         return x
 

@@ -8,8 +8,18 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, SerializeAsAny
 
-from pbdkit.experiment.body import Body, Box, Floats, Grid, Sites
-from pbdkit.experiment.outlines import Disc, Dogbone, Polygon, Rectangle, Ring
+from pbdkit.experiment.body import (
+    Body,
+    Box,
+    Disc,
+    Dogbone,
+    Floats,
+    Grid,
+    Polygon,
+    Rectangle,
+    Ring,
+    Sites,
+)
 from pbdkit.experiment.parts import closed_part
 
 
@@ -32,9 +42,9 @@ class Union(Composed):
         """Those of all parts."""
         return [box for part in self.of for box in part.boxes()]
 
-    def distance(self, at: Sites) -> Floats:
+    def distance(self, sites: Sites) -> Floats:
         """The smallest."""
-        return reduce(np.minimum, (part.distance(at) for part in self.of))
+        return reduce(np.minimum, (part.distance(sites) for part in self.of))
 
 
 class Intersection(Composed):
@@ -49,13 +59,13 @@ class Intersection(Composed):
         outlines = [_hull(boxes) for boxes in every if not any(box.in_sites for box in boxes)]
         if grids or not outlines:
             return (grids or every)[0]
-        low = max(box.low[0] for box in outlines), max(box.low[1] for box in outlines)
-        high = min(box.high[0] for box in outlines), min(box.high[1] for box in outlines)
-        return [Box(low, (max(low[0], high[0]), max(low[1], high[1])))]
+        low = np.max([box.low for box in outlines], axis=0)
+        high = np.min([box.high for box in outlines], axis=0)
+        return [Box(tuple(low), tuple(np.maximum(low, high)))]
 
-    def distance(self, at: Sites) -> Floats:
+    def distance(self, sites: Sites) -> Floats:
         """The largest."""
-        return reduce(np.maximum, (part.distance(at) for part in self.of))
+        return reduce(np.maximum, (part.distance(sites) for part in self.of))
 
 
 class Difference(Composed):
@@ -67,17 +77,16 @@ class Difference(Composed):
         """Those of the first part."""
         return self.of[0].boxes()
 
-    def distance(self, at: Sites) -> Floats:
+    def distance(self, sites: Sites) -> Floats:
         """The largest of the first distance and the others' negatives."""
-        first, *others = (part.distance(at) for part in self.of)
+        first, *others = (part.distance(sites) for part in self.of)
         return reduce(np.maximum, (-other for other in others), first)
 
 
 def _hull(boxes: list[Box]) -> Box:
     """The box around some boxes."""
-    low = min(b.low[0] for b in boxes), min(b.low[1] for b in boxes)
-    high = max(b.high[0] for b in boxes), max(b.high[1] for b in boxes)
-    return Box(low, high)
+    low = np.min([box.low for box in boxes], axis=0)
+    return Box(tuple(low), tuple(np.max([box.high for box in boxes], axis=0)))
 
 
 AnyBody = Annotated[
@@ -87,5 +96,3 @@ AnyBody = Annotated[
     ),
 ]
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]
-for _composed in (Composed, Union, Intersection, Difference):
-    _composed.model_rebuild()

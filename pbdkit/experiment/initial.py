@@ -6,7 +6,6 @@ from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.random import Generator
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny
 
@@ -27,7 +26,7 @@ class Initial(Component):
     """Whether everything starts where it rests; `displacement` is then not asked."""
 
     @abstractmethod
-    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """u of the body particles at X, (particle, axis), in the order of their numbers; `leads`
         marks the leaders of step 1."""
 
@@ -39,7 +38,7 @@ class Reference(Initial):
 
     at_rest: ClassVar[bool] = True
 
-    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """Zeros."""
         return np.zeros_like(X)
 
@@ -51,7 +50,7 @@ class Noise(Initial):
     type: Literal["noise"] = "noise"
     amplitude: Annotated[float, Field(ge=0.0, le=1e100)]
 
-    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """Uniform in [-amplitude, amplitude)."""
         drawn = generator.uniform(-self.amplitude, self.amplitude, X.shape)
         return np.where(leads[:, None], 0.0, drawn)
@@ -64,7 +63,7 @@ class Affine(Initial):
     gradient: Gradient
     shift: Shares = (0.0, 0.0)
 
-    def displacement(self, X: Floats, leads: Flags, generator: Generator) -> Floats:
+    def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """u_a = Σ_b gradient[a][b] X_b + shift_a."""
         (xx, xy), (yx, yy) = self.gradient
         x, y = X.T

@@ -21,7 +21,7 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
-from pbdkit.experiment.parts import brief, fault, located, open_part, report
+from pbdkit.experiment.parts import brief, fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
@@ -62,13 +62,6 @@ Name = Annotated[
     str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
 ]
 Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
-
-
-AnyLattice = Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
-AnyNeighbours = Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)]
-AnyRule = Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
-AnyFrame = Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)]
-AnyFracture = Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)]
 AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
 
 
@@ -87,12 +80,14 @@ class Experiment(Strict):
     version: Version = 1
     name: Name
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    lattice: AnyLattice
+    lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
     body: AnyBody
-    neighbours: AnyNeighbours = _default("coordination")
-    rule: AnyRule
-    frame: AnyFrame = _default("mean")
-    fracture: AnyFracture = _default("none")
+    neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
+        "coordination"
+    )
+    rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
+    frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default("mean")
+    fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
@@ -102,40 +97,31 @@ class Experiment(Strict):
 
     @model_validator(mode="after")
     def _together(self) -> Self:
-        if self.record.at is not None and self.record.at[-1] > self.steps:
-            raise fault(f"step {self.record.at[-1]} is beyond the run's {self.steps}", key="record")
-        if self.neighbours.nearness() and self.fracture.can_break:
-            raise fault(
-                "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
-                "set neighbours.reevaluate: false or fracture: {type: none}",
-                key="fracture",
-            )
-        if self.neighbours.nearness() and not self.solver.makes_steps:
-            raise fault(
-                "where neighbours are re-evaluated nothing tells where the steps lead; "
-                "set neighbours.reevaluate: false or solver: {type: stepping}",
-                key="solver",
-            )
-        if self.neighbours.nearness() and self.stepping.settle:
-            raise fault(
-                "where neighbours are re-evaluated no distance from equilibrium is known; "
-                "set neighbours.reevaluate: false, or leave solver.settle out",
-                key="solver",
-            )
+        last, settles = max(self.record.at or (0,)), self.stepping.settle is not None
+        anew, jumps = self.neighbours.nearness() is not None, not self.solver.makes_steps
         remembers = isinstance(self.rule, RenewsParticles)
-        if self.stepping.settle and (remembers or isinstance(self.fracture, Softens)):
-            part = self.rule if remembers else self.fracture
-            raise fault(
-                f"'{part.type}' remembers, so that no distance from equilibrium is known; leave "
-                "solver.settle out",
-                key="solver",
-            )
-        if remembers and not self.solver.makes_steps:
-            raise fault(
-                f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
-                "all of them; take solver: {type: stepping}",
-                key="solver",
-            )
+        softens = isinstance(self.fracture, Softens)
+        clashes = [
+            ("record", last > self.steps, f"step {last} is beyond the run's {self.steps}"),
+            ("fracture", anew and self.fracture.can_break,
+             "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
+             "set neighbours.reevaluate: false or fracture: {type: none}"),
+            ("solver", anew and jumps,
+             "where neighbours are re-evaluated nothing tells where the steps lead; "
+             "set neighbours.reevaluate: false or solver: {type: stepping}"),
+            ("solver", anew and settles,
+             "where neighbours are re-evaluated no distance from equilibrium is known; "
+             "set neighbours.reevaluate: false, or leave solver.settle out"),
+            ("solver", settles and (remembers or softens),
+             f"'{(self.rule if remembers else self.fracture).type}' remembers, so that no distance "
+             "from equilibrium is known; leave solver.settle out"),
+            ("solver", jumps and remembers,
+             f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
+             "all of them; take solver: {type: stepping}"),
+        ]  # fmt: skip
+        for key, clash, text in clashes:
+            if clash:
+                raise fault(text, key=key)
         return self
 
     @property
@@ -150,9 +136,13 @@ class Experiment(Strict):
         """How a step of it is made, whatever the solver."""
         return self.solver.stepping
 
+    def records(self, step: int) -> bool:
+        """Whether that step is recorded."""
+        return self.recording.keeps(step, self.steps)
+
     def next_wanted(self, step: int) -> int:
         """The next step after `step` of which something is recorded."""
-        if any(d.every_step for d in self.diagnostics):
+        if any(d.every_step and not d.at_end for d in self.diagnostics):
             return step + 1
         return self.recording.next_after(step, self.steps)
 
@@ -166,13 +156,9 @@ class Experiment(Strict):
     def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Types that several distributions offer keep the name of theirs."""
         found: dict[str, Any] = serialize(self)
-        for field in INTERFACES:
-            parts = getattr(self, field)
-            if field == "diagnostics":
-                for part, dumped in zip(parts, found[field], strict=True):
-                    dumped["type"] = self._registry.name_of(part)
-            else:
-                found[field]["type"] = self._registry.name_of(parts)
+        *single, many = (found[field] for field in INTERFACES)
+        for part, dumped in zip(self.components(), [*single, *many], strict=True):
+            dumped["type"] = self._registry.name_of(part)
         return found
 
     @classmethod
@@ -201,8 +187,8 @@ class Experiment(Strict):
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""
-        parts = [self.lattice, self.neighbours, self.rule, self.frame, self.fracture]
-        return [*parts, *self.diagnostics]
+        *single, many = (getattr(self, field) for field in INTERFACES)
+        return [*single, *many]
 
     def distributions(self) -> dict[str, str]:
         """The distributions that the parts come from, with their versions."""
@@ -210,7 +196,7 @@ class Experiment(Strict):
 
     def located(self, error: ExperimentError) -> ExperimentError:
         """The error with the place of its field in the file."""
-        return located(error, self._source)
+        return ExperimentError(self._source.message(error.where, str(error)), error.where)
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:

@@ -41,11 +41,6 @@ def report(error: ValidationError, source: Source) -> ExperimentError:
     return ExperimentError("\n".join(lines), _described(faults[0])[0])
 
 
-def located(error: ExperimentError, source: Source) -> ExperimentError:
-    """The same error with the place of its field in front."""
-    return ExperimentError(source.message(error.where, str(error)), error.where)
-
-
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     where, context = tuple(fault["loc"]), fault.get("ctx", {})
     if "text" in context:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_serializer, model_validator
@@ -40,19 +40,14 @@ class Record(Strict):
 
     def keeps(self, step: int, steps: int) -> bool:
         """Whether that step of a run of `steps` is recorded."""
-        if step in (0, steps):
-            return True
-        if self.at is None:
-            return step % self.every == 0
-        place = bisect_left(self.at, step)
-        return place < len(self.at) and self.at[place] == step
+        return step in (0, self.next_after(step - 1, steps))
 
     def next_after(self, step: int, steps: int) -> int:
         """The first recorded step after `step`, in a run of `steps`."""
         if self.at is None:
             return min(steps, (step // self.every + 1) * self.every)
         place = bisect_right(self.at, step)
-        return min(steps, self.at[place]) if place < len(self.at) else steps
+        return min([steps, *self.at[place : place + 1]])
 
     def count(self, steps: int) -> int:
         """How many steps of a run of `steps` are recorded."""

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.source import Source, read_file, read_text
 from pbdkit.interfaces.component import did_you_mean
 
+FOLDER = Path(__file__).parent.parent / "experiments"
 SUFFIX = ".yaml"
 
 
 def shipped_names() -> list[str]:
     """The names of all shipped experiments, sorted."""
-    return sorted(_found(_root(), ""))
+    found = (path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob(f"*{SUFFIX}"))
+    return sorted(name.removesuffix(SUFFIX) for name in found)
 
 
 def shipped_text(name: str) -> str:
     """The file of a shipped experiment."""
-    return _root().joinpath(*f"{name}{SUFFIX}".split("/")).read_text("utf-8")
+    return (FOLDER / f"{name}{SUFFIX}").read_text("utf-8")
 
 
 def read_experiment(name: str) -> Source:
@@ -39,17 +39,3 @@ def read_experiment(name: str) -> Source:
     near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
     hint = did_you_mean(name, [*near, *names])
     raise ExperimentError(f"{name}: {what}{hint} (`pbdkit experiments` lists them)")
-
-
-def _root() -> Traversable:
-    return files("pbdkit") / "experiments"
-
-
-def _found(folder: Traversable, prefix: str) -> list[str]:
-    names = []
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            names += _found(entry, f"{prefix}{entry.name}/")
-        elif entry.name.endswith(SUFFIX):
-            names.append(prefix + entry.name.removesuffix(SUFFIX))
-    return names

@@ -3,7 +3,6 @@ family."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, SerializeAsAny
@@ -23,18 +22,20 @@ class Settle(Strict):
 class Solver(Component):
     """What takes a scene from its start to its end."""
 
-    makes_steps: ClassVar[bool]
+    makes_steps: ClassVar[bool] = True
     """Whether every step is made, one after the other."""
 
     @property
-    @abstractmethod
     def stepping(self) -> Stepping:
-        """How a step is made, where one is: the rule's own unless the experiment says more."""
+        """How a step is made, where one is: the rule's own unless the experiment says more. Also of
+        an equilibrium: so steps are made until roles change for the last time."""
+        return Stepping()
 
     @property
-    @abstractmethod
     def sought(self) -> Equilibrium:
-        """How an equilibrium is looked for, where one is."""
+        """How an equilibrium is looked for, where one is: as by default, unless the experiment says
+        more."""
+        return Equilibrium()
 
 
 class Stepping(Solver):
@@ -46,7 +47,6 @@ class Stepping(Solver):
     `settle` the run ends where it has settled, after `steps` at the latest.
     """
 
-    makes_steps: ClassVar[bool] = True
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
@@ -59,11 +59,6 @@ class Stepping(Solver):
     def stepping(self) -> Stepping:
         """As the experiment says."""
         return self
-
-    @property
-    def sought(self) -> Equilibrium:
-        """As by default."""
-        return Equilibrium()
 
 
 class Equilibrium(Solver):
@@ -81,11 +76,6 @@ class Equilibrium(Solver):
     method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-8
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
-
-    @property
-    def stepping(self) -> Stepping:
-        """The rule's own: so steps are made until roles change for the last time."""
-        return Stepping()
 
     @property
     def sought(self) -> Equilibrium:

@@ -57,16 +57,16 @@ def read_file(path: Path) -> Source:
     """The experiment in a file; ExperimentError names what cannot be read, and where."""
     try:
         with path.open("rb") as file:
-            if file.read(4) in (b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05"):
-                raise ExperimentError(
-                    f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
-                    "pbdkit.rerun(pbdkit.open(...)) runs the same again"
-                )
-        if path.stat().st_size > MAX_BYTES:
-            raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
-        raw = path.read_bytes()
+            raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
+    if raw.startswith((b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05")):
+        raise ExperimentError(
+            f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
+            "pbdkit.rerun(pbdkit.open(...)) runs the same again"
+        )
+    if len(raw) > MAX_BYTES:
+        raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -87,11 +87,6 @@ def read_text(text: str, name: str) -> Source:
     return source
 
 
-def read_value(text: str, name: str) -> Any:
-    """One YAML value, as in ``--set PATH=VALUE``."""
-    return _read(text, Source(name))
-
-
 def _read(text: str, source: Source) -> Any:
     yaml = YAML(typ="safe", pure=True)
     try:
@@ -102,7 +97,10 @@ def _read(text: str, source: Source) -> Any:
         what = f"the character {error.character!r} is not allowed in YAML"
         raise ExperimentError(f"{source.name}:{place}: {what}") from None
     except YAMLError as error:
-        raise _syntax_error(error, source.name) from None
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        what = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ExperimentError(f"{source.name}{place}: not valid YAML: {what}") from None
 
 
 class _Reading:
@@ -187,13 +185,6 @@ class _Reading:
         raise ExperimentError(f"{self._place(event)}: {what}")
 
 
-def _syntax_error(error: YAMLError, name: str) -> ExperimentError:
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
-    what = getattr(error, "problem", None) or str(error).splitlines()[0]
-    return ExperimentError(f"{place}: not valid YAML: {what}")
-
-
 LONGEST = 80
 """So many characters of a setting are repeated in messages."""
 
@@ -208,19 +199,15 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
     path, equals, value = setting.partition("=")
     if not equals or not path:
         raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
-    where = _parsed(path)
-    changed = Source(source.name, copy.deepcopy(source.data), dict(source.places))
-    _place(changed.data, where, read_value(value, label), label, defaults)
-    for known in [k for k in changed.places if k[: len(where)] == where]:
-        del changed.places[known]
+    where = tuple(
+        int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in path.split(".")
+    )
+    places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
+    changed = Source(source.name, copy.deepcopy(source.data), places)
+    _place(changed.data, where, _read(value, Source(label)), label, defaults)
     for depth in range(1, len(where) + 1):
         changed.places.setdefault(where[:depth], label)
     return changed
-
-
-def _parsed(path: str) -> Where:
-    parts = path.split(".")
-    return tuple(int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in parts)
 
 
 def _place(data: Any, where: Where, value: Any, label: str, defaults: Mapping[str, Any]) -> None:

@@ -17,12 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.spectrum import Complex, largest_stable_relaxation
-from pbdkit.identity.elastic_constants import Elasticity, at_direction
+from pbdkit.identity.elastic_constants import Elasticity
 from pbdkit.identity.waves import Primitive, SlowWaves, operator
 
 Floats = NDArray[np.float64]
@@ -64,13 +65,18 @@ class LongWaves:
     `gradients` the lengths of the fourth order.
     """
 
-    waves: SlowWaves
     second: Floats
     diffusivity: Floats | None
     elasticity: Elasticity | None
     fast: Range
     slow: Range
     gradients: tuple[Gradient, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """By the names of ``pbdkit identify --json``."""
+        found = {"second_order": self.second, "diffusivity_tensor": self.diffusivity}
+        waves = {"fast": vars(self.fast), "slow": vars(self.slow)}
+        return found | waves | {"gradients": [vars(gradient) for gradient in self.gradients]}
 
 
 @dataclass(frozen=True)
@@ -84,25 +90,20 @@ class Spectrum:
     largest_stable_relaxation: float | None
 
 
-def long_rates(q: Floats, degrees: Floats) -> Complex:
-    """(direction, 2): d of the fast and of the slow long wave; complex where they turn."""
-    values: Complex = np.linalg.eigvals(at_direction(q, degrees)).astype(complex)
-    order = np.argsort(-values.real, axis=-1)
-    return np.take_along_axis(values, order, axis=-1)
-
-
 def ranges(q: Floats) -> tuple[Range, Range]:
-    """Of the diffusivities of the fast and of the slow wave."""
+    """Of the diffusivities of the fast and of the slow long wave; of the real parts where they
+    turn."""
 
     def least(wave: int, sign: float) -> tuple[float, float]:
         def value(at: Floats) -> Floats:
-            rates: Floats = long_rates(q, at[:, 0])[:, wave].real.astype(float)
-            return sign * rates
+            n = np.array([np.cos(np.radians(at[:, 0])), np.sin(np.radians(at[:, 0]))])
+            rates = np.linalg.eigvals(np.einsum("abcd,c...,d...->...ab", q, n, n)).real
+            return sign * np.sort(rates)[:, wave]
 
         at, found = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
         return sign * found, round(float(at[0]), 3) % 180.0
 
-    fast, slow = (Range(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
+    slow, fast = (Range(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
     return fast, slow
 
 
@@ -134,9 +135,9 @@ def fourth_order(waves: SlowWaves, normal: Floats) -> tuple[float, float]:
     back = np.linalg.inv(vectors)
     odd, even = back @ third @ vectors, back @ fourth @ vectors
     mixing = odd[0, 1] * odd[1, 0] / (d[0] - d[1])
-    lengths = [((even[0, 0] + mixing) / d[0]).real, ((even[1, 1] - mixing) / d[1]).real]
+    lengths = (even.diagonal() + np.array([mixing, -mixing])) / d
     fast = int(d[0].real < d[1].real)
-    return float(lengths[fast]), float(lengths[1 - fast])
+    return float(lengths[fast].real), float(lengths[1 - fast].real)
 
 
 def spectrum(stencil: Primitive, memory: float) -> Spectrum:
@@ -153,12 +154,8 @@ def spectrum(stencil: Primitive, memory: float) -> Spectrum:
     sampled = eigenvalues(_grid(low, high, WAVES)).ravel()
     ends = eigenvalues(np.array([at_smallest, at_largest])).ravel()
     known = np.concatenate([sampled, ends])
-    return Spectrum(
-        smallest,
-        float(np.abs(known.imag).max()),
-        -largest,
-        largest_stable_relaxation(known, memory),
-    )
+    imaginary, bound = float(np.abs(known.imag).max()), largest_stable_relaxation(known, memory)
+    return Spectrum(smallest, imaginary, -largest, bound)
 
 
 def minimum(

@@ -17,6 +17,7 @@ Harmonics of C by direction after Vannucci, Anisotropic Elasticity, chapter 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations, combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 PAIRS = ((0, 0), (1, 1), (0, 1))
+HUANG = tuple(combinations(PAIRS, 2))
+"""Axes of Γ that may be exchanged."""
+MOBILITIES = np.eye(3)[:, [[0, 2], [2, 1]]]
+"""What B is made of: xx, yy, xy."""
 DIFFUSION, ELASTICITY, NEITHER = "diffusion", "elasticity", "neither"
 SAME = 1e-8
 """Shares below this are nothing; what central differences give is good to 1e-9."""
@@ -74,10 +79,12 @@ class Elasticity:
         return float(sizes[0] / sizes[-1])
 
     @property
-    def zener(self) -> float:
-        """4 C66 / (C11 + C22 - 2 C12), in x and y: 1 for isotropic bodies."""
+    def zener(self) -> float | None:
+        """4 C66 / (C11 + C22 - 2 C12), in x and y: 1 for isotropic bodies; None where stretching
+        one way and shrinking the other costs nothing."""
         (c11, c12, _), (_, c22, _), (*_, c66) = self.stiffness
-        return float(4 * c66 / (c11 + c22 - 2 * c12))
+        stretching = c11 + c22 - 2 * c12
+        return float(4 * c66 / stretching) if stretching else None
 
     def youngs_modulus(self, degrees: float) -> float:
         """Of a bar in plane stress cut along that direction, in the units of `stiffness`; 0 where
@@ -95,18 +102,17 @@ class Elasticity:
         """Along and across a bar pulled along a direction, times det C; the first is 0 where
         it is nothing. From the minors of C, so that a body without stiffness against one strain has
         them too."""
-        compliance = _adjugate(self.stiffness)
-        along, across = _directions(degrees)
+        rows = self.stiffness
+        compliance = np.cross(rows[[1, 2, 0]], rows[[2, 0, 1]]).T
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        along, across = np.array([c * c, s * s, c * s]), np.array([s * s, c * c, -c * s])
         own, other = float(along @ compliance @ along), float(across @ compliance @ along)
         return own if abs(own) > SAME * np.abs(compliance).max() else 0.0, other
 
     def as_dict(self) -> dict[str, Any]:
         """The constants by name and what follows from them."""
-        constants = {
-            f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j])
-            for i in range(3)
-            for j in range(i, 3)
-        }
+        pairs = combinations_with_replacement(range(3), 2)
+        constants = {f"C{'126'[i]}{'126'[j]}": float(self.stiffness[i, j]) for i, j in pairs}
         return constants | {
             "poisson_ratio_xy": self.poisson_ratio(0.0),
             "poisson_ratio_yx": self.poisson_ratio(90.0),
@@ -124,13 +130,6 @@ def second_order(along_x: Floats, along_y: Floats, along_both: Floats) -> Floats
     return np.array([[along_x, mixed], [mixed, along_y]]).transpose(2, 3, 0, 1)
 
 
-def at_direction(q: Floats, degrees: Floats) -> Floats:
-    """(direction, axis, axis): Q_abcd n_c n_d."""
-    n = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
-    found: Floats = np.einsum("abcd,c...,d...->...ab", q, n, n)
-    return found
-
-
 def diffusion(q: Floats) -> Floats | None:
     """D_cd where Q_abcd = δ_ab D_cd, x and y each diffusing by itself and alike; else None."""
     mean = (q[0, 0] + q[1, 1]) / 2
@@ -140,11 +139,11 @@ def diffusion(q: Floats) -> Floats | None:
 
 def elasticity(q: Floats) -> Elasticity | str:
     """The elastic body, or why there is none."""
-    coupling, turning = _equations(q)
+    equations = np.array([_failures(_applied(unit, q)) for unit in MOBILITIES]).T
     scale = float(np.abs(q).max())
-    inverse = _inverse_mobility(np.concatenate([coupling, turning]), scale)
+    inverse = _inverse_mobility(equations, scale)
     if inverse is None:
-        with_energy = _inverse_mobility(coupling, scale)
+        with_energy = _inverse_mobility(equations[: len(PAIRS)], scale)
         return _no_energy(q) if with_energy is None else _no_rotation(_applied(with_energy, q))
     g = _applied(inverse, q)
     c66 = (g[0, 0, 1, 1] + g[1, 1, 0, 0]) / 2
@@ -154,48 +153,17 @@ def elasticity(q: Floats) -> Elasticity | str:
     return Elasticity(stiffness, np.linalg.inv(inverse).astype(float))
 
 
-def _directions(degrees: float) -> tuple[Floats, Floats]:
-    """Unit stress along a direction and across it, in Voigt's order."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([c * c, s * s, c * s]), np.array([s * s, c * c, -c * s])
-
-
 def _applied(inverse: Floats, q: Floats) -> Floats:
+    """Γ = B Q."""
     found: Floats = np.einsum("ae,ebcd->abcd", inverse, q)
     return found
 
 
-def _no_energy(q: Floats) -> str:
-    c, d = max(PAIRS, key=lambda p: abs(q[0, 1][p] - q[1, 0][p]))
-    wave = f"∂{'xy'[c]}∂{'xy'[d]}"
-    return (
-        f"the coupling is not symmetric: {wave} of y moves x by {q[0, 1, c, d]:.6g} and {wave} of "
-        f"x moves y by {q[1, 0, c, d]:.6g}, so that there is no energy"
-    )
-
-
-def _no_rotation(g: Floats) -> str:
-    (a, b), (c, d) = max(
-        [((0, 0), (1, 1)), ((0, 0), (0, 1)), ((1, 1), (0, 1))],
-        key=lambda p: abs(g[p[0]][p[1]] - g[p[1]][p[0]]),
-    )
-    one, other = ("xy"[a] + "xy"[b], "xy"[c] + "xy"[d])
-    return (
-        f"a rigid rotation costs energy: the second-order terms Q_{one}{other} = "
-        f"{g[a, b, c, d]:.6g} and Q_{other}{one} = {g[c, d, a, b]:.6g} would be one constant"
-    )
-
-
-def _equations(q: Floats) -> tuple[Floats, Floats]:
-    """Rows for (B_xx, B_yy, B_xy): symmetric coupling, and Huang's relations."""
-    xx, yy, xy = PAIRS
-    coupling = [[q[0, 1][p], -q[1, 0][p], q[1, 1][p] - q[0, 0][p]] for p in PAIRS]
-    turning = [
-        [q[0, 0][yy], -q[1, 1][xx], q[1, 0][yy] - q[0, 1][xx]],
-        [q[0, 0][xy] - q[0, 1][xx], 0.0, q[1, 0][xy] - q[1, 1][xx]],
-        [-q[0, 1][yy], q[1, 1][xy], q[0, 1][xy] - q[1, 1][yy]],
-    ]
-    return np.array(coupling), np.array(turning)
+def _failures(g: Floats) -> list[float]:
+    """By how much Γ is not symmetric in its first two axes, for each pair of the others, and by how
+    much Huang's relations fail."""
+    coupling = [g[0, 1][p] - g[1, 0][p] for p in PAIRS]
+    return coupling + [g[p][q] - g[q][p] for p, q in HUANG]
 
 
 def _inverse_mobility(equations: Floats, scale: float) -> Floats | None:
@@ -210,6 +178,19 @@ def _inverse_mobility(equations: Floats, scale: float) -> Floats | None:
     return scaled
 
 
-def _adjugate(m: Floats) -> Floats:
-    """det(m) · m⁻¹, which exists where m⁻¹ does not: rows of cross products."""
-    return np.array([np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])]).T
+def _no_energy(q: Floats) -> str:
+    c, d = PAIRS[np.abs(_failures(q)[: len(PAIRS)]).argmax()]
+    wave = f"∂{'xy'[c]}∂{'xy'[d]}"
+    return (
+        f"the coupling is not symmetric: {wave} of y moves x by {q[0, 1, c, d]:.6g} and {wave} of "
+        f"x moves y by {q[1, 0, c, d]:.6g}, so that there is no energy"
+    )
+
+
+def _no_rotation(g: Floats) -> str:
+    p, q = HUANG[np.abs(_failures(g)[len(PAIRS) :]).argmax()]
+    one, other = ("xy"[a] + "xy"[b] for a, b in (p, q))
+    return (
+        f"a rigid rotation costs energy: the second-order terms Q_{one}{other} = {g[p][q]:.6g} and "
+        f"Q_{other}{one} = {g[q][p]:.6g} would be one constant"
+    )

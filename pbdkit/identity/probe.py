@@ -3,6 +3,7 @@ same everywhere. Asked of the rule's own functions with single numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -17,7 +18,7 @@ from pbdkit.scene.scene import Scene, body_box
 Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]
 Differences = dict[Slot, Floats]
-ROUNDING = 1e-9
+ROUNDING, STILL = 1e-9, 1e-8
 SLANT = 0.3137
 """Of a free edge: no row of a lattice lies along it."""
 ANGLE = 1.0
@@ -30,38 +31,47 @@ STRAIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Probed:
-    """What a rule answers: `stencil` in the middle of the body; `move_at_rest`, its largest move
-    of a body at rest (lattice units), and `rests_at_edges`, whether there is none either with half
-    the neighbours missing; `smooth`, `linear` and `turns` anywhere in the body;
-    `place_dependence` in words, None where there is none."""
+    """What a rule answers: `stencil` in the middle of the body; `reasons`, in words, why no long
+    wave tells what it is; `linear` and `turns` anywhere in the body, `symmetric`, and
+    `rests_at_edges`, whether it leaves a body at rest alone with half the neighbours missing."""
 
     stencil: Stencil
-    move_at_rest: float
-    rests_at_edges: bool
-    smooth: bool
+    reasons: tuple[str, ...]
     linear: bool
     turns: bool
     symmetric: bool
-    place_dependence: str | None
+    rests_at_edges: bool
 
 
 def probed(scene: Scene, spacing: float) -> Probed:
     """The answers of the scene's rule, in the middle and, where it asks for the place, in the
     corners of the body."""
     stencils = {at: linearised(scene, at) for at in _places(scene)}
-    middle = next(iter(stencils.values()))
     half = tuple(_one_side(own) for own in scene.neighbourhood.slots)
     passes = [(one, at) for one in _passes(scene) for at in stencils]
     return Probed(
-        middle,
-        max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes),
-        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
-        all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes),
+        next(iter(stencils.values())),
+        tuple(_reasons(scene, passes, stencils, spacing)),
         all(_answers(one, at, AMPLITUDE * spacing, ROUNDING) for one, at in passes),
         all(_turns_with_the_body(one, at, spacing) for one, at in passes),
         all(_is_symmetric(of) for of in stencils.values()),
-        _place_dependence(scene, stencils),
+        all(_move_at_rest(one, at, half) <= ROUNDING * spacing for one, at in passes),
     )
+
+
+def _reasons(
+    scene: Scene, passes: list[tuple[Scene, Here]], stencils: dict[Here, Stencil], spacing: float
+) -> Iterator[str]:
+    """Why the rule is no diffusion and no elasticity, apart from what long waves see."""
+    moved = max(_move_at_rest(one, at, scene.neighbourhood.slots) for one, at in passes) / spacing
+    if not moved <= STILL:
+        yield f"a body at rest does not stay: the rule moves it by {moved:.6g} h a step"
+    if not all(_answers(one, at, SMALL * spacing, STRAIGHT) for one, at in passes):
+        yield (
+            "small displacements do not add up, however small: the rule is not differentiable at "
+            "rest, and no plane wave answers for another"
+        )
+    yield from _place_dependence(scene, stencils)
 
 
 def _passes(scene: Scene) -> list[Scene]:
@@ -93,9 +103,7 @@ def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
 def _answers(scene: Scene, at: Here, size: float, within: float) -> bool:
     """Whether the rule's move is Σ W d for random differences d of that size."""
     stencil = linearised(scene, at)
-    generator = np.random.default_rng(0)
-    for slots in scene.neighbourhood.slots:
-        d = {slot: size * generator.uniform(-1, 1, 2) for slot in slots}
+    for slots, d in _random(scene, size, seed=0):
         moved = _moved(scene, slots, d, at) - _moved(scene, slots, {}, at)
         expected = sum(stencil.neighbours[slot] @ d[slot] for slot in slots)
         if not np.abs(moved - expected).max() <= within * size:
@@ -105,69 +113,60 @@ def _answers(scene: Scene, at: Here, size: float, within: float) -> bool:
 
 def _turns_with_the_body(scene: Scene, at: Here, spacing: float) -> bool:
     """Whether a finite rotation of all neighbours about the particle rotates its move."""
-    generator = np.random.default_rng(1)
     c, s = np.cos(ANGLE), np.sin(ANGLE)
     turn = np.array([[c, -s], [s, c]])
-    for slots in scene.neighbourhood.slots:
-        d = {k: AMPLITUDE * spacing * generator.uniform(-1, 1, 2) for k in slots}
+    for slots, d in _random(scene, AMPLITUDE * spacing, seed=1):
         turned = {k: turn @ (np.array(k.rest) + d[k]) - np.array(k.rest) for k in slots}
-        expected = turn @ _moved(scene, slots, d, at)
-        found = _moved(scene, slots, turned, at)
-        if not np.abs(found - expected).max() < ROUNDING * spacing:
+        apart = _moved(scene, slots, turned, at) - turn @ _moved(scene, slots, d, at)
+        if not np.abs(apart).max() < ROUNDING * spacing:
             return False
     return True
+
+
+def _random(scene: Scene, size: float, seed: int) -> Iterator[tuple[Slots, Differences]]:
+    """The slots of each sublattice with differences of that size."""
+    generator = np.random.default_rng(seed)
+    for slots in scene.neighbourhood.slots:
+        yield slots, {slot: size * generator.uniform(-1, 1, 2) for slot in slots}
 
 
 def _is_symmetric(stencil: Stencil) -> bool:
     """Whether the matrix of j for k is the transpose of that of k for j."""
     by_key = {(s.source, s.target, s.cell): matrix for s, matrix in stencil.neighbours.items()}
-    scale = max(np.abs(matrix).max() for matrix in by_key.values())
-    apart = [
-        np.abs(matrix - by_key[t, s, (-m, -n)].T).max() for (s, t, (m, n)), matrix in by_key.items()
-    ]
-    own = np.abs(stencil.own - np.swapaxes(stencil.own, 1, 2)).max()
-    return bool(max(*apart, own) <= ROUNDING * scale)
+    apart = [matrix - by_key[t, s, (-m, -n)].T for (s, t, (m, n)), matrix in by_key.items()]
+    apart += [own - own.T for own in stencil.own]
+    return bool(np.abs(apart).max() <= ROUNDING * np.abs(list(by_key.values())).max())
 
 
-def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> str | None:
-    """How the rule differs between the body's middle and its corners; None where it does not."""
-    middle, *corners = [_matrices(of) for of in stencils.values()]
-    if not corners:
-        return None
-    differences = [corner - middle for corner in corners]
-    sizes = [float(np.abs(difference).max()) for difference in differences]
-    worst = int(np.argmax(sizes))
-    if sizes[worst] <= ROUNDING * np.abs(middle).max():
-        return None
-    corner = list(stencils)[1 + worst]
+def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[str]:
+    """How the rule differs between the body's middle and the corner where it differs most."""
+    places, slots = list(stencils), scene.neighbourhood.slots
+    weights = np.array([[*of.neighbours.values(), *of.own] for of in stencils.values()])
+    differences = weights - weights[0]
+    worst = int(np.abs(differences).max(axis=(1, 2, 3)).argmax())
+    if not np.abs(differences[worst]).max() > ROUNDING * np.abs(weights[0]).max():
+        return
+    corner = f"({places[worst].X.x:.6g}, {places[worst].X.y:.6g})"
     parameters = ", ".join(scene.experiment.rule.numeric_parameters())
     verdict = f"; no constant of a material does that: {parameters} is no Poisson ratio"
-    text = _worded(scene, differences[worst], f"({corner.X.x:.6g}, {corner.X.y:.6g})")
-    return text + (verdict if parameters else "")
-
-
-def _matrices(stencil: Stencil) -> Floats:
-    return np.array([*stencil.neighbours.values(), *stencil.own])
-
-
-def _worded(scene: Scene, difference: Floats, corner: str) -> str:
-    """The effect on a translation, where there is one."""
-    slots = scene.neighbourhood.slots
-    defect = difference[: len(slots[0])].sum(axis=0) + difference[-len(slots)]
+    text = f"it depends on the place: the weights at {corner} are not those in the middle"
+    # The effect on a translation, where there is one.
+    defect = differences[worst, : len(slots[0])].sum(axis=0) + differences[worst, -len(slots)]
     pushed = int(np.abs(defect).argmax())
-    if abs(defect.ravel()[pushed]) < ROUNDING:
-        return f"it depends on the place: the weights at {corner} are not those in the middle"
-    to, along = "xy"[pushed // 2], "xy"[pushed % 2]
-    return (
-        f"it depends on the place: when everything moves by 1 along {along}, the particle at "
-        f"{corner} of the body moves {defect.ravel()[pushed]:.6g} more along {to} a step than the "
-        "one in the middle"
-    )
+    if abs(defect.ravel()[pushed]) >= ROUNDING:
+        to, along = "xy"[pushed // 2], "xy"[pushed % 2]
+        text = (
+            f"it depends on the place: when everything moves by 1 along {along}, the particle at "
+            f"{corner} of the body moves {defect.ravel()[pushed]:.6g} more along {to} a step than "
+            "the one in the middle"
+        )
+    yield text + (verdict if parameters else "")
 
 
 def _moved(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:
     still = vector(np.zeros(scene.axes))
     with np.errstate(all="ignore"):
-        moved = move(scene, slots, lambda slot: vector(d[slot]) if slot in d else still,
-                     at._replace(u=still))  # fmt: skip
+        moved = move(
+            scene, slots, lambda k: vector(d[k]) if k in d else still, at._replace(u=still)
+        )
     return np.array(moved, float)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL
-from pbdkit.identity.dispersion import Gradient, Range
+from pbdkit.identity.dispersion import Range
 from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
 from pbdkit.scene.scene import Scene
 
@@ -38,13 +38,11 @@ def verdict(found: Identity) -> str:
 def table(found: Identity) -> Table:
     """A row a property; h is the spacing."""
     from rich import box
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    rows = Table(box=box.SIMPLE, show_header=False, pad_edge=False)
-    rows.add_column(no_wrap=True)
-    rows.add_column()
-    for name, value in (*_what(found), *_waves(found), *_character(found)):
-        rows.add_row(name, value)
+    rows = Table(Column(no_wrap=True), "", box=box.SIMPLE, show_header=False, pad_edge=False)
+    for row in (*_what(found), *_waves(found), *_character(found)):
+        rows.add_row(*row)
     return rows
 
 
@@ -70,9 +68,9 @@ def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
         yield "Poisson's ratio", f"{_number(ratio)} in plane stress{strain}"
         return
     along = [body.poisson_ratio(angle) for angle in (0.0, 90.0)]
-    texts = ["none" if r is None else _number(r) for r in along]
+    *texts, zener = ["none" if r is None else _number(r) for r in (*along, body.zener)]
     yield "Poisson's ratio", f"{texts[0]} pulled along x, {texts[1]} along y (plane stress)"
-    yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {_number(body.zener)}, isotropic 1"
+    yield "anisotropy", f"4 C66 / (C11 + C22 - 2 C12) = {zener}, isotropic 1"
     if body.axis is not None:
         yield "axis of symmetry", f"at {_number(body.axis)}°"
 
@@ -80,42 +78,32 @@ def _elastic(found: Identity, body: Elasticity) -> Iterator[Row]:
 def _waves(found: Identity) -> Iterator[Row]:
     if found.long is None:
         return
-    one = found.kind == DIFFUSION
-    for name, waves in (("fast", found.long.fast), ("slow", found.long.slow)):
-        if not one or (name == "fast" and not found.isotropic):
-            label = "diffusivity D" if one else f"{name} long waves"
-            yield label, _range_text(waves, one=one)
+    if found.kind != DIFFUSION:
+        yield "fast long waves", _range_text(found.long.fast, "h²/step diffusivity")
+        yield "slow long waves", _range_text(found.long.slow, "h²/step diffusivity")
+    elif not found.isotropic:
+        yield "diffusivity D", _range_text(found.long.fast, "h²/step")
     for gradient in found.long.gradients:
-        yield "gradient length²", _gradient_text(gradient)
+        fast, slow = (_number(length) for length in gradient.material)
+        alike = abs(gradient.material[0] - gradient.material[1]) < 1e-9
+        where = f"along {_number(gradient.direction)}°"
+        rows = f"across rows {_number(gradient.rows_apart)} h apart"
+        yield "gradient length²", f"{fast if alike else f'{fast} and {slow}'} h² {where}, {rows}"
 
 
-def _range_text(waves: Range, *, one: bool) -> str:
-    unit = "h²/step" if one else "h²/step diffusivity"
+def _range_text(waves: Range, unit: str) -> str:
+    largest = f"{_number(waves.largest)} {unit}"
     if waves.largest - waves.smallest < 1e-8 * abs(waves.largest):
-        return f"{_number(waves.largest)} {unit} in every direction"
-    return (
-        f"{_number(waves.largest)} {unit} along {_number(waves.at_largest)}°, "
-        f"{_number(waves.smallest)} along {_number(waves.at_smallest)}°"
-    )
-
-
-def _gradient_text(gradient: Gradient) -> str:
-    where = (
-        f"along {_number(gradient.direction)}°, across rows {_number(gradient.rows_apart)} h apart"
-    )
-    fast, slow = gradient.material
-    values = _number(fast) if abs(fast - slow) < 1e-9 else f"{_number(fast)} and {_number(slow)}"
-    return f"{values} h² {where}"
+        return f"{largest} in every direction"
+    smallest = f"{_number(waves.smallest)} along {_number(waves.at_smallest)}°"
+    return f"{largest} along {_number(waves.at_largest)}°, {smallest}"
 
 
 def _character(found: Identity) -> Iterator[Row]:
     spectrum, yes = found.spectrum, {True: "yes", False: "no"}
     turning = f", imaginary parts up to {_number(spectrum.imaginary)}"
-    yield (
-        "eigenvalues",
-        f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
-        + turning * (spectrum.imaginary > NEUTRAL),
-    )
+    ends = f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
+    yield "eigenvalues", ends + turning * (spectrum.imaginary > NEUTRAL)
     yield "relaxation", _relaxation_text(found)
     yield "linear", yes[found.linear]
     yield "symmetric", "yes, k weighs for j as j for k" if found.symmetric else "no"
@@ -137,61 +125,51 @@ def _number(value: float) -> str:
     return f"{round(value, 11) + 0.0:.6g}"
 
 
-def notes_on(found: Identity, scene: Scene) -> tuple[str, ...]:
+def notes_on(found: Identity, scene: Scene) -> Iterator[str]:
     """A line each."""
-    notes = []
     if not found.linear:
-        notes.append("the rule is not linear: this is what it is for small displacements from rest")
+        yield "the rule is not linear: this is what it is for small displacements from rest"
     if scene.experiment.rule.uses_reference:
-        notes.append("it asks for the place: the figures are those in the middle of the body")
+        yield "it asks for the place: the figures are those in the middle of the body"
     if scene.experiment.neighbours.nearness():
-        notes.append("neighbours are found anew: the figures hold while they are those at rest")
+        yield "neighbours are found anew: the figures hold while they are those at rest"
     if found.stencil.sites > 1:
-        notes.append(f"{found.stencil.sites} sites a cell: shifts of them are eliminated")
+        yield f"{found.stencil.sites} sites a cell: shifts of them are eliminated"
     if found.long is not None:
-        notes += _notes_of_long_waves(found, found.long)
+        yield from _notes_of_long_waves(found, found.long)
     bound = found.spectrum.largest_stable_relaxation
     if bound is None and found.spectrum.largest > 1 + NEUTRAL:
-        notes.append("some waves grow at any relaxation")
+        yield "some waves grow at any relaxation"
     elif bound is not None and found.relaxation > bound * (1 + NEUTRAL):
-        notes.append(f"relaxation {found.relaxation:g} diverges; it is stable below {bound:.6g}")
-    return tuple(notes)
+        yield f"relaxation {found.relaxation:g} diverges; it is stable below {bound:.6g}"
 
 
-def _notes_of_long_waves(found: Identity, long: LongWaves) -> list[str]:
-    notes = []
+def _notes_of_long_waves(found: Identity, long: LongWaves) -> Iterator[str]:
     if abs(long.slow.smallest) <= SAME * abs(long.fast.largest):
-        notes.append(f"some long waves along {long.slow.at_smallest:.4g}° do not decay at all")
+        yield f"some long waves along {long.slow.at_smallest:.4g}° do not decay at all"
     if found.kind == DIFFUSION and found.body:
-        notes.append("away from free edges it is plane-stress elasticity with Poisson's ratio -1")
+        yield "away from free edges it is plane-stress elasticity with Poisson's ratio -1"
     if found.kind == ELASTICITY and long.elasticity:
-        notes += _notes_of_body(long.elasticity)
+        yield from _notes_of_body(long.elasticity)
         if not found.rests_at_edges:
-            notes.append("away from free edges it is elastic; at them it pulls inwards")
-    return [*notes, *_notes_of_gradients(long)]
-
-
-def _notes_of_gradients(long: LongWaves) -> list[str]:
+            yield "away from free edges it is elastic; at them it pulls inwards"
+    lengths = [length for gradient in long.gradients for length in gradient.material]
     attracting = [f"{g.direction:.4g}°" for g in long.gradients if min(g.material) < -SAME]
     if attracting:
-        return [
+        yield (
             f"rows beyond the next attract along {', '.join(attracting)}: the wrong sign for "
             "gradient elasticity, and an effect that vanishes with the spacing"
-        ]
-    squares = [l2 for gradient in long.gradients for l2 in gradient.material]
-    if not squares or min(squares) <= SAME:
-        return []
-    low, high = float(np.sqrt(min(squares))), float(np.sqrt(max(squares)))
-    span = f"{low:.6g}" if high - low < SAME else f"{low:.6g} to {high:.6g}"
-    return [f"it is gradient elasticity, with a length of {span} h"]
+        )
+    elif min(lengths, default=0.0) > SAME:
+        low, high = np.sqrt(min(lengths)), np.sqrt(max(lengths))
+        span = f"{low:.6g}" if high - low < SAME else f"{low:.6g} to {high:.6g}"
+        yield f"it is gradient elasticity, with a length of {span} h"
 
 
-def _notes_of_body(body: Elasticity) -> list[str]:
-    notes = []
+def _notes_of_body(body: Elasticity) -> Iterator[str]:
     if body.least_stiffness < -SAME:
-        notes.append("some uniform strain lowers the energy: only held edges keep it in shape")
+        yield "some uniform strain lowers the energy: only held edges keep it in shape"
     elif body.least_stiffness < SAME:
-        notes.append("some uniform strain costs no energy")
+        yield "some uniform strain costs no energy"
     if np.abs(body.mobility - np.eye(2)).max() > SAME:
-        notes.append("x and y go to equilibrium at different rates; the equilibrium is elastic")
-    return notes
+        yield "x and y go to equilibrium at different rates; the equilibrium is elastic"

@@ -68,24 +68,17 @@ def primitive(cell: Cell, stencil: Stencil) -> Primitive:
     spacing = spacing_of(cell)
     at = np.array([site.at for site in cell.sites]) / spacing
     vectors = np.array(cell.vectors) / spacing
-    slots, names = list(stencil.neighbours), np.arange(len(at))
-    whole = Primitive(
-        spacing,
-        vectors,
-        stencil.own,
-        np.array([slot.source for slot in slots]),
-        np.array([slot.target for slot in slots]),
-        np.array([slot.rest for slot in slots]) / spacing,
-        np.array(list(stencil.neighbours.values())),
-    )
-    found = {s: _image(at, vectors, at[s] - at[0]) for s in names}
+    source, target = np.array([(slot.source, slot.target) for slot in stencil.neighbours]).T
+    rest = np.array([slot.rest for slot in stencil.neighbours]) / spacing
+    matrix = np.array(list(stencil.neighbours.values()))
+    whole = Primitive(spacing, vectors, stencil.own, source, target, rest, matrix)
+    found = {s: _image(at, vectors, place - at[0]) for s, place in enumerate(at)}
     images = {s: i for s, i in found.items() if i is not None and _same_under(whole, i)}
     basis = _shortest(vectors, np.array([at[s] - at[0] for s in images]))
     names, number = np.unique(np.min(list(images.values()), axis=0), return_inverse=True)
-    kept = np.isin(whole.source, names)
-    source, target = number[whole.source[kept]], number[whole.target[kept]]
-    own, rest, matrix = whole.own[names], whole.rest[kept], whole.matrix[kept]
-    return Primitive(spacing, basis, own, source, target, rest, matrix)
+    kept = np.isin(source, names)
+    source, target, own = number[source[kept]], number[target[kept]], stencil.own[names]
+    return Primitive(spacing, basis, own, source, target, rest[kept], matrix[kept])
 
 
 def _image(at: Floats, vectors: Floats, shift: Floats) -> NDArray[np.intp] | None:
@@ -107,14 +100,10 @@ def _same_under(whole: Primitive, image: NDArray[np.intp]) -> bool:
 
 def _shortest(vectors: Floats, shifts: Floats) -> Floats:
     """The shortest two independent translations among shifts + cells: a reduced basis."""
-    a, b = vectors
-    while True:  # Lagrange and Gauss, so that few cells around have to be looked at
-        if a @ a > b @ b:
-            a, b = b, a
-        turns = np.rint(a @ b / (a @ a))
-        if turns == 0:
-            break
-        b = b - turns * a
+    a, b = sorted(vectors, key=lambda v: v @ v)
+    # Lagrange and Gauss, so that few cells around have to be looked at.
+    while turns := np.rint(a @ b / (a @ a)):
+        a, b = sorted((a, b - turns * a), key=lambda v: v @ v)
     cells = np.array([m * a + n * b for m in range(-2, 3) for n in range(-2, 3)])
     within = shifts - np.rint(shifts @ np.linalg.inv(np.array([a, b]))) @ np.array([a, b])
     found = (cells[:, None] + within[None]).reshape(-1, 2)
@@ -122,17 +111,12 @@ def _shortest(vectors: Floats, shifts: Floats) -> Floats:
     upper = found[(found[:, 1] > NEAR) | ((np.abs(found[:, 1]) <= NEAR) & (found[:, 0] > NEAR))]
     lengths = np.round(np.linalg.norm(upper, axis=1), 6)
     upper = upper[np.lexsort((np.arctan2(upper[:, 1], upper[:, 0]), lengths))]
-    one = upper[0]
-    across = np.abs(upper[:, 0] * one[1] - upper[:, 1] * one[0])
-    return np.array([one, upper[across > NEAR][0]])
+    across = np.abs(upper[:, 0] * upper[0, 1] - upper[:, 1] * upper[0, 0])
+    return np.array([upper[0], upper[across > NEAR][0]])
 
 
 ZERO = 1e-8
 """What is smaller, as a share of the stencil's largest entry, is nothing."""
-
-
-class NoSlowWavesError(ValueError):
-    """The rule has no pair of slow waves; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -158,28 +142,27 @@ class SlowWaves:
         return a
 
 
-def slow_waves(stencil: Primitive) -> SlowWaves:
-    """The slow waves; NoSlowWavesError where a translation of the whole is not left alone, or
+def slow_waves(stencil: Primitive) -> SlowWaves | str:
+    """The slow waves, or why there are none: a translation of the whole is not left alone, or
     sites move by themselves."""
     rest = operator(stencil, np.zeros((1, 2)))[0].real
-    alike, scale = _all_alike(stencil.sites), _scale(stencil)
+    alike = _all_alike(stencil.sites)
+    scale = max(np.abs(stencil.matrix).max(), np.abs(stencil.own).max())
     defect = rest @ alike
     if np.abs(defect).max() > ZERO * scale:
         worst = np.unravel_index(np.abs(defect).argmax(), defect.shape)
-        raise NoSlowWavesError(
+        return (
             "a rigid translation is not left alone: when everything moves by 1 along "
             f"{'xy'[worst[1]]}, the rule moves a particle by {-defect[worst]:.6g} along "
             f"{'xy'[worst[0] % 2]} a step"
         )
     u, sizes, _ = np.linalg.svd(rest)
     left = u[:, -2:].T
-    if len(rest) > 2 and sizes[-3] < ZERO * scale:
-        raise NoSlowWavesError(
-            "the sublattices can move against each other at no rate at all: not one body"
-        )
+    if len(rest) > 2 and sizes[-3] <= ZERO * scale:
+        return "the sublattices can move against each other at no rate at all: not one body"
     shared = left @ alike
     if abs(np.linalg.det(shared)) < ZERO:
-        raise NoSlowWavesError("the sublattices keep moving once they are shifted, ever faster")
+        return "the sublattices keep moving once they are shifted, ever faster"
     left = np.linalg.inv(shared) @ left
     bordered = np.block([[rest, alike], [left, np.zeros((2, 2))]])
     return SlowWaves(stencil, left.astype(complex), np.linalg.inv(bordered).astype(complex))
@@ -187,35 +170,27 @@ def slow_waves(stencil: Primitive) -> SlowWaves:
 
 def operator(stencil: Primitive, k: Floats) -> Complex:
     """L(k) for waves k, (wave, axis): (wave, 2S, 2S); 1 - L(k) is what a step multiplies by."""
-    found = -_coupled(stencil, np.exp(1j * k @ stencil.rest.T))
-    for s, own in enumerate(stencil.own):
-        found[:, 2 * s : 2 * s + 2, 2 * s : 2 * s + 2] -= own
-    return found
+    return -_coupled(stencil, np.exp(1j * k @ stencil.rest.T), 1.0)
 
 
 def _moment(stencil: Primitive, direction: Floats, m: int) -> Complex:
     """The part of L of degree m in k: -(i^m / m!) Σ W (k·r)^m, and -own for m = 0."""
-    if m == 0:
-        still: Complex = operator(stencil, np.zeros((1, 2)))[0]
-        return still
     weight = -(1j**m) / math.factorial(m) * (stencil.rest @ direction) ** m
-    found: Complex = _coupled(stencil, weight[None])[0]
+    found: Complex = _coupled(stencil, weight[None], -float(m == 0))[0]
     return found
 
 
-def _coupled(stencil: Primitive, weight: Complex) -> Complex:
-    """Σ weight W over the entries, (wave, entry), between the sites that they couple."""
-    found = np.zeros((len(weight), 2 * stencil.sites, 2 * stencil.sites), complex)
+def _coupled(stencil: Primitive, weight: Complex, share: float) -> Complex:
+    """Σ weight W over the entries, (wave, entry), between the sites that they couple, and the share
+    of each site's own."""
+    sites = stencil.sites
+    found = np.zeros((len(weight), sites, 2, sites, 2), complex)
     for e, (s, t) in enumerate(zip(stencil.source, stencil.target, strict=True)):
-        found[:, 2 * s : 2 * s + 2, 2 * t : 2 * t + 2] += (
-            weight[:, e, None, None] * stencil.matrix[e]
-        )
-    return found
+        found[:, s, :, t] += weight[:, e, None, None] * stencil.matrix[e]
+    for s, own in enumerate(stencil.own):
+        found[:, s, :, s] += share * own
+    return found.reshape(len(weight), 2 * sites, 2 * sites)
 
 
 def _all_alike(sites: int) -> Floats:
     return np.tile(np.eye(2), (sites, 1))
-
-
-def _scale(stencil: Primitive) -> float:
-    return float(max(np.abs(stencil.matrix).max(), np.abs(stencil.own).max()))

@@ -31,6 +31,7 @@ class FrameMap:
     lag: int = 0
 
 
+@dataclass(frozen=True)
 class FrameSites(ABC):
     """The frame of a scene, as a policy sees it: the lattice's `cell`, the `site` index (i, j)
     of every frame point in the order of the numbers, (point, 2), the smallest and largest

@@ -19,6 +19,8 @@ Index = tuple[int, ...]
 
 
 PLANE_ORIGIN = Vector(0.0, 0.0)
+NEARLY = 1e-9
+"""What two ways to round may make of a length."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +109,12 @@ class Cell:
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
         """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""
-        spread = radius + max(math.hypot(*s.at) for s in self.sites) * 2
-        here = self.sites[source].at
-        steps = [site.at - here for site in self.sites]
-        found = []
-        for cell in self._cells_within(spread):
-            shift = self.shift(cell)
-            near = [t for t, step in enumerate(steps) if math.hypot(*(step + shift)) <= radius]
-            found += [self.offset(source, target, cell) for target in near]
-        others = [offset for offset in found if any(offset.site)]
+        sites = np.array([site.at for site in self.sites])
+        cells = np.array(list(self._cells_within(radius + 2 * np.linalg.norm(sites, axis=1).max())))
+        rests = (cells @ np.array(self.vectors))[:, None] + (sites - sites[source])
+        near = np.argwhere(np.linalg.norm(rests, axis=2) <= radius * (1 + NEARLY))
+        found = [self.offset(source, t, tuple(cells[n].tolist())) for n, t in near.tolist()]
+        others = [offset for offset in found if any(offset.site) and offset.length <= radius]
         return sorted(others, key=lambda o: (o.length, o.site))
 
     def _cells_within(self, radius: float) -> Iterator[Index]:

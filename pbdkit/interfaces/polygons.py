@@ -18,13 +18,15 @@ from pbdkit.interfaces.vector import Components
 @dataclass(frozen=True)
 class Polygon:
     """A cell: sites on one circle with no site inside it (Delaunay's; the square lattice's squares,
-    the hexagonal one's triangles). It is met once for each site of sublattice `source`.
+    the hexagonal one's triangles). It is met once for each site of sublattice `source`, as number
+    `kind` of those that are.
 
     `corners` are the offsets from that site to all corners, itself first, counter-clockwise. The
     first corner is the lowest, of those the leftmost.
     """
 
     source: int
+    kind: int
     corners: tuple[Offset, ...]
 
     @cached_property
@@ -65,27 +67,25 @@ class Side:
 class Tiling:
     """The cells of a lattice, and which of them lie beside the bonds.
 
-    `polygons[s]` are the cells whose first corner is a site of sublattice s. `beside[slot]` are the
-    cells to the left and to the right of a slot, for a diagonal one cell twice. It is empty unless
-    the neighbours of every site are the corners of the cells around it, triangles or
-    parallelograms: 8 on the square and the rectangular lattice, 6 on the hexagonal one.
+    `beside[slot]` are the cells to the left and to the right of a slot, for a diagonal one cell
+    twice. It is empty unless the neighbours of every site are the corners of the cells around it,
+    triangles or parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.
     """
 
-    polygons: tuple[tuple[Polygon, ...], ...] = ()
+    polygons: tuple[Polygon, ...] = ()
     beside: dict[Slot, tuple[Side, Side]] = field(default_factory=dict)
 
     @cached_property
     def rectangle(self) -> tuple[float, float] | None:
         """The sides of the cells beside the bonds, where all are one rectangle along the axes."""
-        sides = {polygon.rectangle for own in self.polygons for polygon in own}
+        sides = {polygon.rectangle for polygon in self.polygons}
         return sides.pop() if self.beside and len(sides) == 1 else None
 
     @cached_property
     def regular(self) -> int | None:
         """3 where the cells beside the bonds are equilateral triangles, 4 where they are squares,
         in whatever direction."""
-        every = [polygon for own in self.polygons for polygon in own]
-        kinds = {len(polygon.corners) if polygon.is_regular else None for polygon in every}
+        kinds = {len(cell.corners) if cell.is_regular else None for cell in self.polygons}
         return kinds.pop() if self.beside and len(kinds) == 1 else None
 
     def is_diagonal(self, slot: Slot) -> bool:

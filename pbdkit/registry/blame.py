@@ -6,11 +6,12 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import entry_points
+from pathlib import PureWindowsPath
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.component import AnswerError, did_you_mean
-from pbdkit.registry.discovery import GROUP
+from pbdkit.registry import GROUP
 
 LONGEST = 400
 
@@ -66,15 +67,11 @@ def worded(error: BaseException, package: str = "") -> str:
     if isinstance(error, AnswerError):
         return one_line(message)
     told = f"{type(error).__name__}: {message}" if message else type(error).__name__
-    places = [
-        (frame.f_code.co_filename, line)
-        for frame, line in traceback.walk_tb(error.__traceback__)
-        if package and str(frame.f_globals.get("__name__")).split(".")[0] == package
-    ]
     place = ""
-    if places:
-        file, line = places[-1]
-        place = f" ({file.replace(chr(92), '/').rsplit('/', 1)[-1]}, line {line})"
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if package and str(frame.f_globals.get("__name__")).split(".")[0] == package:
+            # which takes the separators of every system
+            place = f" ({PureWindowsPath(frame.f_code.co_filename).name}, line {line})"
     return one_line(told) + remedy(error) + place
 
 

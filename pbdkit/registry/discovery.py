@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, distribution, distributions
 from pathlib import PurePath
-from typing import TYPE_CHECKING
 
 import pluggy
 
-if TYPE_CHECKING:
-    from pbdkit.interfaces import Component
-
-BUILTIN = GROUP = "pbdkit"
-"""The distribution of the built-in components, and the entry-point group of plugins, which is the
-project name of their hook markers too."""
+from pbdkit.interfaces import Component
+from pbdkit.registry import BUILTIN, GROUP
+from pbdkit.registry.blame import worded
 
 API = 1
 """The version of the hook and the six interfaces. A plugin may declare the one that it was written
@@ -27,6 +23,8 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 DISABLE, ALL = "PBDKIT_DISABLE_PLUGINS", "*"
 """The variable that lists what is not to be loaded, distributions or entry points, and its value
 for: nothing at all."""
+SEVERITY = ("ok", "conflict", "broken")
+"""The states of what a plugin offers; its own is the worst of them."""
 
 
 class Hooks:
@@ -39,50 +37,105 @@ class Hooks:
 
 
 @dataclass(frozen=True)
-class Point:
-    """An entry point with the distribution that declares it; `fault` where it cannot be read."""
+class Offer:
+    """One thing on the list of a plugin: a `component` with its type as `name`, and the `reason`
+    where it is in conflict with others. Of a broken one the component is left out, and of
+    `interface` and `name` there is what is known."""
+
+    name: str
+    interface: type[Component] | None = None
+    component: type[Component] | None = None
+    reason: str = ""
+
+    @property
+    def state(self) -> str:
+        """ok, conflict or broken."""
+        usable = "conflict" if self.reason else "ok"
+        return usable if self.component else "broken"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An entry point with the distribution that declares it, and what it offers once it is loaded;
+    or in which state it is that nothing of it can be had, and why."""
 
     name: str
     distribution: str
     version: str
     entry: EntryPoint | None = None
-    fault: Exception | None = None
+    offers: tuple[Offer, ...] = ()
+    unusable: str = ""
+    why: str = ""
+
+    @property
+    def state(self) -> str:
+        """ok, disabled, broken (in whole or in part), incompatible or conflict."""
+        states = [offer.state for offer in self.offers]
+        return self.unusable or max(states, key=SEVERITY.index, default="ok")
+
+    @property
+    def reason(self) -> str:
+        """Why it is in that state; empty where it is ok."""
+        return self.why or "; ".join(dict.fromkeys(o.reason for o in self.offers if o.reason))
+
+    @property
+    def fault(self) -> str:
+        """``broken: why``, or another state in which it cannot be used; else empty."""
+        return "" if self.state in ("ok", "conflict") else f"{self.state}: {self.reason}"
+
+    @property
+    def components(self) -> tuple[type[Component], ...]:
+        """The classes that can be used."""
+        return tuple(o.component for o in self.offers if o.component)
 
     def answers_to(self, name: str) -> bool:
         """Whether the name is that of the distribution or of the entry point."""
         return canonical(name) in (canonical(self.distribution), canonical(self.name))
 
-    @property
-    def disabled(self) -> str:
-        """Why the user does not want it loaded; empty where that is not said."""
-        if ALL in (names := disabled_names()):
-            return f"no plugin is wanted (--no-plugins or {DISABLE}={ALL})"
-        return f"{DISABLE} names it" if any(map(self.answers_to, names)) else ""
+    def __str__(self) -> str:
+        return f"{self.distribution} {self.version}".strip()
 
 
-def installed_points() -> list[Point]:
-    """The entry points of all distributions but our own, sorted by the names of both.
+def installed_plugins() -> list[Plugin]:
+    """The entry points of all distributions but our own, sorted by the names of both, not loaded.
 
-    Metadata that cannot be read become a point with a fault. Of two distributions with one name
-    the first on Python's path counts, as for Python itself.
+    Metadata that cannot be read become a broken plugin, and what the user does not want loaded a
+    disabled one. Of two distributions with one name the first on Python's path counts, as for
+    Python itself.
     """
     names: set[str] = set()
-    points: list[Point] = []
-    for found in distributions():
+    found: list[Plugin] = []
+    for each in distributions():
         try:
-            if f"[{GROUP}]" in (found.read_text("entry_points.txt") or ""):
-                names.add(canonical(found.metadata["Name"] or ""))
+            if f"[{GROUP}]" in (each.read_text("entry_points.txt") or ""):
+                names.add(canonical(each.metadata["Name"] or ""))
         except Exception as error:
-            folder = PurePath(str(getattr(found, "_path", "(no name)"))).name
-            points.append(Point("", folder, "", fault=error))
+            folder = PurePath(str(getattr(each, "_path", "(no name)"))).name
+            found.append(_torn(folder, error))
     for name in sorted(names - {BUILTIN}):
         try:
             own = distribution(name)
             what = own.metadata["Name"], own.metadata["Version"] or ""
-            points += [Point(e.name, *what, e) for e in own.entry_points.select(group=GROUP)]
+            points = own.entry_points.select(group=GROUP)
+            found += [_wanted(Plugin(point.name, *what, point)) for point in points]
         except Exception as error:
-            points.append(Point("", name or "(no name)", "", fault=error))
-    return sorted(points, key=lambda point: (point.distribution, point.name))
+            found.append(_torn(name or "(no name)", error))
+    return sorted(found, key=lambda plugin: (plugin.distribution, plugin.name))
+
+
+def _torn(distribution: str, error: Exception) -> Plugin:
+    why = f"its metadata cannot be read: {worded(error)}"
+    return Plugin("", distribution, "", unusable="broken", why=why)
+
+
+def _wanted(plugin: Plugin) -> Plugin:
+    """The plugin, disabled where the user says so."""
+    why = ""
+    if ALL in (names := disabled_names()):
+        why = f"no plugin is wanted (--no-plugins or {DISABLE}={ALL})"
+    elif any(map(plugin.answers_to, names)):
+        why = f"{DISABLE} names it"
+    return replace(plugin, unusable="disabled", why=why) if why else plugin
 
 
 def disabled_names() -> list[str]:

@@ -7,7 +7,7 @@ import re
 import sys
 import warnings
 from contextlib import chdir, redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.metadata import EntryPoint, distribution, version
 from typing import Any
 
@@ -15,56 +15,14 @@ import pluggy
 from pydantic import ValidationError
 
 from pbdkit.interfaces import INTERFACES, Component
+from pbdkit.registry import BUILTIN, GROUP
 from pbdkit.registry.blame import interface_of, one_line, worded
-from pbdkit.registry.discovery import API, BUILTIN, GROUP, Hooks, Point
+from pbdkit.registry.discovery import API, Hooks, Offer, Plugin
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 REFUSALS = ("missing", "value_error", "assertion_error")
 """Kinds of pydantic's errors that are no fault of a default: a parameter is not given, or the
 component's own validator refuses it."""
-
-
-@dataclass(frozen=True)
-class Offer:
-    """One thing on the list of a plugin.
-
-    A component that can be used has the state ok or conflict. Of a broken one `interface` and
-    `name`, its type, are what is known.
-    """
-
-    name: str
-    interface: type[Component] | None = None
-    component: type[Component] | None = None
-    state: str = "ok"
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class Plugin:
-    """One entry point: the distribution it comes from, what it offers, and how it fared.
-
-    `state` is ok, disabled, broken (in whole or in part), incompatible or conflict.
-    """
-
-    name: str
-    distribution: str
-    version: str
-    state: str = "ok"
-    reason: str = ""
-    offers: tuple[Offer, ...] = ()
-
-    @property
-    def components(self) -> tuple[type[Component], ...]:
-        """The classes that can be used."""
-        return tuple(o.component for o in self.offers if o.component is not None)
-
-    @property
-    def fault(self) -> str:
-        """``broken: why``, or another state in which it cannot be used; else empty."""
-        return "" if self.state in ("ok", "conflict") else f"{self.state}: {self.reason}"
-
-    def __str__(self) -> str:
-        return f"{self.distribution} {self.version}".strip()
 
 
 class IncompatibleError(Exception):
@@ -76,38 +34,33 @@ def load_builtin() -> Plugin:
     not checked, for that is what the tests do."""
     own = distribution(BUILTIN)
     (entry,) = own.entry_points.select(group=GROUP)
-    return Plugin(entry.name, BUILTIN, own.version, offers=tuple(map(offer_of, _offered(entry))))
+    return Plugin(entry.name, BUILTIN, own.version, entry, tuple(map(offer_of, _offered(entry))))
 
 
-def load_plugin(point: Point) -> Plugin:
+def loaded(plugin: Plugin) -> Plugin:
     """Imports the plugin, unless it is disabled, and asks it for its components; a fault becomes
     its state and reason.
 
     One unusable class leaves the others of the plugin in use. What a plugin prints at import is no
     output of the program; its filters of warnings and its folder are its own.
     """
-    offers: tuple[Offer, ...] = ()
-    state, reason = "disabled", point.disabled
-    if point.fault:
-        state, reason = "broken", f"its metadata cannot be read: {worded(point.fault)}"
-    elif point.entry and not reason:
-        package = point.entry.value.split(":")[0].split(".")[0].strip()
-        try:
-            with chdir("."), redirect_stdout(sys.stderr), warnings.catch_warnings():
-                offers = tuple(_offer(c, package) for c in _offered(point.entry))
-            reason = "; ".join(dict.fromkeys(o.reason for o in offers if o.state != "ok"))
-            state = "broken" if reason else "ok"
-        except IncompatibleError as error:
-            state, reason = "incompatible", str(error)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"while {point.distribution} was loaded") from None
-        except BaseException as error:  # SystemExit at import is a plugin's fault too
-            state, reason = "broken", worded(error, package)
-    return Plugin(point.name, point.distribution, point.version, state, reason, offers)
+    if plugin.unusable or plugin.entry is None:
+        return plugin
+    package = plugin.entry.value.split(":")[0].split(".")[0].strip()
+    try:
+        with chdir("."), redirect_stdout(sys.stderr), warnings.catch_warnings():
+            offers = tuple(_offer(c, package) for c in _offered(plugin.entry))
+        return replace(plugin, offers=offers)
+    except IncompatibleError as error:
+        return replace(plugin, unusable="incompatible", why=str(error))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"while {plugin.distribution} was loaded") from None
+    except BaseException as error:  # SystemExit at import is a plugin's fault too
+        return replace(plugin, unusable="broken", why=worded(error, package))
 
 
 def offer_of(component: type[Component]) -> Offer:
-    """The offer of a class that has been checked."""
+    """The offer of a class that is known to be usable."""
     return Offer(component.type_name(), interface_of(component), component)
 
 
@@ -132,22 +85,22 @@ def _offered(entry: EntryPoint) -> list[Any]:
     answers = manager.hook.pbdkit_components()
     if not answers or not isinstance(answers[0], list):
         raise TypeError("its hook `pbdkit_components` must return a list of component classes")
-    return [c for n, c in enumerate(answers[0]) if not any(c is d for d in answers[0][:n])]
+    return list({id(component): component for component in answers[0]}.values())
 
 
 def _offer(component: Any, package: str) -> Offer:
     try:
-        check_component(component)
-        return offer_of(component)
+        return checked(component)
     except (Exception, SystemExit) as error:
         name, interface = "", None
         with suppress(Exception):
             interface, name = interface_of(component), str(component.type_name())
-        return Offer(name, interface, None, "broken", worded(error, package))
+        return Offer(name, interface, reason=worded(error, package))
 
 
-def check_component(component: Any) -> None:
-    """Raises TypeError, with what to mend, unless this is a usable component class."""
+def checked(component: Any) -> Offer:
+    """The offer of a component class; raises TypeError, with what to mend, where it is none that
+    can be used."""
     if isinstance(component, Component):
         name = type(component).__name__
         raise TypeError(f"an object of {name} is offered; offer the class {name} itself")
@@ -169,6 +122,7 @@ def check_component(component: Any) -> None:
         why = f"cannot be described in a JSON Schema: {worded(error)}"
         raise TypeError(f"the parameters of {own} {why}") from None
     _check_defaults(component)
+    return offer_of(component)
 
 
 def _check_functions(component: type[Component]) -> None:

@@ -9,23 +9,18 @@ from functools import cached_property
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.registry.blame import one_line
+from pbdkit.registry import BUILTIN
+from pbdkit.registry.blame import interface_of, one_line
 from pbdkit.registry.discovery import (
     ALL,
     DISABLE,
-    Point,
-    canonical,
-    disabled_names,
-    installed_points,
-)
-from pbdkit.registry.plugin import (
     Offer,
     Plugin,
-    check_component,
-    load_builtin,
-    load_plugin,
-    offer_of,
+    canonical,
+    disabled_names,
+    installed_plugins,
 )
+from pbdkit.registry.plugin import checked, load_builtin, loaded
 
 GIVEN = "components"
 """How classes that were handed over in Python appear among the plugins."""
@@ -41,12 +36,12 @@ class Registry:
     def __init__(self, components: Iterable[type[Component]] = ()) -> None:
         self._builtin = load_builtin()
         self._own = [self._builtin, _given(components, self._builtin)]
-        self._loaded: dict[Point, Plugin] = {}
+        self._loaded: dict[Plugin, Plugin] = {}
 
     @cached_property
     def installed(self) -> list[Plugin]:
         """The third-party plugins; the first look at them imports them."""
-        return self._judged(self._points)
+        return self._load(self._found)
 
     @property
     def plugins(self) -> list[Plugin]:
@@ -66,166 +61,139 @@ class Registry:
         else:
             plugins = self._own if _offers(self._own, interface, kind) else self.installed
         offers, told = _offers(plugins, interface, kind), one_line(kind)
-        classes = {p.distribution: o.component for p, o in offers if o.component is not None}
+        classes = {p.distribution: o.component for p, o in offers if o.component}
         if len(classes) > 1:
             choice = ", ".join(f"'{one}:{kind}'" for one in classes)
             raise ExperimentError(f"'{told}' is offered by several distributions: write {choice}")
-        for component in classes.values():
-            return component
+        if classes:
+            return classes.popitem()[1]
         if distribution:
             for plugin in [p for p, _ in offers] or plugins:
                 if plugin.fault:
                     raise PluginError(f"'{told}' is asked of {plugin}, which is {plugin.fault}")
-            offered = [o.name for p in plugins for o in p.offers if o.interface is interface]
-            hint = did_you_mean(kind, offered)
+            hint = did_you_mean(kind, [o.name for _, o in _offers(plugins, interface)])
             what = f"offers no {interface.__name__} '{told}'{hint}"
             raise ExperimentError(f"{one_line(distribution)} {what}")
         for plugin, offer in offers:
             raise PluginError(f"'{told}' comes from {plugin}, which is broken: {offer.reason}")
-        installed = sorted(self.components(interface))
+        installed = sorted(names[0] for names in self.spellings(interface).values())
         hint = f"{did_you_mean(kind, installed)} (installed: {', '.join(installed)})"
         others = "".join(f"; {p} is {p.fault}" for p in self.installed if p.fault)
         raise ExperimentError(f"unknown type '{told}'{hint}{others}")
 
-    def components(
-        self, interface: type[Component], *, installed: bool = True
-    ) -> dict[str, type[Component]]:
-        """Every usable component of an interface by the name that an experiment gives it; third
-        parties' too if `installed`."""
-        spellings = self.spellings(interface, installed=installed)
-        return {names[0]: component for component, names in spellings.items()}
-
     def spellings(
         self, interface: type[Component], *, installed: bool = True
     ) -> dict[type[Component], list[str]]:
-        """The same by class, with all names that an experiment may give it, the shortest first."""
+        """Every usable component of an interface, third parties' too if `installed`, with all names
+        that an experiment may give it, the shortest first."""
         found: dict[type[Component], list[str]] = {}
-        for plugin in self.plugins if installed else self._own:
-            for offer in plugin.offers:
-                if offer.component is not None and offer.interface is interface:
-                    names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
-                    full = f"{plugin.distribution}:{offer.name}"
-                    if plugin not in self._own and full not in names:
-                        names.append(full)
+        for plugin, offer in _offers(self.plugins if installed else self._own, interface):
+            if offer.component:
+                names = found.setdefault(offer.component, [self._name_in(plugin, offer)])
+                full = f"{plugin.distribution}:{offer.name}"
+                if plugin not in self._own and full not in names:
+                    names.append(full)
         return found
 
     def versions(self, used: Iterable[Component]) -> dict[str, str]:
         """The distributions that these components come from, with their versions; under GIVEN the
         types of those that come from none."""
         classes = {type(component) for component in used}
-        loaded = [self._builtin, *self._loaded.values()]
-        found = {p.distribution: p.version for p in loaded if classes & set(p.components)}
-        given = classes.difference(*(p.components for p in loaded))
+        known = [self._builtin, *self._loaded.values()]
+        found = {p.distribution: p.version for p in known if classes & set(p.components)}
+        given = classes.difference(*(p.components for p in known))
         types = ", ".join(sorted(c.type_name() for c in given))
         return found | ({GIVEN: types} if given else {})
 
     def name_of(self, component: Component) -> str:
         """The type by which an experiment finds this component again: with its distribution unless
         nobody else is known to offer the type."""
-        for plugin in [*self._own, *self._loaded.values()]:
-            for offer in plugin.offers:
-                if offer.component is type(component):
-                    return self._name_in(plugin, offer)
-        return component.type_name()
+        known = [(p, o) for p in [*self._own, *self._loaded.values()] for o in p.offers]
+        names = (self._name_in(p, o) for p, o in known if o.component is type(component))
+        return next(names, component.type_name())
 
     def doubts(self) -> list[str]:
         """What the user may have meant otherwise: names to be disabled that nothing has."""
-        known = {name for p in self._points for name in (p.distribution, p.name)}
+        known = {name for p in self._found for name in (p.distribution, p.name)}
         return [
             f"{DISABLE} names '{name}', which is not installed{did_you_mean(name, known)}"
             for name in disabled_names()
-            if name != ALL and not any(point.answers_to(name) for point in self._points)
+            if name != ALL and not any(plugin.answers_to(name) for plugin in self._found)
         ]
 
     @cached_property
-    def _points(self) -> list[Point]:
-        return installed_points()
+    def _found(self) -> list[Plugin]:
+        return installed_plugins()
+
+    def _load(self, plugins: list[Plugin]) -> list[Plugin]:
+        self._loaded |= {p: loaded(p) for p in plugins if p not in self._loaded}
+        return _judged([self._loaded[p] for p in plugins], self._builtin)
 
     def _of(self, distribution: str, name: str) -> list[Plugin]:
         """The plugins of a distribution."""
-        if canonical(distribution) == canonical(self._builtin.distribution):
+        if canonical(distribution) == BUILTIN:
             return [self._builtin]
-        known = {canonical(p.distribution): p.distribution for p in self._points}
-        if canonical(distribution) not in known:
-            hint = did_you_mean(distribution, known.values())
+        own = [p for p in self._found if canonical(p.distribution) == canonical(distribution)]
+        if not own:
+            hint = did_you_mean(distribution, [p.distribution for p in self._found])
             asked = f"'{one_line(name)}' is asked of {one_line(distribution)}"
             raise PluginError(f"{asked}, which is not installed{hint}")
-        own = known[canonical(distribution)]
-        return self._judged([p for p in self._points if p.distribution == own])
-
-    def _judged(self, points: list[Point]) -> list[Plugin]:
-        """The plugins, with their clashes: among each other and with built-in names."""
-        for point in points:
-            if point not in self._loaded:
-                self._loaded[point] = load_plugin(point)
-        plugins, found = [self._loaded[point] for point in points], []
-        for plugin in plugins:
-            offers = tuple(_judged(plugin, o, plugins, self._builtin) for o in plugin.offers)
-            changed = [new for new, old in zip(offers, plugin.offers, strict=True) if new != old]
-            if changed:
-                states = {plugin.state, *(offer.state for offer in changed)}
-                reasons = dict.fromkeys([plugin.reason, *(offer.reason for offer in changed)])
-                state = "broken" if "broken" in states else "conflict"
-                reason = "; ".join(filter(None, reasons))
-                plugin = replace(plugin, state=state, reason=reason, offers=offers)
-            found.append(plugin)
-        return found
+        return self._load(own)
 
     def _name_in(self, plugin: Plugin, offer: Offer) -> str:
         if plugin in self._own:
             return offer.name
-        alone = "installed" in self.__dict__ and not _offers(self._own, offer.interface, offer.name)
-        offers = _offers(self.installed, offer.interface, offer.name) if alone else []
-        if len({p.distribution for p, o in offers if o.component}) == 1:
-            return offer.name
+        if "installed" in self.__dict__:  # only then are all known
+            offers = _offers([*self._own, *self.installed], offer.interface, offer.name)
+            if {p.distribution for p, o in offers if o.component} == {plugin.distribution}:
+                return offer.name
         return f"{plugin.distribution}:{offer.name}"
 
 
 def _offers(
-    plugins: Iterable[Plugin], interface: type[Component] | None, name: str
+    plugins: Iterable[Plugin], interface: type[Component] | None, name: str | None = None
 ) -> list[tuple[Plugin, Offer]]:
-    """The offers of that interface and type, the broken ones too."""
-    return [
-        (plugin, offer)
-        for plugin in plugins
-        for offer in plugin.offers
-        if offer.interface is interface and offer.name == name
-    ]
+    """The offers of that interface, and of one type where it is given, the broken ones too."""
+    every = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
+    return [(plugin, o) for plugin, o in every if name in (None, o.name)]
 
 
-def _judged(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
-    if offer.component is None or offer.interface is None:
+def _judged(plugins: list[Plugin], builtin: Plugin) -> list[Plugin]:
+    """The plugins, with the reason at each offer that is in conflict with others."""
+    found = []
+    for plugin in plugins:
+        offers = tuple(_judged_offer(plugin, o, plugins, builtin) for o in plugin.offers)
+        found.append(replace(plugin, offers=offers))
+    return found
+
+
+def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: Plugin) -> Offer:
+    if offer.component is None:
         return offer
     name, chosen = offer.name, f"write '{plugin.distribution}:{offer.name}'"
-    twins = _offers(plugins, offer.interface, name)
-    if any(
-        p.distribution == plugin.distribution and o.component not in (None, offer.component)
-        for p, o in twins
-    ):
+    twins = [(p, o) for p, o in _offers(plugins, offer.interface, name) if o.component]
+    own = {o.component for p, o in twins if p.distribution == plugin.distribution}
+    if len(own) > 1:
         reason = f"it offers two classes with the type '{name}'; give one of them another"
-        return replace(offer, component=None, state="broken", reason=reason)
+        return replace(offer, component=None, reason=reason)
     if _offers([builtin], offer.interface, name):
-        what = f"'{name}' is the name of a built-in {offer.interface.__name__}"
+        what = f"'{name}' is the name of a built-in {interface_of(offer.component).__name__}"
         remedy = f"{chosen}, or give it another type" if plugin.distribution else "give it another"
-        return replace(offer, state="conflict", reason=f"{what}; {remedy}")
-    others = [str(p) for p, o in twins if o.component and p.distribution != plugin.distribution]
-    if not others:
-        return offer
-    reason = f"'{name}' is offered by {', '.join(others)} too; {chosen}"
-    return replace(offer, state="conflict", reason=reason)
+        return replace(offer, reason=f"{what}; {remedy}")
+    if others := [str(p) for p, _ in twins if p.distribution != plugin.distribution]:
+        reason = f"'{name}' is offered by {', '.join(others)} too; {chosen}"
+        return replace(offer, reason=reason)
+    return offer
 
 
 def _given(components: Iterable[type[Component]], builtin: Plugin) -> Plugin:
     """Classes from Python as a plugin; ExperimentError for what cannot be used."""
-    offers: dict[Offer, None] = {}  # each once, in their order
-    for component in components:
-        try:
-            check_component(component)
-        except TypeError as error:
-            raise ExperimentError(f"components: {error}") from None
-        offers[offer_of(component)] = None
-    given = Plugin(GIVEN, "", "", offers=tuple(offers))
-    for offer in offers:
-        if reason := _judged(given, offer, [given], builtin).reason:
-            raise ExperimentError(f"components: {reason}")
+    try:
+        offers = tuple(dict.fromkeys(map(checked, components)))  # each once, in their order
+    except TypeError as error:
+        raise ExperimentError(f"components: {error}") from None
+    (given,) = _judged([Plugin(GIVEN, "", "", offers=offers)], builtin)
+    for offer in given.offers:
+        if offer.reason:
+            raise ExperimentError(f"components: {offer.reason}")
     return given

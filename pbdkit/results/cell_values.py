@@ -9,7 +9,7 @@ found in the same way. Quadratic displacements of rectangular cells are exact, e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Vector
 from pbdkit.interfaces.diagnostic import CellValues
 from pbdkit.interfaces.polygons import area_share, corner_share, signed_area
-from pbdkit.results.tables import Tables, broken_along, read_only
+from pbdkit.results.tables import Tables, read_only
 from pbdkit.scene.cells import Patch
 from pbdkit.stepping.state import State
 
@@ -34,57 +34,50 @@ def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]
     shares; 0 where no cell is."""
     cells = list(cells)
     shape = u.shape[1:]
-    area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((4, *shape))
+    area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((2, 2, *shape))
     for patch, share in cells:
         rest = patch.polygon.rest
-        whole, slopes = _around(patch.differences(u), rest)
+        whole, slopes = _around([np.array(d) for d in patch.differences(u)], rest)
         centre = [sum(r[axis] for r in rest) / len(rest) for axis in (0, 1)]
         for corner, r in zip(patch.corners, rest, strict=True):
-            there = corner.slices()
-            area[there] += whole * share
-            for axis in (0, 1):
-                offset[(axis, *there)] += (centre[axis] - r[axis]) * whole * share
-            for n, slope in enumerate(slopes):
-                gradient[(n, *there)] += slope * share
+            corner.of(area)[...] += whole * share
+            for plane, middle, place in zip(offset, centre, r, strict=True):
+                corner.of(plane)[...] += (middle - place) * whole * share
+            for plane, slope in zip(gradient, slopes, strict=True):
+                corner.of(plane)[...] += slope * share
     some = np.where(area > 0.0, area, 1.0)
     gradient /= some
     offset /= some
-    return gradient - _beyond(gradient, offset, cells)
+    planes = gradient.reshape(4, *shape)
+    return planes - _beyond(planes, offset, cells)
 
 
 def _beyond(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
     """What a gradient changes from the particles to the centres, (4, ...)."""
     area, slope = np.zeros(gradient.shape[1:]), np.zeros((4, 2, *gradient.shape[1:]))
     for patch, share in cells:
-        first, at = offset[(slice(None), *patch.corners[0].slices())], []
-        for corner, r in zip(patch.corners, patch.polygon.rest, strict=True):
-            x, y = offset[(slice(None), *corner.slices())] - first
-            at.append(Vector(r.x + x, r.y + y))
-        values = [gradient[(slice(None), *corner.slices())] for corner in patch.corners]
-        between = [_around([Vector(*(v[n : n + 2] - values[0][n : n + 2])) for v in values], at)
-                   for n in (0, 2)]  # fmt: skip
-        whole = between[0][0]
-        usable = np.where(whole > FLAT * signed_area(patch.polygon.rest), share, 0.0)
+        rest, away = patch.polygon.rest, [corner.of(offset) for corner in patch.corners]
+        at = [r + Vector(*(own - away[0])) for r, own in zip(rest, away, strict=True)]
+        values = [corner.of(gradient) for corner in patch.corners]
+        whole, slopes = _around([value - values[0] for value in values], at)
+        usable = np.where(whole > FLAT * signed_area(rest), share, 0.0)
         for corner in patch.corners:
-            there = corner.slices()
-            area[there] += whole * usable
-            for n, (_, slopes) in enumerate(between):
-                for k, part in enumerate(slopes):
-                    slope[(2 * n + k // 2, k % 2, *there)] += part * usable
+            corner.of(area)[...] += whole * usable
+            for plane, part in zip(slope, slopes, strict=True):
+                corner.of(plane)[...] += part * usable
     slope /= np.where(area > 0.0, area, 1.0)
     beyond: Floats = slope[:, 0] * offset[0] + slope[:, 1] * offset[1]
     return beyond
 
 
-def _around(d: Any, r: Any) -> tuple[Any, list[Any]]:
-    """The area of a polygon with corners r, and area times the mean gradient of d: xx, xy, yx, yy
-    with the component first."""
-    slopes: list[Any] = [0.0, 0.0, 0.0, 0.0]
+def _around(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
+    """The area of a polygon with corners r, and area times the mean gradient of d, (component of d,
+    axis, ...)."""
+    slopes = np.zeros((len(d[0]), 2, *d[0].shape[1:]))
     for k, value in enumerate(d):
         ahead, behind = r[(k + 1) % len(r)], r[k - 1]
-        normal = (ahead.y - behind.y) / 2, (behind.x - ahead.x) / 2
-        for n in range(4):
-            slopes[n] = slopes[n] + value[n // 2] * normal[n % 2]
+        slopes[:, 0] += value * ((ahead.y - behind.y) / 2)
+        slopes[:, 1] += value * ((behind.x - ahead.x) / 2)
     return signed_area(r), slopes
 
 
@@ -165,5 +158,7 @@ class StateCells(CellValues):
         if self._state.broken_step is None:
             return intact
         for block, slot in patch.bonds(self._scene.neighbourhood.slots):
-            intact = intact & ~broken_along(self._scene, self._state, block, slot)
+            plane, at_this_end = self._scene.neighbourhood.home[slot]
+            home = block if at_this_end else block.seen_through(slot)
+            intact = intact & (home.within(self._state.broken_step[plane]) < 0)
         return intact

@@ -15,7 +15,7 @@ from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembered_values import describe_bonds
+from pbdkit.stepping.state import describe_bonds
 
 if TYPE_CHECKING:
     import xarray
@@ -60,9 +60,9 @@ class Explained:
                 "has no table of bonds: nothing could break in this run; run the experiment with "
                 "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
             )
-        self._dataset, self._scene, experiment = dataset, scene, scene.experiment
-        self.model: FractureModel = experiment.fracture
-        self._remembered = [number.name for number in bond_numbers(experiment)]
+        self._dataset, self._scene = dataset, scene
+        self.model: FractureModel = scene.experiment.fracture
+        self._remembered = [number.name for number in bond_numbers(scene.experiment)]
         self.bonds: Bonds = describe_bonds(scene)
         self.steps = self._of_bonds("broken_step", np.int32(-1))
         """(bond,): when each broke, -1 where it has not."""
@@ -84,10 +84,9 @@ class Explained:
     def limits(self) -> Floats:
         """(bond,): the strain above which each breaks, NaN where the model does not say."""
         limits, constants = np.full(len(self.bonds), np.nan), self._scene.constants
+        known = all(name in self._dataset for name in self._remembered)
         model = self.model
-        if not isinstance(model, BreaksAtStrain) or not model.can_break:
-            return limits
-        if any(name not in self._dataset for name in self._remembered):
+        if not (known and model.can_break and isinstance(model, BreaksAtStrain)):
             return limits
         own = [_last(self._dataset[name]).astype(float) for name in self._remembered]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
@@ -127,30 +126,27 @@ class Explained:
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
         times = self._dataset["time"].values
         time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
-        strains, at = self.strains(rows, time).tolist(), int(times[time])
+        strains = self.strains(rows, time).tolist()
         return [
-            self._standing(row, place.get(row), strain, at)
+            Standing(
+                bond=tuple(self.bonds.ends[row].tolist()),
+                shell=int(self.bonds.shell[row]),
+                rest_length=float(np.hypot(*self.bonds.rest[row])),
+                state=self._state(row),
+                step=int(self.steps[row]) if row in place else None,
+                order=place.get(row),
+                strain_at_break=_known(self.strains_at_break[row]),
+                breaks_above=None if self.spared[row] else _known(self.limits[row]),
+                strain=strain,
+                at_step=int(times[time]),
+            )
             for row, strain in zip(rows.tolist(), strains, strict=True)
         ]
 
-    def _standing(self, row: int, order: int | None, strain: float, at: int) -> Standing:
-        step, bonds = int(self.steps[row]), self.bonds
-        state = "broken" if step > 0 else "broken from the start" if step == 0 else "intact"
-        if step < 0 and self.spared[row]:
-            state = "cannot break"
-        a, b = bonds.ends[row].tolist()
-        return Standing(
-            bond=(a, b),
-            shell=int(bonds.shell[row]),
-            rest_length=float(np.hypot(*bonds.rest[row])),
-            state=state,
-            step=step if step >= 0 else None,
-            order=order,
-            strain_at_break=_known(self.strains_at_break[row]),
-            breaks_above=None if self.spared[row] else _known(self.limits[row]),
-            strain=strain,
-            at_step=at,
-        )
+    def _state(self, row: int) -> str:
+        if self.steps[row] < 0:
+            return "cannot break" if self.spared[row] else "intact"
+        return "broken" if self.steps[row] > 0 else "broken from the start"
 
     def nearest(self) -> Standing | None:
         """The bond that is nearest to breaking at the last recorded step, if that is known."""

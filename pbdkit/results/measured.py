@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,21 +39,18 @@ class Measured:
     @cached_property
     def shows_leaders(self) -> bool:
         """Whether anything is measured of each leader group."""
-        variables = (v for d in self._diagnostics for v in d.variables())
-        return any("leader_group" in variable.dims for variable in variables)
+        return any("leader_group" in v.dims for d in self._diagnostics for v in d.variables())
 
     @cached_property
     def sizes(self) -> dict[str, int]:
         """The lengths of the dimensions that are known before the first step."""
         scene = self._scene
         sizes = {"particle": scene.raster.count, "axis": scene.axes, "index": scene.axes}
-        if scene.shows_bonds:
+        if scene.experiment.shows_bonds:
             sizes |= {"bond": len(scene.bonds.ends), "end": 2}
         if self.shows_leaders:
             sizes["leader_group"] = len(scene.leading)
-        return sizes | {
-            n: len(values) for d in self._diagnostics for n, values in d.coordinates().items()
-        }
+        return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:
         """Theirs. Raises PluginError for names that are taken, and for dimensions that nobody gives
@@ -68,7 +64,7 @@ class Measured:
             own, whose = diagnostic.coordinates(), f"Diagnostic '{diagnostic.type}' declares"
             for name in (*own, *filter(None, [diagnostic.own_dimension])):
                 _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
-            columns += [layout.own_coordinate(n, v.dtype.str[1:]) for n, v in own.items()]
+            columns += [layout.coordinate(n, n, v.dtype.str[1:]) for n, v in own.items()]
             known = {*self.sizes, "time", "step", diagnostic.own_dimension}
             for variable in diagnostic.variables():
                 _refuse_taken(variable.name, taken, f"{whose} the variable '{variable.name}'")
@@ -80,24 +76,19 @@ class Measured:
                 columns.append(layout.diagnostic_column(variable, diagnostic))
         return columns
 
-    def coordinates(self) -> dict[str, Callable[[], Any]]:
+    @cached_property
+    def coordinates(self) -> dict[str, Any]:
         """Those of the diagnostics, by name."""
-        return {
-            name: partial(np.asarray, values)
-            for d in self._diagnostics
-            for name, values in d.coordinates().items()
-        }
+        return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
 
-    def at_start(self, now: Moment) -> Values:
-        """What is remembered and stays."""
-        return {c.name: now.remembered(c.name) for c in self._remembered if not c.grows}
-
-    def at_record(self, now: Moment) -> Values:
-        """What is remembered and changes. Raises FloatingPointError for what is not finite."""
-        values = {c.name: now.remembered(c.name) for c in self._remembered if c.grows}
-        for name, value in values.items():
-            if not np.isfinite(value).all():
-                raise FloatingPointError(f"{name} at step {now.step}")
+    def remembered(self, now: Moment, *, first: bool) -> Values:
+        """What is remembered and changes and, the `first` time, what stays. Raises
+        FloatingPointError for what changes and is not finite."""
+        wanted = [column for column in self._remembered if column.grows or first]
+        values = {column.name: now.remembered(column.name) for column in wanted}
+        for column in wanted:
+            if column.grows and not np.isfinite(values[column.name]).all():
+                raise FloatingPointError(f"{column.name} at step {now.step}")
         return values
 
     def diagnosed(self, when: When, now: Moment) -> Values:

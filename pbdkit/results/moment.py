@@ -10,21 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import LeaderRows, Moment, Pair, Slot, Stiffness, length
+from pbdkit.interfaces import LeaderRows, Moment, Pair, Stiffness, length
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.rule import material_of
-from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
-from pbdkit.results.tables import Tables, broken_along, read_only
+from pbdkit.results.tables import Tables, read_only
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import Selecting, kinds_at
 from pbdkit.scene.raster import FOLLOWER
-from pbdkit.stepping.evaluator import summed
-from pbdkit.stepping.remembered_values import describe_bonds
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.evaluator import Neighbour
+from pbdkit.stepping.state import Floats, State, describe_bonds
 
 
 class StateMoment(Moment):
@@ -34,7 +32,7 @@ class StateMoment(Moment):
         self.step = state.step
         self._no_later_than = state.step if no_later_than is None else no_later_than
         self._state, self._tables = state, tables
-        self._scene, self._raster = tables.scene, tables.raster
+        self._scene, self._raster = tables.scene, tables.scene.raster
 
     @property
     def body(self) -> NDArray[np.bool_]:
@@ -94,19 +92,18 @@ class StateMoment(Moment):
         self, function: Callable[[Any, Any], Any], *, intact_only: bool = False
     ) -> Floats:
         """The loop of the stepper, on the body's particles."""
-        state, sums = self._state, np.full(self._raster.shape, np.nan)
-        for block, slots, present in self._tables.blocks:
 
-            def contribution(slot: Slot, block: Any = block) -> tuple[Any, ...]:
-                there = vector(block.seen_through(slot).of(state.u))
-                value = function(there - vector(block.of(state.u)), slot.rest)
-                if not intact_only or state.broken_step is None:
-                    return (value,)
-                return (np.where(broken_along(self._scene, state, block, slot), 0.0, value),)
+        def contribution(d: Any, u: Any, to: Neighbour) -> tuple[Any, ...]:
+            value = function(d, to.r)
+            if to.broken is not None and intact_only:
+                value = np.where(to.broken, 0.0, value)
+            return (value,)
 
-            (total,) = summed(zip(map(contribution, slots), present, strict=True))
-            body = self._raster.kind[block.slices()] == FOLLOWER
-            sums[block.slices()] = np.where(body, total, np.nan)
+        sums = np.full(self._raster.shape, np.nan)
+        for around in self._tables.surroundings:
+            (total,) = around.sums(contribution, self._state.u, self._state)
+            body = around.where.of(self._raster.kind) == FOLLOWER
+            around.where.of(sums)[...] = np.where(body, total, np.nan)
         return read_only(self._raster.table(sums[None])[:, 0])
 
     def leader_groups(self) -> tuple[LeaderRows, ...]:
@@ -138,13 +135,11 @@ class StateMoment(Moment):
     def broken_strain(self) -> NDArray[np.float64]:
         """From the lengths, in float64 whatever the run's precision."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
-        strains = np.full(len(steps), np.nan)
-        if lengths is not None:
-            rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
-            broken = steps > 0
-            rest = rests[scene.bonds.plane[broken]]
-            strains[broken] = self._of_bonds(lengths)[broken] / rest - 1
-        return strains
+        if lengths is None:
+            return np.full(len(steps), np.nan)
+        rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
+        strains = self._of_bonds(lengths) / rests[scene.bonds.plane] - 1
+        return np.where(steps > 0, strains, np.nan)
 
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""

@@ -1,10 +1,13 @@
-"""A sink that streams the dataset into a netCDF-4 file, which appears whole or not at all."""
+"""A sink that streams the dataset into a netCDF-4 file, which appears whole or not at all, and one
+that lets the run go on meanwhile."""
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path
@@ -27,6 +30,10 @@ WHOLE = ("complete", "settled")
 """The status of results that may replace others."""
 PARTIAL = "-partial"
 """Added to the name of a result that may not, where its name is taken."""
+LARGE_BYTES = 2**20
+"""Below this, handing over costs as much as writing."""
+MOST_WAITING = 2
+"""So many large values may wait to be written; then the run waits for the disk."""
 
 
 class NetcdfSink(Sink):
@@ -81,7 +88,6 @@ class NetcdfSink(Sink):
             self._file.setncatts(attributes)
             self._file.close()
             _sync(self._temporary)
-        with self._storing():
             self._give_name(attributes["status"] in WHOLE)
         with suppress(OSError):  # the result is there; some file systems cannot sync a folder
             _sync(self._temporary.parent)
@@ -173,6 +179,44 @@ class NetcdfSink(Sink):
             if shutil.disk_usage(self._path.parent).free < FULL_BYTES:
                 return "the disk is full; free some space, or record fewer steps"
         return str(getattr(error, "strerror", None) or error)
+
+
+class OverlappingSink(Sink):
+    """Hands everything to another sink, from the first large value on in a second thread.
+
+    What goes wrong there is raised at the next call.
+    """
+
+    def __init__(self, inner: Sink) -> None:
+        self._inner = inner
+        self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
+        self._waiting: deque[Future[None]] = deque()
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """At once, so that what cannot be written is known before the first step."""
+        self._inner.begin(columns, sizes, planned)
+
+    def put(self, values: Values) -> None:
+        """Takes the values over: they must not be changed afterwards."""
+        if not self._waiting and sum(np.asarray(v).nbytes for v in values.values()) < LARGE_BYTES:
+            self._inner.put(values)
+            return
+        while len(self._waiting) >= MOST_WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._thread.submit(self._inner.put, values))
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """When all is written."""
+        while self._waiting:
+            self._waiting.popleft().result()
+        self._thread.shutdown()
+        self._inner.finish(attributes)
+
+    def abandon(self) -> None:
+        """What waits is not written."""
+        self._thread.shutdown(cancel_futures=True)
+        self._waiting.clear()
+        self._inner.abandon()
 
 
 def _sync(path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.results.snapshot import Array, Snapshot, label, plain, take_snapshots, variable_label
+from pbdkit.results.snapshot import Snapshot, label, plain, take_snapshots, variable_label
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 if TYPE_CHECKING:
@@ -149,10 +149,9 @@ def _paint(ax: Axes, dataset: xarray.Dataset, now: Snapshot, look: Look) -> None
     """One configuration in one pair of axes, without title and legend."""
     from matplotlib.collections import LineCollection
 
-    left, right, bottom, top = look.box
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    units = dataset["position"].attrs.get("units", "")
-    ax.set(xlabel=label("x", units), ylabel=label("y", units))
+    (left, right, bottom, top), units = look.box, dataset["position"].attrs.get("units", "")
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal",
+           xlabel=label("x", units), ylabel=label("y", units))  # fmt: skip
     inches = ax.bbox.transformed(ax.figure.dpi_scale_trans.inverted())
     apart = 72 * look.spacing * min(inches.width / (right - left), inches.height / (top - bottom))
     size = 1.3 * apart if look.crowded else min(0.4 * apart, 7.0)
@@ -191,27 +190,24 @@ def _explain(
 ) -> None:
     """The colour bar and the legend of the kinds, as far as they are used."""
     from matplotlib.cm import ScalarMappable
-
-    if color is not None:
-        colours = ScalarMappable(look.norm, CONTOUR_COLOURS if contours else DOT_COLOURS)
-        bar = axes[0].figure.colorbar(colours, ax=axes, aspect=25)
-        bar.set_label(variable_label(dataset, color))
-        bar.ax.ticklabel_format(axis="y", scilimits=(-3, 4))
-    if color is None or (contours and not look.crowded):
-        _legend(axes, np.unique(dataset["kind"].values))
-
-
-def _legend(axes: list[Axes], present: Array) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.transforms import ScaledTranslation
 
+    ax, whole = axes[0], axes[0].figure
+    if color is not None:
+        colours = ScalarMappable(look.norm, CONTOUR_COLOURS if contours else DOT_COLOURS)
+        bar = whole.colorbar(colours, ax=axes, aspect=25)
+        bar.set_label(variable_label(dataset, color))
+        bar.ax.ticklabel_format(axis="y", scilimits=(-3, 4))
+    if color is not None and (look.crowded or not contours):
+        return
+    present = np.unique(dataset["kind"].values)
     handles = [
         Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
         for kind, (name, colour) in reversed(KINDS.items())
         if kind in present
     ]
     style = {"handles": handles, "ncols": 3, "frameon": False, "handletextpad": 0.1}
-    ax, whole = axes[0], axes[0].figure
     if len(axes) > 1:
         whole.legend(loc="outside lower center", **style)
         return

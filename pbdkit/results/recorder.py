@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib import import_module
 from importlib.metadata import version
-from typing import Any
+from itertools import chain, compress
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +21,9 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
+
+if TYPE_CHECKING:
+    import xarray
 
 
 class Sink(ABC):
@@ -41,6 +46,45 @@ class Sink(ABC):
     @abstractmethod
     def abandon(self) -> None:
         """The run failed: what was put is not wanted."""
+
+
+class MemorySink(Sink):
+    """Grows every column in memory."""
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """Nothing is allocated before it comes."""
+        self._columns, self._sizes = columns, sizes
+        self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
+
+    def put(self, values: Values) -> None:
+        """Keeps what it is given."""
+        for name, value in values.items():
+            self._entries[name].append(value)
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Keeps the attributes."""
+        self._attributes = attributes
+
+    def abandon(self) -> None:
+        """Forgets everything."""
+        self._entries = {}
+
+    def dataset(self) -> xarray.Dataset:
+        """The dataset as in the file."""
+        import xarray
+
+        import_module("pbdkit.results.accessor")  # gives every dataset its `pbd`
+        variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
+        coordinates = [c.name for c in self._columns if c.coordinate]
+        return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
+
+    def _values(self, column: Column) -> Any:
+        entries = self._entries[column.name]
+        if column.grows:
+            shape = (len(entries), *(self._sizes[d] for d in column.dims[1:]))
+            return np.array(entries, column.dtype).reshape(shape)
+        dtype = None if column.dtype == "str" else column.dtype
+        return np.asarray(entries[0] if entries else [], dtype)
 
 
 @dataclass(frozen=True)
@@ -67,25 +111,22 @@ class Recorder:
         steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
         planned = {"time": recording.count(steps), "step": steps + 1}
         self._sink.begin(self._columns(), self._measured.sizes, planned)
-        for name, values in self._known().items():
-            self._sink.put({name: values()})
+        for values in self._known():
+            self._sink.put(values)
 
-    def _known(self) -> dict[str, Callable[[], Any]]:
+    def _known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
         raster, scene = self._scene.raster, self._scene
         numbers = np.arange(1, raster.count + 1)
-        known: dict[str, Callable[[], Any]] = {
-            "particle": lambda: numbers,
-            "number": lambda: numbers,
-            "axis": lambda: np.array(list("xyz"[: scene.axes])),
-            "site": raster.site_table,
-            "reference": raster.reference,
-        }
-        if scene.shows_bonds:
-            known |= {"bond": lambda: scene.bonds.ends, "shell": lambda: scene.bonds.shell}
+        yield {"particle": numbers, "number": numbers}
+        yield {"axis": np.array(list("xyz"[: scene.axes]))}
+        yield {"site": raster.site_table()}
+        yield {"reference": raster.reference()}
+        if scene.experiment.shows_bonds:
+            yield {"bond": scene.bonds.ends, "shell": scene.bonds.shell}
         if self._measured.shows_leaders:
-            known["leader_group"] = lambda: np.arange(len(scene.leading))
-        return known | self._measured.coordinates()
+            yield {"leader_group": np.arange(len(scene.leading))}
+        yield self._measured.coordinates
 
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False) -> None:
@@ -94,20 +135,15 @@ class Recorder:
         value has left the finite numbers; nothing of that step is kept."""
         moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
-        if (
-            state.step > self._last_recorded
-            if last
-            else experiment.recording.keeps(state.step, experiment.steps)
-        ):
+        late = last and state.step > self._last_recorded
+        if late or (not last and experiment.records(state.step)):
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
-            values |= self._measured.at_record(moment)
+            values |= self._measured.remembered(moment, first=self._last_recorded < 0)
             values |= self._measured.diagnosed(When.RECORD, moment)
-            if self._last_recorded < 0:
-                values |= self._measured.at_start(moment)
             self._last_recorded = state.step
         if self._measured.every_step and not last:
             values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
@@ -130,16 +166,15 @@ class Recorder:
         self._sink.finish(self._attributes(outcome, prediction))
 
     def _columns(self) -> list[Column]:
-        columns = layout.base_columns()
-        if self._scene.shows_bonds:
-            columns += layout.bond_columns()
-        if self._scene.has_fracture:
-            columns += layout.broken_columns()
-        if self._measured.every_step:
-            columns.append(layout.step_column())
-        if self._measured.shows_leaders:
-            columns.append(layout.leader_column())
-        columns += self._measured.columns()
+        scene, measured = self._scene, self._measured
+        wanted = (
+            scene.experiment.shows_bonds,
+            scene.has_fracture,
+            measured.every_step,
+            measured.shows_leaders,
+        )
+        some = chain(*compress(layout.optional_columns(), wanted))
+        columns = [*layout.base_columns(), *some, *measured.columns()]
         if self._scene.experiment.record.dtype == "float64":
             return columns
         return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

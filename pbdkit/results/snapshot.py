@@ -63,10 +63,8 @@ def take_snapshots(
 def _snapshot(now: xarray.Dataset, color: str | None, triangles: Array | None) -> Snapshot:
     step = int(now["time"])
     bonds = now["bond"].values if "bond" in now else np.empty((0, 2), np.intp)
-    gone = np.zeros(len(bonds), bool)
-    if "broken_step" in now:
-        broken_step = now["broken_step"].values
-        gone = (broken_step >= 0) & (broken_step <= step)
+    broken = now["broken_step"].values if "broken_step" in now else np.full(len(bonds), -1)
+    gone = (broken >= 0) & (broken <= step)
     values = None if color is None else _values(now[color])
     if triangles is not None and values is not None:
         whole = ~_have_side(triangles, bonds[gone]) & np.isfinite(values)[triangles].all(axis=1)
@@ -120,12 +118,9 @@ def _have_side(triangles: Array, pairs: Array) -> Array:
 
 def _check(color: str | None, dataset: xarray.Dataset) -> None:
     """What can be drawn has a number or a vector for each particle."""
-    shapes = ({"particle"}, {"particle", "axis"})
-    known = [
-        str(name)
-        for name, variable in dataset.drop_vars("kind").data_vars.items()
-        if set(variable.dims) - {"time"} in shapes and variable.dtype.kind in "biuf"
-    ]
+    shapes, variables = ({"particle"}, {"particle", "axis"}), dataset.drop_vars("kind").data_vars
+    known = [str(name) for name, v in variables.items()
+             if set(v.dims) - {"time"} in shapes and v.dtype.kind in "biuf"]  # fmt: skip
     names = f"what can be drawn: {', '.join(known)}"
     if color is None:
         raise ExperimentError(f"contours need a variable as color; {names}")

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from pbdkit.analysis.forecast import prediction, quick_warnings
-from pbdkit.equilibrium.watch import Watch
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
-from pbdkit.results.recorder import Outcome, Recorder, Sink
-from pbdkit.results.sinks import MemorySink
+from pbdkit.results.progress import Watch
+from pbdkit.results.recorder import MemorySink, Outcome, Recorder, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice
@@ -83,6 +85,22 @@ class Report:
     def ns_per_particle_step(self) -> float:
         """Wall time of stepping and recording together."""
         return self.wall_s * 1e9 / (self.particles * max(1, self.outcome.steps))
+
+
+def peak_memory() -> int:
+    """Bytes at most resident in this process; 0 where the system does not tell.
+
+    Linux counts what the process that started this one had resident into ru_maxrss, so the
+    figure of this program's own memory is taken where there is one.
+    """
+    status = Path("/proc/self/status")
+    if status.exists() and (found := re.search(r"VmHWM:\s*(\d+)", status.read_text())):
+        return int(found[1]) * 1024
+    try:
+        from resource import RUSAGE_SELF, getrusage
+    except ImportError:
+        return 0
+    return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def record(run: Run, sink: Sink) -> Report:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING
 
-from pbdkit.equilibrium.watch import StoppedError, Watch
+from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
@@ -76,21 +76,18 @@ class Stepwise(Driver):
     def _stepped(self) -> States:
         steps = self.scene.experiment.steps
         try:
-            yield self.state
-            self._heed()
+            yield from self._given_out()
             while not (outcome := self._settled()) and (step := self.state.step) < steps:
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
-                yield self.state
-                self._heed()
+                yield from self._given_out()
         except StoppedError:
             step = self.state.step
             stopped = Outcome("interrupted", f"stopped after step {step}", step)
             outcome = stopped if step < steps else None
         if self.kept < self.state.step:
             self.ending = True
-            yield self.state
-            self._heed()
+            yield from self._given_out()
         if outcome:
             return outcome
         unsettled = f", not settled: {self.settling.obstacle}" if self.settling else ""
@@ -99,26 +96,21 @@ class Stepwise(Driver):
     def _advance(self) -> None:
         """To the next step at which to look. Raises FloatingPointError."""
         experiment, state = self.scene.experiment, self.state
-        reached = min(
-            experiment.next_wanted(state.step), self.guard.next_look, state.step + self._patience
-        )
-        if self.settling:
-            reached = min(reached, self.settling.pace.next_look)
-        looks = reached == self.guard.next_look or self._records(reached)
+        stops = [experiment.next_wanted(state.step), self.guard.next_look]
+        stops += [self.settling.pace.next_look] if self.settling else []
+        reached = min(*stops, state.step + self._patience)
+        looks = reached == self.guard.next_look or experiment.records(reached)
         self.state = self._engine.advance(state, reached - state.step)
         if looks:
             self.guard.look(self.scene, self.state)
 
-    def _heed(self) -> None:
-        """Raises what whoever looked at the state has against it."""
+    def _given_out(self) -> Iterator[State]:
+        """The state. Raises what whoever looked at it has against it."""
+        yield self.state
         if self.rejection:
             raise self.rejection
-        if self._records(self.state.step):
+        if self.scene.experiment.records(self.state.step):
             self.kept = self.state.step
-
-    def _records(self, step: int) -> bool:
-        experiment = self.scene.experiment
-        return experiment.recording.keeps(step, experiment.steps)
 
     def _settled(self) -> Outcome | None:
         state = self.state

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import add
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,8 @@ from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.places import Block
+from pbdkit.scene.places import Block, Floats, Mask, hull
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
-
-Mask = NDArray[np.bool_]
 
 
 def crosses(start: Vector, end: Vector, crack: Segment) -> Mask:
@@ -26,15 +23,13 @@ def crosses(start: Vector, end: Vector, crack: Segment) -> Mask:
     particles parts the row from those on its right; a bond that a tip touches is crossed.
     """
     a, b = (Vector(*point) for point in crack)
-    sides = (_side(a, b, start) >= 0) != (_side(a, b, end) >= 0)
-    ends = _side(start, end, a) * _side(start, end, b) <= 0
-    found: Mask = sides & ends
-    return found
+    parted = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
+    return parted & (_side(start, end, a) * _side(start, end, b) <= 0)
 
 
-def _side(a: Vector, b: Vector, c: Vector) -> Any:
+def _side(a: Vector, b: Vector, c: Vector) -> Floats:
     """Twice the signed area of a, b, c: positive where c lies left of the line from a to b."""
-    return (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
+    return np.asarray((b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x))
 
 
 @dataclass(frozen=True)
@@ -54,20 +49,16 @@ def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
     forward = raster.body_block(plane.slot.source)
     landed = raster.body_block(plane.slot.target)
     backward = landed.seen_through(plane.opposite) if landed else None
-    blocks = [b for b in (forward, backward) if b]
-    if not blocks:
-        return None
-    start = tuple(map(min, zip(*(b.start for b in blocks), strict=True)))
-    stop = tuple(map(max, zip(*(b.stop for b in blocks), strict=True)))
-    return Block(plane.slot.source, start, stop)
+    corners = [(block.start, block.stop) for block in (forward, backward) if block]
+    return Block(plane.slot.source, *hull(corners)) if corners else None
 
 
-def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> NDArray[np.bool_]:
+def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) -> Mask:
     """Where in the block of a plane a bond starts: both ends are particles, at least one of the
     body, or both where bonds to the frame are left out."""
     here = raster.kind[block.slices()]
     there = raster.kind[block.seen_through(plane.slot).slices()]
-    found: NDArray[np.bool_] = (here == FOLLOWER) & (there == FOLLOWER)
+    found: Mask = (here == FOLLOWER) & (there == FOLLOWER)
     if frame_too:
         found = (here == FOLLOWER) & (there != EMPTY) | (here != EMPTY) & (there == FOLLOWER)
     return found
@@ -75,7 +66,7 @@ def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) ->
 
 def count_bonds(raster: Raster, neighbourhood: Neighbourhood) -> int:
     """The number of bonds with at least one end in the body."""
-    blocks = [(plane, plane_block(raster, plane)) for plane in neighbourhood.planes]
+    blocks = ((plane, plane_block(raster, plane)) for plane in neighbourhood.planes)
     return sum(int(bonds_in(raster, b, plane, True).sum()) for plane, b in blocks if b)
 
 
@@ -86,19 +77,20 @@ def build_bond_table(raster: Raster, neighbourhood: Neighbourhood) -> BondTable:
         for n, plane in enumerate(neighbourhood.planes)
         if (block := plane_block(raster, plane))
     ]
-    lower, upper, shell, number, place = (np.concatenate(p) for p in zip(*parts, strict=True))
-    order = np.lexsort((upper, lower))
-    ends = np.stack([lower, upper], axis=1)[order].astype(np.int64)
-    return BondTable(ends, shell[order].astype(np.int8), number[order], place[order])
+    ends, shell, number, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    return BondTable(ends[order], shell[order], number[order], place[order])
 
 
 def _bonds_of_plane(
     raster: Raster, number: int, plane: BondPlane, block: Block
-) -> tuple[Indices, Indices, Indices, Indices, Indices]:
+) -> tuple[Indices, NDArray[np.int8], Indices, Indices]:
+    """(rows of both ends, shell, number of the plane, place in it) of its bonds."""
     found = np.nonzero(bonds_in(raster, block, plane, frame_too=True))
     cells, slot = list(map(add, found, block.start)), plane.slot
-    a = raster.rows_at(np.full(len(found[0]), slot.source), *cells)
-    b = raster.rows_at(np.full(len(found[0]), slot.target), *map(add, cells, slot.cell))
+    a = raster.rows_at(slot.source, *cells)
+    b = raster.rows_at(slot.target, *map(add, cells, slot.cell))
     within = np.ravel_multi_index(tuple(cells), raster.shape[1:])
-    shell = np.full(len(a), plane.slot.shell)
-    return np.minimum(a, b), np.maximum(a, b), shell, np.full(len(a), number), within
+    shell, of_plane = np.full(len(a), slot.shell, np.int8), np.full(len(a), number)
+    ends = np.stack([np.minimum(a, b), np.maximum(a, b)], axis=1)
+    return ends, shell, of_plane, within

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import permutations
+from operator import sub
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,11 @@ from pbdkit.interfaces import Cell, Components, Offset, Slot, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Side, Tiling
-from pbdkit.scene.places import Block, Where
+from pbdkit.scene.places import Block, Floats, Mask, Where
 from pbdkit.scene.raster import FOLLOWER, Raster
 
-Floats = NDArray[np.float64]
 Slots = tuple[tuple[Slot, ...], ...]
-Step = tuple[int, Index]
+Step = tuple[int, int, Index]
 Share = NDArray[np.floating[Any]] | float
 CELLS_AT_ONCE = 65536
 """So many are looked at together, so that temporaries stay small."""
@@ -32,20 +33,18 @@ def tiling_of(cell: Cell, slots: Slots) -> Tiling:
     in the plane."""
     if len(cell.vectors) != 2:
         return Tiling()
-    polygons = tuple(_polygons(cell, s, slots[s]) for s in range(len(cell.sites)))
+    polygons = tuple(found for s, own in enumerate(slots) for found in _polygons(cell, s, own))
     return Tiling(polygons, _beside(polygons, slots))
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The cells of one shape on a rectangle of the raster: polygon number `kind` of its sublattice,
-    `corners[k]` the block of their k-th corners; `whole` tells of which all corners are particles
-    of the body."""
+    """The cells of one shape on a rectangle of the raster: `corners[k]` is the block of their k-th
+    corners, `whole` tells of which all corners are particles of the body."""
 
     polygon: Polygon
-    kind: int
     corners: tuple[Block, ...]
-    whole: NDArray[np.bool_]
+    whole: Mask
 
     def differences(self, u: NDArray[Any]) -> tuple[Vector, ...]:
         """u_k - u_0 of the corners, from planes u, (axis, sublattice, cell, cell)."""
@@ -57,27 +56,26 @@ class Patch:
         corners, found = self.polygon.corners, []
         for k, a in enumerate(corners):
             ahead = {_step(a, b) for b in corners[k + 1 :]}
-            own = [slot for slot in slots[a.target] if (slot.target, slot.cell) in ahead]
+            own = [s for s in slots[a.target] if (s.source, s.target, s.cell) in ahead]
             found += [(self.corners[k], slot) for slot in own]
         return found
 
     def rows(self, raster: Raster, place: int) -> Indices:
         """The rows of the corners of the cell at a flat place of the patch."""
-        m, n = np.unravel_index(place, self.whole.shape)
         s = np.array([block.sublattice for block in self.corners])
         start = np.array([block.start for block in self.corners])
-        return raster.rows_at(s, start[:, 0] + m, start[:, 1] + n)
+        return raster.rows_at(s, *np.add(start, np.unravel_index(place, self.whole.shape)).T)
 
 
 def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
     """The places with cells whose corners are all of the body, some at a time."""
     found = []
-    for kind, polygon in ((k, p) for own in tiling.polygons for k, p in enumerate(own)):
+    for polygon in tiling.polygons:
         block = _within(raster, polygon)
         for part in block.rows(CELLS_AT_ONCE) if block else ():
             corners = tuple(part.seen_through(corner) for corner in polygon.corners)
             inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
-            patch = Patch(polygon, kind, corners, np.logical_and.reduce(inside))
+            patch = Patch(polygon, corners, np.logical_and.reduce(inside))
             found += [patch] if patch.whole.any() else []
     return tuple(found)
 
@@ -92,7 +90,7 @@ class WeighedCells:
 
     def of(self, patch: Patch) -> Floats:
         """The shares of the cells of a patch."""
-        return patch.corners[0].of(self.share[patch.kind])
+        return patch.corners[0].of(self.share[patch.polygon.kind])
 
     def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
         """The shares to the left and the right of a slot; 1 where all are whole."""
@@ -114,16 +112,14 @@ def _within(raster: Raster, polygon: Polygon) -> Block | None:
     block = raster.body_block(polygon.source)
     if not block:
         return None
-    bounds = []
-    for axis in (0, 1):
-        steps = [corner.cell[axis] for corner in polygon.corners]
-        begin = max(block.start[axis], -min(steps))
-        bounds.append((begin, min(block.stop[axis], raster.shape[1 + axis] - max(steps))))
-    (i, k), (j, n) = bounds
-    return Block(polygon.source, (i, j), (k, n)) if i < k and j < n else None
+    steps = np.array([corner.cell for corner in polygon.corners])
+    start = np.maximum(block.start, -steps.min(axis=0))
+    stop = np.minimum(block.stop, raster.shape[1:] - steps.max(axis=0))
+    there = Block(polygon.source, tuple(start.tolist()), tuple(stop.tolist()))
+    return there if (start < stop).all() else None
 
 
-def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon, ...]:
+def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[Polygon]:
     """Those whose first corner is of sublattice `source`, counter-clockwise; corners that are
     neighbours lie where the slots say, to the last bit."""
     exact = {(slot.target, slot.cell): slot.rest for slot in slots}
@@ -134,8 +130,9 @@ def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> tuple[Polygon
         others = tuple(around[k] for k in places)
         # It is met from each of its corners: kept is the first.
         if all(_is_ahead(offset.rest) for offset in others):
-            found.append(Polygon(source, (cell.offset(source, source, (0, 0)), *others)))
-    return tuple(sorted(found, key=lambda polygon: math.atan2(*polygon.rest[1][::-1])))
+            found.append((cell.offset(source, source, (0, 0)), *others))
+    found.sort(key=lambda corners: math.atan2(*corners[1].rest[::-1]))
+    return (Polygon(source, kind, corners) for kind, corners in enumerate(found))
 
 
 def _is_ahead(r: Components) -> bool:
@@ -143,34 +140,27 @@ def _is_ahead(r: Components) -> bool:
     return bool(r.x > 0.0 if level else r.y > 0.0)
 
 
-def _beside(
-    polygons: tuple[tuple[Polygon, ...], ...], slots: Slots
-) -> dict[Slot, tuple[Side, Side]]:
+def _beside(polygons: tuple[Polygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
     """The cells beside every slot, where the neighbours are the corners of simple cells."""
-    every = [(kind, polygon) for own in polygons for kind, polygon in enumerate(own)]
-    found: dict[Slot, tuple[Side, Side]] = {}
-    for s, own in enumerate(slots):
-        slot_of = {(slot.target, slot.cell): slot for slot in own}
-        left: dict[Step, Side] = {}
-        right: dict[Step, Side] = {}
-        for kind, polygon in every:
-            n = len(polygon.corners)
-            for start in (k for k in range(n) if polygon.corners[k].target == s):
-                keys = [_step(polygon.corners[start], corner) for corner in polygon.corners]
-                for ahead in range(1, n):
-                    end = (start + ahead) % n
-                    side = Side(kind, slot_of.get(keys[0]), start, end)
-                    left |= {keys[end]: side} if ahead < n - 1 else {}
-                    right |= {keys[end]: side} if ahead > 1 else {}
-        if not left.keys() == right.keys() == slot_of.keys():
-            return {}
-        found |= {slot: (left[key], right[key]) for key, slot in slot_of.items()}
-    return found if all(_is_simple(polygon) for _, polygon in every) else {}
+    slot_of = {(slot.source, slot.target, slot.cell): slot for own in slots for slot in own}
+    left: dict[Step, Side] = {}
+    right: dict[Step, Side] = {}
+    for polygon in polygons:
+        corners = polygon.corners
+        for start, end in permutations(range(len(corners)), 2):
+            side = Side(polygon.kind, slot_of.get(_step(corners[start], corners[0])), start, end)
+            step, ahead = _step(corners[start], corners[end]), (end - start) % len(corners)
+            left |= {step: side} if ahead < len(corners) - 1 else {}
+            right |= {step: side} if ahead > 1 else {}
+    fits = left.keys() == right.keys() == slot_of.keys()
+    if not (fits and all(map(_is_simple, polygons))):
+        return {}
+    return {slot: (left[step], right[step]) for step, slot in slot_of.items()}
 
 
 def _step(here: Offset, there: Offset) -> Step:
-    """(sublattice, repeat cells) from one corner of a polygon to another."""
-    return there.target, (there.cell[0] - here.cell[0], there.cell[1] - here.cell[1])
+    """(sublattice, sublattice, repeat cells) from one corner of a polygon to another."""
+    return here.target, there.target, tuple(map(sub, there.cell, here.cell))
 
 
 def _is_simple(polygon: Polygon) -> bool:

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
-from pbdkit.scene.cells import WeighedCells
-from pbdkit.scene.raster import Raster, cells_of_sites, positions
-from pbdkit.scene.sites import Mask, rounding_of, window
-
-Floats = NDArray[np.float64]
+from pbdkit.scene.places import Floats
+from pbdkit.scene.sites import Filling, rounding_of, sites_from, sublattices_from, trimmed, window
 
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
@@ -33,25 +27,6 @@ SMALLEST = 0.02
 as little else does, and say little about it."""
 
 
-@dataclass(frozen=True)
-class Filling:
-    """The sites of the body on a window whose first site index is `first`, (i, j), and the shares
-    of the cells by the site of their first corner, (kind, i, j)."""
-
-    body: Mask
-    first: Index
-    share: Floats
-
-    def on(self, raster: Raster, tiling: Tiling) -> WeighedCells:
-        """The shares by place of a raster."""
-        out = np.zeros((len(self.share), *raster.shape))
-        rows = raster.body_rows
-        i, j = raster.site_of(rows).T
-        for kind, share in enumerate(self.share):
-            out[kind].ravel()[raster.place_of(rows)] = share[i - self.first[0], j - self.first[1]]
-        return WeighedCells(tiling, out)
-
-
 def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     """The cells with a share inside the outline, and as body all their corners.
 
@@ -59,45 +34,36 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     no cell.
     """
     cutter = _Cutter(body, lattice, tiling)
-    kinds = max(map(len, tiling.polygons))
-    share = np.zeros((kinds, *cutter.shape))
+    share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *cutter.shape))
     corner = np.zeros(cutter.shape, bool)
-    for polygons in tiling.polygons:
-        for kind, polygon in enumerate(polygons):
-            i, j, found = cutter.shares(polygon)
-            share[kind, i, j] = found
-            for m, n in (at.site for at in polygon.corners):
-                corner[i + m, j + n] = True
-    if not corner.any():
+    for polygon in tiling.polygons:
+        i, j, found = cutter.shares(polygon)
+        share[polygon.kind, i, j] = found
+        for m, n in (at.site for at in polygon.corners):
+            corner[i + m, j + n] = True
+    if not (filling := trimmed(cutter.low, corner, share)):
         raise ExperimentError(
             "holds no cell of the lattice; make it larger, or take a frame that does not weigh "
             "cells",
             ("body",),
         )
-    rows, columns = (np.flatnonzero(corner.any(axis=axis)) for axis in (1, 0))
-    inside = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    first = (int(cutter.low[0] + rows[0]), int(cutter.low[1] + columns[0]))
-    return Filling(corner[inside], first, share[(slice(None), *inside)])
+    return filling
 
 
 class _Cutter:
     """The signed distance at all sites of a window around the body, and within cells."""
 
     def __init__(self, body: Body, lattice: Lattice, tiling: Tiling) -> None:
-        self._body, self._lattice, self._cell = body, lattice, lattice.cell()
         low, high = window(body, lattice)
-        corners = (at for own in tiling.polygons for p in own for at in p.corners)
-        margin = max(2, *(abs(n) for at in corners for n in at.site))
-        self.low = (low[0] - margin, low[1] - margin)
-        self.shape = (high[0] - low[0] + 1 + 2 * margin, high[1] - low[1] + 1 + 2 * margin)
-        self._of_sites = any(box.in_sites for box in body.boxes())
-        i, j = np.indices(self.shape)
-        i, j = i + self.low[0], j + self.low[1]
-        self._sublattice, m, n = cells_of_sites(self._cell, i, j)
-        x, y = positions(self._cell, self._sublattice, m, n)
-        self._x, self._y = x + lattice.origin[0], y + lattice.origin[1]
-        self._tolerance = rounding_of(self._cell, self._x, self._y)
-        self._distance = self._signed(Sites((i, j), Vector(self._x, self._y)))
+        corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
+        margin = max(2, *(abs(n) for corner in corners for n in corner.site))
+        self.low = tuple(n - margin for n in low)
+        self.shape = tuple(b - a + 1 + 2 * margin for a, b in zip(low, high, strict=True))
+        self._body, self._of_sites = body, any(box.in_sites for box in body.boxes())
+        sites = sites_from(lattice, self.low, self.shape)
+        self._sublattice = sublattices_from(lattice.cell(), self.low, self.shape)
+        self._at, self._tolerance = sites.at, rounding_of(lattice.cell(), *sites.at)
+        self._distance = self._signed(sites)
 
     def shares(self, polygon: Polygon) -> tuple[Indices, Indices, Floats]:
         """(i, j, share) of the cells of that shape with a share, by the place of their first corner
@@ -117,7 +83,7 @@ class _Cutter:
             cut = np.flatnonzero(nearest <= reach)
             for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
                 at = [(i[some] + m, j[some] + n) for m, n in steps]
-                x, y = (np.array([plane[there] for there in at]) for plane in (self._x, self._y))
+                x, y = (np.array([plane[there] for there in at]) for plane in self._at)
                 share[some] = self._cut_shares(x, y)
         counted = share > SMALLEST
         return i[counted], j[counted], share[counted]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Diagnostic, FollowerRule, FractureModel, Remembered, Remembers
@@ -40,9 +38,9 @@ def remembered_names(experiment: Experiment) -> dict[str, str]:
     Raises PluginError for a name that is declared twice.
     """
     bonds, particles = bond_numbers(experiment), particle_numbers(experiment)
-    counts = Counter(number.name for number in (*bonds, *particles))
-    for name, count in counts.items():
-        if count > 1:
+    names = [number.name for number in (*bonds, *particles)]
+    for name in names:
+        if (count := names.count(name)) > 1:
             raise PluginError(
                 f"the number '{name}' is declared {count} times, by FractureModel "
                 f"'{experiment.fracture.type}' and FollowerRule '{experiment.rule.type}'; "
@@ -77,15 +75,14 @@ def check_diagnostics(
 
 
 def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
-    asking = [(n, d) for n, d in enumerate(experiment.diagnostics) if "forces" in d.needs]
-    if not asking or not (raster.table_kind == FRAME).any():
-        return []
+    has_frame = (raster.table_kind == FRAME).any()
     return [
         f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which at "
         "the corners of held edges is no force of the body; there it converges slowly (a clamped "
         "cantilever under 'traction-free' is 67 % off with 10 cells over its height and 24 % with "
         "40; under 'natural' 1.6 % and .13 %); take frame: {type: natural}"
-        for n, diagnostic in asking
+        for n, diagnostic in enumerate(experiment.diagnostics)
+        if has_frame and "forces" in diagnostic.needs
     ]
 
 

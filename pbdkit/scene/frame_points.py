@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, FollowerRule, FrameMap, FramePolicy, FrameSites
+from pbdkit.interfaces import FollowerRule, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.lattice import Index, Offset
+from pbdkit.scene.places import distinct
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
 
 Floats = NDArray[np.floating[Any]]
@@ -44,7 +45,7 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
     follow = policy.follow(frame)
     _refuse_unfit(follow, len(rows), raster)
     says = np.abs(follow.weight).reshape(len(follow.point), -1).max(axis=1, initial=0.0) > 0.0
-    alone = np.setdiff1d(np.arange(len(rows)), follow.point[says])
+    alone = np.flatnonzero(np.bincount(follow.point[says], minlength=len(rows)) == 0)
     if len(alone):
         raise ExperimentError(
             f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
@@ -61,7 +62,7 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     inside = raster.site_of(raster.body_rows)
     low, high = (tuple(end.tolist()) for end in (inside.min(axis=0), inside.max(axis=0)))
     site = raster.site_of(rows).astype(np.int32)
-    return RasterFrame(raster, rows, raster.lattice.cell(), site, low, high, rule)
+    return RasterFrame(raster.lattice.cell(), site, low, high, rule, raster, rows)
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
@@ -71,9 +72,9 @@ def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
         raise ExperimentError(
             "its map needs one point, body and weight (or square matrix) an entry"
         )
-    if entries and not (follow.point.min() >= 0 and follow.point.max() < points):
+    if ((follow.point < 0) | (follow.point >= points)).any():
         raise ExperimentError(f"its map names a frame point outside 0 to {points - 1}")
-    if entries and (np.diff(follow.point) < 0).any():
+    if (np.diff(follow.point) < 0).any():
         raise ExperimentError("its map is not sorted by frame point")
     known = (follow.body >= 0) & (follow.body < raster.count)
     if not known.all() or (raster.table_kind[follow.body] != FOLLOWER).any():
@@ -88,11 +89,6 @@ class RasterFrame(FrameSites):
 
     raster: Raster
     frame_rows: Indices
-    cell: Cell
-    site: NDArray[np.int32]
-    low: Index
-    high: Index
-    rule: FollowerRule
 
     def body_at(self, site: NDArray[np.int32]) -> Indices:
         """Looks the sites up on the raster."""
@@ -103,37 +99,26 @@ class RasterFrame(FrameSites):
         """Searches outwards from every frame point, shell of sites by shell, until all have met
         the body and every tie is in."""
         sublattice = self.raster.cells_of(self.frame_rows)[0]
-        pairs = [
-            self._nearest_of(s, np.flatnonzero(sublattice == s)) for s in np.unique(sublattice)
-        ]
+        own = ((s, np.flatnonzero(sublattice == s)) for s in distinct(sublattice))
+        pairs = [pair for s, points in own for pair in self._nearest_of(s, points)]
         point, body = (np.concatenate(part) for part in zip(*pairs, strict=True))
         order = np.lexsort((body, point))
         return point[order], body[order]
 
-    def _nearest_of(self, sublattice: int, points: Indices) -> tuple[Indices, Indices]:
+    def _nearest_of(self, sublattice: int, points: Indices) -> Iterator[tuple[Indices, Indices]]:
+        """Of the points of a sublattice, offset by offset, those with a body particle there and
+        none nearer."""
         nearest = np.full(len(points), np.inf)
         searched, radius = 0.0, max(math.hypot(*v) for v in self.cell.vectors)
-        pairs = []
         while (_with_ties(nearest) > searched).any():
             for offset in self.cell.offsets(sublattice, radius):
                 if offset.length > searched:
-                    pairs.append(self._met_at(offset, points, nearest))
+                    open_ = np.flatnonzero(offset.length <= _with_ties(nearest))
+                    body = self.body_at(self.site[points[open_]] + offset.site)
+                    open_, body = open_[body >= 0], body[body >= 0]
+                    nearest[open_] = np.minimum(nearest[open_], offset.length)
+                    yield points[open_], body
             searched, radius = radius, radius * 1.5
-        point, body = (np.concatenate(part) for part in zip(*pairs, strict=True))
-        return point, body
-
-    def _met_at(self, offset: Offset, points: Indices, nearest: Floats) -> tuple[Indices, Indices]:
-        """The points with a body particle at that offset and none nearer; notes the distance."""
-        open_ = np.flatnonzero(offset.length <= _with_ties(nearest))
-        places = self.raster.place_of(self.frame_rows[points[open_]])
-        _, *cells = np.unravel_index(places, self.raster.shape)
-        there = np.stack(cells) + np.array(offset.cell)[:, None]
-        inside = ((there >= 0) & (self.raster.shape[1:] > there.T).T).all(axis=0)
-        open_, there = open_[inside], there[:, inside]
-        met = self.raster.kind[(offset.target, *there)] == FOLLOWER
-        open_, there = open_[met], there[:, met]
-        nearest[open_] = np.minimum(nearest[open_], offset.length)
-        return points[open_], self.raster.rows_at(np.full(len(open_), offset.target), *there)
 
 
 def _with_ties(distance: Floats) -> Floats:

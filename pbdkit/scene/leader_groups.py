@@ -6,18 +6,17 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import LeaderGroup, Selection
-from pbdkit.experiment.motions import Rotation
+from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.places import Floats, distinct
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
-
-Floats = NDArray[np.floating[Any]]
 
 SHOWN = 5
 """So many warnings of one kind are given."""
@@ -34,60 +33,53 @@ class Leading:
     reference: Floats
 
 
-def build_leading(
-    raster: Raster, groups: Iterable[LeaderGroup], steps: int, *, at_rest: bool = True
-) -> tuple[Leading, ...]:
+def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]:
     """Every group with its particles.
 
     Raises ExperimentError for a group that selects nobody or a frame point, and for groups that
     move one particle differently in the same step.
     """
-    found, body = [], Selecting(raster)
-    for n, group in enumerate(groups):
+    found: list[Leading] = []
+    body, steps = Selecting(raster), experiment.steps
+    for n, group in enumerate(experiment.leaders):
         rows = body.select(group.select, ("leaders", n, "select"))
         at = raster.reference(rows)
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
         found.append(Leading(group, rows, raster.place_of(rows), at))
     for k, n in _meeting(found, steps):
-        if _known_beforehand(found[k].group, found[n].group, at_rest):
-            _refuse_contradiction(raster, (k, found[k]), (n, found[n]), steps)
+        if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
+            _refuse_contradiction(raster, found, k, n, steps)
     return tuple(found)
 
 
 def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
     """The pairs of groups that lead a particle in the same step, and not by the same motion."""
-    motions: dict[tuple[Any, int], int] = {}
-    table = np.array(
-        [
-            (
-                min(g.group.from_, steps + 1),
-                g.group.last(steps),
-                g.rows[0],
-                g.rows[-1],
-                motions.setdefault((g.group.motion, g.group.from_), len(motions)),
-            )
-            for g in found
-        ]
-    ).reshape(-1, 5)
-    rows = [set(g.rows.tolist()) for g in found] if len(found) > 1 else []
-    for n, (begin, end, low, high, motion) in enumerate(table):
-        others = table[:n]
-        near = (others[:, 0] <= end) & (begin <= others[:, 1]) & (others[:, 4] != motion)
-        near &= (others[:, 2] <= high) & (low <= others[:, 3])
-        yield from (
-            (k, n) for k in np.flatnonzero(near).tolist() if not rows[k].isdisjoint(rows[n])
-        )
+    groups, rows = [leading.group for leading in found], [leading.rows for leading in found]
+    kinds = {(group.motion, group.from_): n for n, group in enumerate(groups)}
+    kind = np.array([kinds[group.motion, group.from_] for group in groups])
+    begin = np.array([min(group.from_, steps + 1) for group in groups])
+    end = np.array([group.last(steps) for group in groups])
+    low, high = (np.array([some[edge] for some in rows]) for edge in (0, -1))
+    sets = [set(some.tolist()) for some in rows] if len(rows) > 1 else []
+    for n in range(1, len(found)):
+        near = (begin[:n] <= end[n]) & (begin[n] <= end[:n]) & (kind[:n] != kind[n])
+        near &= (low[:n] <= high[n]) & (low[n] <= high[:n])
+        for k in np.flatnonzero(near).tolist():
+            if not sets[k].isdisjoint(sets[n]):
+                yield k, n
 
 
 def doubts(raster: Raster, groups: Iterable[LeaderGroup]) -> list[str]:
     """Warnings about groups that lead others than was meant."""
     body, found = Selecting(raster), []
-    for n, group in enumerate(groups):
-        for point in body.far(group.select.nearest or ()):
-            x, y = raster.reference(body.nearest([point]))[0]
+    width = max(math.hypot(*v) for v in raster.lattice.cell().vectors)
+    points = ((n, point) for n, group in enumerate(groups) for point in group.select.nearest or ())
+    for n, (x, y) in points:
+        if body.distance((x, y)).min() > width:
+            at = raster.reference(body.nearest([(x, y)]))[0]
             found.append(
-                f"leaders.{n}.select.nearest: ({point[0]:g}, {point[1]:g}) lies far from the body; "
-                f"the particle that leads is at ({x:.6g}, {y:.6g})"
+                f"leaders.{n}.select.nearest: ({x:g}, {y:g}) lies far from the body; "
+                f"the particle that leads is at ({at[0]:.6g}, {at[1]:.6g})"
             )
     return found[:SHOWN]
 
@@ -111,14 +103,13 @@ class Selecting:
     def _body(self) -> Indices:
         return self.raster.body_rows
 
-    def far(self, points: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-        """The points that lie outside the body by more than the cell is wide."""
-        width = max(math.hypot(*v) for v in self.raster.lattice.cell().vectors)
-        return (p for p in points if not np.hypot(*(self._x - p).T).min() <= width)
-
     @cached_property
     def _x(self) -> Floats:
         return self.raster.reference(self._body)
+
+    def distance(self, point: Pair) -> Floats:
+        """(particle,): how far each body particle is from a point at rest."""
+        return np.asarray(np.hypot(*(self._x - point).T))
 
     def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
         """The rows of the selected body particles, sorted."""
@@ -134,7 +125,7 @@ class Selecting:
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
             text = f"selects no particle; the body reaches from {low} to {high}"
             raise ExperimentError(text, where)
-        return np.unique(rows)
+        return distinct(rows)
 
     def _edge(self, edge: str) -> Indices:
         """The body particle of smallest or largest i in every row j, or j in every column i."""
@@ -151,11 +142,11 @@ class Selecting:
         low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
         return self._body[((self._x >= low) & (self._x <= high)).all(axis=1)]
 
-    def nearest(self, points: Iterable[tuple[float, float]]) -> Indices:
+    def nearest(self, points: Iterable[Pair]) -> Indices:
         """The row of the particle nearest to each point, the lowest number on ties."""
         found = []
         for point in points:
-            distance = np.hypot(*(self._x - point).T)
+            distance = self.distance(point)
             ties = distance <= distance.min() * (1 + 1e-9) + 1e-12 * _spacing(self.raster)
             found.append(self._body[np.argmax(ties)])
         return np.array(found, np.intp)
@@ -178,17 +169,11 @@ def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, .
     return np.array(numbers, np.intp) - 1
 
 
-def _refuse_contradiction(
-    raster: Raster, first: tuple[int, Leading], second: tuple[int, Leading], steps: int
-) -> None:
-    """Compares what two groups prescribe in every step in which both lead one particle."""
-    (k, a), (n, b) = first, second
-    if b.group.from_ < a.group.from_:
-        a, b = b, a
+def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, steps: int) -> None:
+    """Compares what groups k and n prescribe in every step in which both lead one particle."""
+    a, b = sorted((found[k], found[n]), key=lambda leading: leading.group.from_)
     shared = np.intersect1d(a.rows, b.rows)
     begin, end = b.group.from_, min(a.group.last(steps), b.group.last(steps))
-    if not len(shared) or begin > end:
-        return
     # b starts where a, which led the particles just before unless both begin together, left them.
     at = raster.reference(shared)
     start = _offset(a.group, begin - 1, at)

@@ -47,16 +47,20 @@ class Neighbourhood:
         """The cells of the lattice, and which of them lie beside the slots."""
         return tiling_of(self.cell, self.slots)
 
+    @cached_property
+    def every(self) -> tuple[Slot, ...]:
+        """The slots of all sublattices, one after the other."""
+        return tuple(slot for own in self.slots for slot in own)
+
     @property
     def reach(self) -> int:
         """The largest difference of site index, max(|Δi|, |Δj|)."""
-        return max(max(abs(n) for n in slot.site) for slots in self.slots for slot in slots)
+        return max(abs(n) for slot in self.every for n in slot.site)
 
     @property
     def reach_in_cells(self) -> Index:
         """The largest difference of repeat cell along each axis."""
-        steps = zip(*(slot.cell for slots in self.slots for slot in slots), strict=True)
-        return tuple(max(map(abs, along)) for along in steps)
+        return tuple(np.abs([slot.cell for slot in self.every]).max(axis=0).tolist())
 
     @cached_property
     def home(self) -> dict[Slot, tuple[int, bool]]:
@@ -67,19 +71,17 @@ class Neighbourhood:
 
     def shells(self) -> list[list[float]]:
         """The rest lengths of each shell, the first shell first."""
-        found: dict[int, list[float]] = {}
-        for slots in self.slots:
-            for slot in slots:
-                found.setdefault(slot.shell, []).append(math.hypot(*slot.rest))
-        return [found[shell] for shell in sorted(found)]
+        found: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]
+        for slot in self.every:
+            found[slot.shell - 1].append(math.hypot(*slot.rest))
+        return found
 
     def spans_space(self) -> bool:
         """Whether steps between neighbours reach in all directions; else rows do not feel each
         other."""
-        rests = np.array([slot.rest for slots in self.slots for slot in slots])
+        rests = np.array([slot.rest for slot in self.every])
         directions = rests / np.linalg.norm(rests, axis=1)[:, None]
-        rank = int(np.linalg.matrix_rank(directions, tol=1e-9))
-        return rank == len(self.slots[0][0].rest)
+        return bool(np.linalg.matrix_rank(directions, tol=1e-9) == self.cell.axes)
 
 
 def checked_cell(lattice: Lattice) -> Cell:
@@ -93,10 +95,9 @@ def checked_cell(lattice: Lattice) -> Cell:
         raise ExperimentError(f"the cell vectors {named} span no area")
     if flatness(cell) < FLATTEST:
         raise ExperimentError(
-            f"the cell vectors {named} are nearly degenerate: sites lie "
-            f"{1 / flatness(cell):.3g} times closer along one line than the longer is long, and "
-            f"{1 / FLATTEST:g} times is the most; open their angle, or make their lengths more "
-            "alike"
+            f"the cell vectors {named} are nearly degenerate: sites lie {1 / flatness(cell):.3g} "
+            f"times closer along one line than the longer is long, and {1 / FLATTEST:g} times is "
+            "the most; open their angle, or make their lengths more alike"
         )
     far = max(map(abs, lattice.origin))
     apart = min(math.hypot(*v) for v in cell.vectors)
@@ -131,8 +132,8 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
     """The slots that the metric chooses; ExperimentError unless neighbourhood is mutual and
     balanced."""
     exact = _ExactVectors()
-    chosen = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
-    slots = tuple(_slots_of(s, shells, exact) for s, shells in enumerate(chosen))
+    sublattices = range(len(cell.sites))
+    slots = tuple(_slots_of(s, metric.shells_around(cell, s), exact) for s in sublattices)
     by_key = {(s.source, s.target, s.cell): s for own in slots for s in own}
     _refuse_gaps(slots, len(by_key))
     planes = []
@@ -143,7 +144,7 @@ def build_neighbourhood(cell: Cell, metric: NeighbourMetric) -> Neighbourhood:
                 f"'{metric.type}' is not mutual: the neighbour at site index offset {slot.site} "
                 "does not have this one in the same shell; a body at rest would drift"
             )
-        if slot.site > tuple(0 for _ in slot.site):
+        if slot.site > (0,) * cell.axes:
             planes.append(BondPlane(slot, opposite))
     for own in slots:
         _refuse_lopsided(own, metric)
@@ -175,13 +176,12 @@ def _refuse_gaps(slots: tuple[tuple[Slot, ...], ...], different: int) -> None:
 def _slots_of(
     source: int, shells: Sequence[Sequence[Offset]], exact: _ExactVectors
 ) -> tuple[Slot, ...]:
-    found = []
-    for shell, offsets in enumerate(shells, 1):
-        for o in offsets:
-            number, negative, rest = exact.of(o.rest)
-            slot = Slot(source, o.target, o.cell, o.site, rest, shell)
-            found.append((shell, number, negative, slot))
-    return tuple(slot for *_, slot in sorted(found, key=lambda entry: entry[:3]))
+    offsets = [(shell, offset) for shell, near in enumerate(shells, 1) for offset in near]
+    found = [(shell, *exact.of(offset.rest), offset) for shell, offset in offsets]
+    found.sort(key=lambda entry: entry[:3])
+    return tuple(
+        Slot(source, to.target, to.cell, to.site, rest, shell) for shell, _, _, rest, to in found
+    )
 
 
 class _ExactVectors:
@@ -196,13 +196,12 @@ class _ExactVectors:
 
     def of(self, v: Components) -> tuple[int, bool, Components]:
         """(which known vector, whether negated, the value to use)."""
-        for negative in (False, True):
-            number = self._near.get(self._key(-v if negative else v))
-            if number is not None:
-                known = self._known[number]
-                return number, negative, -known if negative else known
+        if (number := self._near.get(self._key(v))) is not None:
+            return number, False, self._known[number]
+        if (number := self._near.get(self._key(-v))) is not None:
+            return number, True, -self._known[number]
+        number = len(self._known)
         self._known.append(v.each(lambda component: component + 0.0))
-        number = len(self._known) - 1
         for near in product(*((n - 1, n, n + 1) for n in self._key(v))):
             self._near.setdefault(near, number)
         return number, False, self._known[number]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import sub
@@ -15,7 +15,7 @@ from pbdkit.interfaces import Cell, Lattice
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.vector import vector
-from pbdkit.scene.places import Block, Places, Where
+from pbdkit.scene.places import Block, Places, Where, bounds
 
 EMPTY, LEADER, FOLLOWER, FRAME = -1, 0, 1, 2
 CHUNK_ROWS = 65536
@@ -54,7 +54,7 @@ class Raster:
         """(particle,): the place in the window of each row, where that is not the row itself."""
         return np.flatnonzero(self.sites != EMPTY)
 
-    @property
+    @cached_property
     def table_kind(self) -> NDArray[np.int8]:
         """(particle,): FOLLOWER or FRAME."""
         flat = self.sites.ravel()
@@ -75,12 +75,16 @@ class Raster:
         place = rows if self._full else self._flat_sites[rows]
         return np.stack(np.unravel_index(place, self.sites.shape), axis=1) + self.low
 
+    def _of_all(self, values: Callable[[Indices], Any], columns: int, dtype: Any) -> NDArray[Any]:
+        """(particle, column): what is told of some rows at a time."""
+        out = np.empty((self.count, columns), dtype)
+        for rows in self.chunks():
+            out[rows[0] : rows[-1] + 1] = values(rows)
+        return out
+
     def site_table(self) -> NDArray[np.int32]:
         """(particle, index): the sites (i, j) of all rows."""
-        out = np.empty((self.count, self.sites.ndim), np.int32)
-        for rows in self.chunks():
-            out[rows[0] : rows[-1] + 1] = self.site_of(rows)
-        return out
+        return self._of_all(self.site_of, self.sites.ndim, np.int32)
 
     def cells_of(self, rows: Indices) -> tuple[Indices, ...]:
         """(sublattice, repeat cell, repeat cell) of some rows."""
@@ -91,7 +95,7 @@ class Raster:
         s, *cells = self.cells_of(rows)
         return np.ravel_multi_index((s, *map(sub, cells, self.first)), self.shape)
 
-    def rows_at(self, s: Indices, *cells: Indices) -> Indices:
+    def rows_at(self, s: int | Indices, *cells: Indices) -> Indices:
         """The rows of the particles at (sublattice, raster cell, raster cell); -1 where none is."""
         cell = self.lattice.cell()
         index = np.array([site.index for site in cell.sites])
@@ -114,10 +118,7 @@ class Raster:
     def reference(self, rows: Indices | None = None) -> NDArray[np.float64]:
         """X, (particle, axis), of all particles or of some rows."""
         if rows is None:
-            out = np.empty((self.count, self.sites.ndim))
-            for some in self.chunks():
-                out[some[0] : some[-1] + 1] = self.reference(some)
-            return out
+            return self._of_all(self.reference, self.sites.ndim, np.float64)
         offsets = positions(self.lattice.cell(), *self.cells_of(rows))
         return np.stack(offsets, axis=1) + self.lattice.origin
 
@@ -133,44 +134,24 @@ class Raster:
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
         """(particle, axis): the values of planes u, (axis, sublattice, cell, cell), by number."""
-        out = np.empty((self.count, len(u)), u.dtype)
-        if self._full:
-            window = out.reshape(*self.sites.shape, len(u))
+        if not self._full:
+            flat = u.reshape(len(u), -1)
+            return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)
+        out = np.empty((*self.sites.shape, len(u)), u.dtype)
+        cell = self.lattice.cell()
+        for s, site in enumerate(cell.sites):
+            skip = np.subtract(site.index, self.low) % cell.period
+            own = out[tuple(slice(n, None, p) for n, p in zip(skip, cell.period, strict=True))]
+            begin = np.add(self.low, skip) // cell.period - self.first
+            there = tuple(map(slice, begin, begin + own.shape[:-1]))
             for axis, plane in enumerate(u):
-                for s, here, there in self._strides():
-                    window[here][..., axis] = plane[s][there]
-            return out
-        for rows in self.chunks():
-            place = self.place_of(rows)
-            for axis, plane in enumerate(u):
-                out[rows[0] : rows[-1] + 1, axis] = plane.ravel()[place]
-        return out
+                own[..., axis] = plane[s][there]
+        return out.reshape(-1, len(u))
 
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
-        inside = self.kind[sublattice] == FOLLOWER
-        axes = range(inside.ndim)
-        some = [
-            np.flatnonzero(inside.any(axis=tuple(other for other in axes if other != axis)))
-            for axis in axes
-        ]
-        if not len(some[0]):
-            return None
-        start, stop = tuple(int(n[0]) for n in some), tuple(int(n[-1]) + 1 for n in some)
-        return Block(sublattice, start, stop)
-
-    def _strides(self) -> Iterator[tuple[int, tuple[slice, ...], tuple[slice, ...]]]:
-        """(sublattice, its sites in the window, its cells on the raster)."""
-        cell = self.lattice.cell()
-        for s, site in enumerate(cell.sites):
-            here, there = [], []
-            for axis, (period, low) in enumerate(zip(cell.period, self.low, strict=True)):
-                skip = (site.index[axis] - low) % period
-                number = len(range(skip, self.sites.shape[axis], period))
-                begin = (low + skip) // period - self.first[axis]
-                here.append(slice(skip, None, period))
-                there.append(slice(begin, begin + number))
-            yield s, tuple(here), tuple(there)
+        found = bounds(self.kind[sublattice] == FOLLOWER)
+        return Block(sublattice, *found) if found else None
 
 
 def positions(cell: Cell, s: int | Indices, *cells: Indices) -> Any:

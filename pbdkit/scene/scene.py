@@ -10,20 +10,21 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Cell, Components, Remembers, Setting
+from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Patch, WeighedCells, patches
-from pbdkit.scene.constants import SceneConstants, ask_for_constants
-from pbdkit.scene.cut_cells import Filling, fill_with_cells
+from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.frame_points import Frame, build_frame
+from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.places import Mask, distinct, hull
 from pbdkit.scene.raster import FOLLOWER, Raster, positions
-from pbdkit.scene.sites import Mask, build_raster, fill, has_narrow_slot, window
+from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
 
 FLAT = 0.05
@@ -68,19 +69,13 @@ class Scene:
     def middle(self) -> Components:
         """The middle of the body's box, from the lattice's site (0, 0)."""
         lower, upper = body_box(self.raster)
-        middle: Components = (lower + upper) / 2
-        return middle
-
-    @property
-    def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds."""
-        return self.experiment.shows_bonds
+        return (lower + upper) / 2
 
     @cached_property
     def leaders_overlap(self) -> bool:
         """Whether any particle belongs to two leader groups."""
         rows = [leading.rows for leading in self.leading]
-        return len(np.unique(np.concatenate([*rows, []]))) < sum(map(len, rows))
+        return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
 
     @cached_property
     def bonds(self) -> BondTable:
@@ -114,13 +109,9 @@ def _build(experiment: Experiment) -> Scene:
     low, high = window(experiment.body, experiment.lattice)
     extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
     refuse_too_large(experiment, neighbourhood, extent, layers)
-    if frame.weighs_cells:
-        filling = _filling(experiment, neighbourhood)
-        body, first = filling.body, filling.first
-    else:
-        body, first = fill(experiment.body, experiment.lattice)
-    warnings += _doubts(cell, neighbourhood, body, layers) + _edge_effects(experiment)
-    raster = build_raster(experiment.lattice, body, first, layers, neighbourhood.reach_in_cells)
+    filling = _filling(experiment, neighbourhood)
+    warnings += _doubts(experiment, neighbourhood, filling.body, layers)
+    raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += doubts(raster, experiment.leaders)
     constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
@@ -130,27 +121,18 @@ def _build(experiment: Experiment) -> Scene:
             "neighbours do not have; set neighbours.reevaluate: false",
             ("neighbours",),
         )
-    at_rest = experiment.initial.at_rest
-    leading = build_leading(raster, experiment.leaders, experiment.steps, at_rest=at_rest)
+    leading = build_leading(raster, experiment)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
-    cells = filling.on(raster, neighbourhood.tiling) if frame.weighs_cells else None
+    cells = filling.on(raster, neighbourhood.tiling)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
-    scene = Scene(experiment, *parts, tuple(warnings))
-    return with_inner(scene)
-
-
-def with_inner(scene: Scene) -> Scene:
-    """The scene with that of its inner rule, where the rule works on the moves of another."""
-    inner = inner_experiment(scene.experiment, lags=scene.lag > 0)
-    if inner is None:
-        return scene
-    constants = ask_for_constants(inner, setting_of(scene.raster, scene.neighbourhood))
-    return replace(scene, inner=with_inner(replace(scene, experiment=inner, constants=constants)))
+    return with_inner(Scene(experiment, *parts, tuple(warnings)))
 
 
 def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
     frame, rule = experiment.frame, experiment.rule
+    if not frame.weighs_cells:
+        return fill(experiment.body, experiment.lattice)
     if not rule.uses_cells:
         raise ExperimentError(
             f"'{frame.type}' weighs the cells between neighbours, and the rule '{rule.type}' does "
@@ -178,21 +160,21 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
 def body_box(raster: Raster) -> tuple[Components, Components]:
     """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
     cell = raster.lattice.cell()
-    lower, upper = np.full(len(cell.vectors), np.inf), np.full(len(cell.vectors), -np.inf)
-    for rows in raster.chunks():
-        x = np.array(positions(cell, *raster.cells_of(rows[raster.table_kind[rows] == FOLLOWER])))
-        lower = np.minimum(lower, x.min(axis=1, initial=np.inf))
-        upper = np.maximum(upper, x.max(axis=1, initial=-np.inf))
-    return vector(lower.tolist()), vector(upper.tolist())
+    bodies = (rows[raster.table_kind[rows] == FOLLOWER] for rows in raster.chunks())
+    parts = (positions(cell, *raster.cells_of(rows)) for rows in bodies if len(rows))
+    lower, upper = hull(([x.min() for x in at], [x.max() for x in at]) for at in parts)
+    return vector(map(float, lower)), vector(map(float, upper))
 
 
-def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -> list[str]:
-    doubts = []
-    if flatness(cell) < FLAT:
+def _doubts(
+    experiment: Experiment, neighbourhood: Neighbourhood, body: Mask, layers: int
+) -> list[str]:
+    doubts, frame, rule = [], experiment.frame, experiment.rule
+    if (flat := flatness(neighbourhood.cell)) < FLAT:
         doubts.append(
-            f"lattice: nearly degenerate, sites lie {1 / flatness(cell):.3g} times closer along "
-            "one line than its longer cell vector is long, so that neighbours by distance lie "
-            "along that line; take chebyshev neighbours, or open the angle between the vectors"
+            f"lattice: nearly degenerate, sites lie {1 / flat:.3g} times closer along one line "
+            "than its longer cell vector is long, so that neighbours by distance lie along that "
+            "line; take chebyshev neighbours, or open the angle between the vectors"
         )
     if not neighbourhood.spans_space():
         doubts.append(
@@ -204,35 +186,30 @@ def _doubts(cell: Cell, neighbourhood: Neighbourhood, body: Mask, layers: int) -
             f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
             "belong to both faces; widen it, or take fewer layers"
         )
+    if not frame.edges_are_free and material_of(rule) is not None:
+        doubts.append(
+            f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated "
+            f"rule '{rule.type}' the result does not converge to elasticity, however fine the "
+            "lattice (copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); "
+            "take {type: natural} or {type: traction-free}"
+        )
     return doubts
 
 
-def _edge_effects(experiment: Experiment) -> list[str]:
-    frame, rule = experiment.frame, experiment.rule
-    if frame.edges_are_free or material_of(rule) is None:
-        return []
-    return [
-        f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated rule "
-        f"'{rule.type}' the result does not converge to elasticity, however fine the lattice "
-        "(copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); take "
-        "{type: natural} or {type: traction-free}"
-    ]
+def with_inner(scene: Scene) -> Scene:
+    """The scene with that of its inner rule, where the rule works on the moves of another.
 
-
-def inner_experiment(experiment: Experiment, *, lags: bool) -> Experiment | None:
-    """The same experiment with the rule's inner rule; None for rules that have none.
-
-    Raises ExperimentError for frames that `lags`, for bonds that break, neighbours that come and go
+    Raises ExperimentError for frames that lag, for bonds that break, neighbours that come and go
     and rules that remember: what the moves of the inner rule are is not told there.
     """
-    rule = experiment.rule
+    experiment, rule = scene.experiment, scene.experiment.rule
     if not isinstance(rule, AppliesTwice):
-        return None
+        return scene
     with blaming(rule, "when asked for its inner rule", "rule"):
         inner = rule.inner()
     remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
     for unfit, part, remedy in (
-        (lags, "frame", "lag: 0"),
+        (scene.lag, "frame", "lag: 0"),
         (experiment.fracture.can_break, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
         (remembers, "rule", "one that remembers nothing"),
@@ -243,4 +220,7 @@ def inner_experiment(experiment: Experiment, *, lags: bool) -> Experiment | None
                 f"this {part}; take {part}: {remedy}",
                 (part,),
             )
-    return experiment.model_copy(update={"rule": inner})
+    experiment = experiment.model_copy(update={"rule": inner})
+    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
+    below = replace(scene, experiment=experiment, constants=constants)
+    return replace(scene, inner=with_inner(below))

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Box, Floats, Sites
 from pbdkit.interfaces import Cell, Lattice
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.polygons import Tiling
+from pbdkit.scene.cells import WeighedCells
+from pbdkit.scene.places import Mask, bounds, hull
 from pbdkit.scene.raster import (
     CHUNK_ROWS,
     EMPTY,
@@ -26,77 +28,91 @@ from pbdkit.scene.raster import (
     sublattices,
 )
 
-Mask = NDArray[np.bool_]
+
+@dataclass(frozen=True)
+class Filling:
+    """The sites of the body on a window whose first site index is `first`, (i, j), and where cells
+    are weighed the shares of the cells by the site of their first corner, (kind, i, j)."""
+
+    body: Mask
+    first: Index
+    share: Floats | None = None
+
+    def on(self, raster: Raster, tiling: Tiling) -> WeighedCells | None:
+        """The shares by place of a raster."""
+        if self.share is None:
+            return None
+        out = np.zeros((len(self.share), *raster.shape))
+        rows = raster.body_rows
+        sites = tuple((raster.site_of(rows) - self.first).T)
+        for own, share in zip(out, self.share, strict=True):
+            own.ravel()[raster.place_of(rows)] = share[sites]
+        return WeighedCells(tiling, out)
 
 
-def build_raster(
-    lattice: Lattice, body: Mask, origin: Index, layers: int, reach_in_cells: Index
-) -> Raster:
-    """The raster of a body and its frame.
+def trimmed(low: Index, body: Mask, share: Floats | None = None) -> Filling | None:
+    """The same on a window as small as the body allows, from one that begins at the site `low`;
+    None where there is no body."""
+    if not (found := bounds(body)):
+        return None
+    inside = tuple(map(slice, *found))
+    shares = None if share is None else share[(slice(None), *inside)]
+    return Filling(body[inside], tuple(map(add, low, found[0])), shares)
 
-    `body` tells which sites of a window belong to it, `origin` is the site index of its first;
-    the frame takes every other site within `layers` of index distance of the body.
+
+def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) -> Raster:
+    """The raster of a body and its frame, and of all that a slot can `reach`, in repeat cells.
+
+    The frame takes every site within `layers` of index distance of the body that is none of it.
     """
     cell = lattice.cell()
-    inside = np.pad(body, layers)
-    low = tuple(n - layers for n in origin)
-    window = dilated(inside, layers) & existing(cell, low, inside.shape)
+    inside = np.pad(filling.body, layers)
+    low = tuple(n - layers for n in filling.first)
+    window = dilated(inside, layers) & (sublattices_from(cell, low, inside.shape) >= 0)
     sites = np.where(window, np.int8(FRAME), np.int8(EMPTY))
     sites[inside] = FOLLOWER
-    first, shape = _extent(cell, low, sites.shape, reach_in_cells)
+    first = np.floor_divide(low, cell.period) - reach
+    last = (np.add(low, sites.shape) - 1) // cell.period + reach
+    shape = (len(cell.sites), *(last + 1 - first).tolist())
     kind = np.full(shape, EMPTY, np.int8)
-    raster = Raster(lattice, shape, first, kind, low, sites)
+    raster = Raster(lattice, shape, tuple(first.tolist()), kind, low, sites)
     for rows in raster.chunks():
         kind.ravel()[raster.place_of(rows)] = raster.table_kind[rows]
     return raster
 
 
-def existing(cell: Cell, low: Index, shape: tuple[int, ...]) -> Mask:
-    """Which sites of a window of indices, from `low` on, the lattice has."""
-    along = [np.arange(n, n + size) for n, size in zip(low, shape, strict=True)]
-    there: Mask = sublattices(cell) >= 0
-    return there[np.ix_(*(n % p for n, p in zip(along, cell.period, strict=True)))]
+def sublattices_from(cell: Cell, low: Index, shape: Index) -> Indices:
+    """The sublattice of each site of a window of indices, from `low` on; -1 at a hole."""
+    window = zip(low, shape, cell.period, strict=True)
+    return sublattices(cell)[np.ix_(*(np.arange(n, n + size) % p for n, size, p in window))]
 
 
 def dilated(mask: Mask, layers: int) -> Mask:
     """Every place within `layers` of a true one, along either axis or both."""
     for axis in range(mask.ndim):
         grown = mask.copy()
+        wider, narrower = np.moveaxis(grown, axis, 0), np.moveaxis(mask, axis, 0)
         for k in range(1, layers + 1):
-            ahead, behind = [slice(None)] * mask.ndim, [slice(None)] * mask.ndim
-            ahead[axis], behind[axis] = slice(k, None), slice(None, -k)
-            grown[tuple(ahead)] |= mask[tuple(behind)]
-            grown[tuple(behind)] |= mask[tuple(ahead)]
+            wider[k:] |= narrower[:-k]
+            wider[:-k] |= narrower[k:]
         mask = grown
     return mask
 
 
-def _extent(
-    cell: Cell, low: Index, window: tuple[int, ...], reach: Index
-) -> tuple[Index, tuple[int, ...]]:
-    """(first cell, shape) of the rasters: the window's cells and all that a slot can reach."""
-    ends = np.array([low, np.add(low, window) - 1])
-    _, *cells = cells_of_sites(cell, *ends.T)
-    first = tuple(int(m[0]) - r for m, r in zip(cells, reach, strict=True))
-    last = [int(m[1]) + r for m, r in zip(cells, reach, strict=True)]
-    return first, (len(cell.sites), *(b + 1 - a for a, b in zip(first, last, strict=True)))
-
-
 def window(body: Body, lattice: Lattice) -> tuple[Index, Index]:
     """The smallest and the largest site index (i, j) that may belong to the body."""
-    corners = [_indices(box, lattice) for box in body.boxes()]
-    low, high = zip(*corners, strict=True)
-    return (
-        tuple(map(min, zip(*low, strict=True))),
-        tuple(map(max, zip(*high, strict=True))),
-    )
+    return hull(_indices(box, lattice) for box in body.boxes())
 
 
-def fill(body: Body, lattice: Lattice) -> tuple[Mask, Index]:
-    """(mask, origin): which sites of a window belong to the body, and the index of its first.
+def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
+    """All indices of a window from the site `low` on, and where such sites lie or would lie."""
+    index = [n + first for n, first in zip(np.indices(shape), low, strict=True)]
+    at = positions(lattice.cell(), *cells_of_sites(lattice.cell(), *index))
+    return Sites(index, at.each(add, lattice.origin))
 
-    The window is as small as the body allows. Raises ExperimentError where no site belongs.
-    """
+
+def fill(body: Body, lattice: Lattice) -> Filling:
+    """The sites inside or on the outline; ExperimentError where there is none."""
     low, high = window(body, lattice)
     cell = lattice.cell()
     if max(map(abs, (*low, *high))) > 2**31 - 100:
@@ -104,26 +120,16 @@ def fill(body: Body, lattice: Lattice) -> tuple[Mask, Index]:
             "lies beyond the site indices of 32 bits; move it, or the lattice's origin, nearer",
             ("body",),
         )
-    inside = existing(cell, low, tuple(b - a + 1 for a, b in zip(low, high, strict=True))).copy()
+    shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
+    inside = sublattices_from(cell, low, shape) >= 0
     lines = max(1, CHUNK_ROWS // inside[0].size)
     for begin in range(0, len(inside), lines):
-        ends = [min(low[0] + begin + lines - 1, high[0]), *high[1:]]
-        along = map(np.arange, [low[0] + begin, *low[1:]], np.add(ends, 1))
-        inside[begin : begin + lines] &= _belongs(body, lattice, np.meshgrid(*along, indexing="ij"))
-    if not inside.any():
+        part = inside[begin : begin + lines]
+        sites = sites_from(lattice, (low[0] + begin, *low[1:]), part.shape)
+        part &= body.distance(sites) <= rounding_of(cell, *sites.at)
+    if not (filling := trimmed(low, inside)):
         raise ExperimentError("holds no site of the lattice; make it larger, or move it", ("body",))
-    places = np.nonzero(inside)
-    first, last = ([int(end(n)) for n in places] for end in (np.min, np.max))
-    trimmed = inside[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))]
-    return trimmed, tuple(map(add, low, first))
-
-
-def _belongs(body: Body, lattice: Lattice, index: Sequence[Indices]) -> Mask:
-    """Whether the sites lie inside or on the outline."""
-    cell = lattice.cell()
-    at = positions(cell, *cells_of_sites(cell, *index)).each(add, lattice.origin)
-    found: Mask = body.distance(Sites(index, at)) <= rounding_of(cell, *at)
-    return found
+    return filling
 
 
 def rounding_of(cell: Cell, *at: Floats) -> float:
@@ -158,9 +164,6 @@ def _indices(box: Box, lattice: Lattice) -> tuple[Index, Index]:
     from_origin = np.array(list(corners)) - lattice.origin
     cells = np.linalg.solve(np.array(cell.vectors).T, from_origin.T)
     # A basis site lies up to one cell from the corner of its own.
-    low = [math.floor(n.min()) - 1 for n in cells]
-    high = [math.ceil(n.max()) + 1 for n in cells]
-    return (
-        tuple(n * p for n, p in zip(low, cell.period, strict=True)),
-        tuple(n * p + p - 1 for n, p in zip(high, cell.period, strict=True)),
-    )
+    low = [(math.floor(n.min()) - 1) * p for n, p in zip(cells, cell.period, strict=True)]
+    high = [(math.ceil(n.max()) + 2) * p - 1 for n, p in zip(cells, cell.period, strict=True)]
+    return tuple(low), tuple(high)

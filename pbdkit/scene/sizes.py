@@ -13,7 +13,7 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.rule import material_of
-from pbdkit.scene.declarations import Declared, bond_numbers, particle_numbers
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.neighbourhood import Neighbourhood
 
 MIB = 2**20
@@ -46,23 +46,13 @@ class Sizes:
     output: int
 
 
-def estimate(
-    experiment: Experiment, neighbourhood: Neighbourhood, window: Index, layers: int
-) -> Sizes:
-    """From the window of site indices that the body fills at most, with Python's integers."""
-    cell = experiment.lattice.cell()
-    share = len(cell.sites) / math.prod(cell.period)
-    particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
-    return sizes_of(experiment, neighbourhood, particles)
-
-
 def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
-    """The same for a known number of particles."""
+    """The sizes of a scene with so many particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
-    bonds, own = bond_numbers(experiment), particle_numbers(experiment)
     state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1 + value)
-    state += planes * _bytes_of(bonds, value) + _bytes_of(own, value)
+    state += planes * sum(_bytes_of(n.dtype, value) for n in bond_numbers(experiment))
+    state += sum(_bytes_of(n.dtype, value) for n in particle_numbers(experiment))
     table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
     memory = LEAST + math.ceil(particles * (state + table + made))
@@ -91,31 +81,38 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:
     """Bytes of the dataset, with `planes` bonds a particle, all of which may break."""
-    bonds, own = bond_numbers(experiment), particle_numbers(experiment)
-    records = experiment.recording.count(experiment.steps)
+    fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
-    per_record, every_step = particles * (2 * recorded + 1), 0
-    for diagnostic in experiment.diagnostics:
-        entry = 0 if diagnostic.at_end else _bytes_an_entry(diagnostic, particles, recorded)
+    each_time, every_step = 2 * recorded + 1.0, 0
+    once = 2 * 8 + 2 * 4 + 2 * 8 + experiment.shows_bonds * planes * (17 + 12 * fracture.can_break)
+    of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
+    of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
+    for numbers, owners, renews in (of_bonds, of_particles):
+        for number in (n for n in numbers if n.recorded):
+            if renews and number.changes:
+                each_time += owners * _bytes_of(number.dtype, recorded)
+            else:
+                once += owners * _bytes_of(number.dtype, 8)
+    per_record = math.ceil(particles * each_time)
+    for diagnostic in (d for d in experiment.diagnostics if not d.at_end):
+        entry = _bytes_an_entry(diagnostic, particles, recorded)
         if diagnostic.every_step:
             every_step += entry
         else:
             per_record += entry
-    once = particles * (2 * 8 + 2 * 4 + 2 * 8)
-    if experiment.shows_bonds:
-        once += math.ceil(particles * planes * (2 * 8 + 1 + 12 * experiment.fracture.can_break))
-    of_bonds = _recorded_bytes(bonds, isinstance(experiment.fracture, RenewsBonds), recorded)
-    of_particles = _recorded_bytes(own, isinstance(experiment.rule, RenewsParticles), recorded)
-    once += math.ceil(particles * (planes * of_bonds[0] + of_particles[0]))
-    per_record += math.ceil(particles * (planes * of_bonds[1] + of_particles[1]))
-    return once + records * per_record + (experiment.steps + 1) * every_step
+    records = experiment.recording.count(experiment.steps)
+    return math.ceil(particles * once) + records * per_record + (experiment.steps + 1) * every_step
 
 
 def refuse_too_large(
     experiment: Experiment, neighbourhood: Neighbourhood, window: Index, layers: int
 ) -> None:
-    """Raises ExperimentError where the scene cannot fit into the memory of this machine."""
-    sizes = estimate(experiment, neighbourhood, window, layers)
+    """Raises ExperimentError where the scene cannot fit into the memory of this machine, if the
+    body fills its window of site indices; with Python's integers, as windows can be vast."""
+    cell = neighbourhood.cell
+    share = len(cell.sites) / math.prod(cell.period)
+    particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
+    sizes = sizes_of(experiment, neighbourhood, particles)
     available = machine_memory()
     if sizes.memory > available:
         raise ExperimentError(
@@ -133,23 +130,15 @@ def machine_memory() -> int:
         return 16 * 2**30
 
 
-def _bytes_of(numbers: Declared, value: int) -> int:
-    return sum(value if n.dtype == "f8" else np.dtype(n.dtype).itemsize for n in numbers)
-
-
-def _recorded_bytes(numbers: Declared, part_renews: bool, recorded: int) -> tuple[int, int]:
-    """What is written of each bond or particle once, and at every record."""
-    shown = tuple(n for n in numbers if n.recorded)
-    growing = tuple(n for n in shown if n.changes and part_renews)
-    fixed = tuple(n for n in shown if n not in growing)
-    return _bytes_of(fixed, 8), _bytes_of(growing, recorded)
+def _bytes_of(dtype: str, value: int) -> int:
+    """Of one number, where numbers that are not whole take `value`."""
+    return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
 def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int) -> int:
     sizes = {"particle": particles, "axis": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     return sum(
-        math.prod(sizes.get(dim, 1) for dim in v.dims)
-        * (recorded if v.dtype == "f8" else np.dtype(v.dtype).itemsize)
+        math.prod(sizes.get(dim, 1) for dim in v.dims) * _bytes_of(v.dtype, recorded)
         for v in diagnostic.variables()
     )

@@ -55,10 +55,10 @@ class Fracturing:
         """
         radius = within / np.cos(np.pi / DIRECTIONS)
         angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-        around = [(float(np.cos(angle)), float(np.sin(angle))) for angle in angles]
+        around = np.stack([np.cos(angles), np.sin(angles)], axis=1).tolist()
         return any(
-            bool(breaks.any())
-            for along in ((0.0, 0.0), *around)
+            breaks.any()
+            for along in ([0.0, 0.0], *around)
             for *_, breaks in self._judged(u, state, "near equilibrium", radius * vector(along))
         )
 

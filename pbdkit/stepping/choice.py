@@ -38,9 +38,8 @@ def choose(scene: Scene) -> Choice:
     solver = scene.experiment.stepping
     hindrance = obstacle()
     if solver.engine == "compiled" and hindrance:
-        raise scene.experiment.located(
-            ExperimentError(f"the compiled engine cannot be had: {hindrance}", ("solver", "engine"))
-        )
+        refusal = f"the compiled engine cannot be had: {hindrance}"
+        raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
     if solver.engine == "numpy":
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
@@ -50,7 +49,7 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
-        threads = _processors() if scene.raster.count >= TWO_THREADS_PAY else 1
+        threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason)
 
@@ -72,32 +71,27 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
 
 def obstacle() -> str:
     """Why the compiled engine cannot be had; empty where it can."""
-    if find_spec("numba") is None:
-        return "numba is not installed: pip install 'pbdkit[fast]'"
-    return ""
+    return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"
 
 
 def _numpy_seconds(scene: Scene) -> float:
+    """What the numpy engine takes at most. A run that is to settle makes no more steps than a plain
+    barycentre on a body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
+    steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
+    if settle:
+        settled = (4 * max(scene.raster.shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
+        steps = min(steps, last_event(scene) + settled)
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.count / len(scene.neighbourhood.slots))
-    return a_step * _steps(scene)
+    return a_step * steps
 
 
 def _about(seconds: float) -> str:
     return f"about {seconds:.1g} s" if seconds < 10.0 else f"about {seconds:.0f} s"
 
 
-def _steps(scene: Scene) -> float:
-    """How many steps may be made: one that is to settle makes no more than a plain barycentre
-    needs on a body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
-    steps, settle = scene.experiment.steps, scene.experiment.stepping.settle
-    if settle is None:
-        return steps
-    cells = max(scene.raster.shape[1:])
-    return min(steps, last_event(scene) + (4 * cells / math.pi) ** 2 * -math.log(settle.tolerance))
-
-
-def _processors() -> int:
+def processors() -> int:
+    """Those that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

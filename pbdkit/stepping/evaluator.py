@@ -31,7 +31,7 @@ from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembered_values import changing, renew, shown
+from pbdkit.stepping.state import renew, shown
 
 Mask = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
@@ -57,13 +57,13 @@ class Evaluator:
         self._scene = scene
         self.rule: FollowerRule = scene.experiment.rule
         self._model = scene.experiment.fracture
-        self._softens = self._model if isinstance(self._model, Softens) else None
         self._p, self._q = scene.constants.rule, scene.constants.fracture
+        self._of_bond = bond_numbers(scene.experiment)
+        self._of_particle = particle_numbers(scene.experiment)
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        seen = self.seen(d, u, to)
-        return as_values(self.rule.gather(seen, to.r, to.w, self._p), "gather")
+        return as_values(self.rule.gather(self.seen(d, u, to), to.r, to.w, self._p), "gather")
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
@@ -78,11 +78,10 @@ class Evaluator:
             return d
         with blaming(model, "to place a fictitious point"):
             lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
-        if self._softens and to.c is not None:
+        if isinstance(model, Softens) and to.c is not None:
             with blaming(model, "to soften a bond"):
-                d = as_vector(self._softens.seen(d, lost, to.r, to.c, self._q), "seen", u)
-        chosen: Components = d if to.broken is None else where(to.broken, lost, d)
-        return chosen
+                d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
+        return d if to.broken is None else where(to.broken, lost, d)
 
     def move(self, total: Contributions, here: Here) -> Any:
         """From where the particle stands to its target."""
@@ -94,18 +93,23 @@ class Evaluator:
         return as_vector(self.rule.force(total, here, self._p), "force", here.u)
 
     def remember(self, total: Contributions, here: Here) -> Contributions:
-        """The new values of the particle's numbers that change; none where the rule has none."""
-        if not isinstance(self.rule, RenewsParticles):
-            return ()
+        """The new values of the particle's numbers that change."""
+        assert isinstance(self.rule, RenewsParticles)
         return as_values(self.rule.remember(total, here, self._p), "remember")
+
+    def renew_particles(
+        self, total: Contributions, here: Here, own: Sequence[Any], where: Mask | None
+    ) -> None:
+        """Writes the new values over what is remembered of particles, in place, where asked for."""
+        if isinstance(self.rule, RenewsParticles):
+            renew(self._of_particle, own, self.remember(total, here), where)
 
     def renew_bonds(
         self, d: Components, r: Components, limits: Any, own: Sequence[Any], intact: Mask
     ) -> None:
         """Writes the new values over what is remembered of bonds, in place, where they hold."""
         if isinstance(self._model, RenewsBonds):
-            numbers = bond_numbers(self._scene.experiment)
-            renew(changing(numbers, own), self.update(d, r, limits, own), intact)
+            renew(self._of_bond, own, self.update(d, r, limits, own), intact)
 
     def update(self, d: Any, r: Any, limits: Any, own: Sequence[Any]) -> Contributions:
         """The new values of the bonds' numbers that change."""
@@ -131,8 +135,8 @@ class Evaluator:
 
     def initial_own(self) -> Any:
         """What a particle remembers at the start, unless it is drawn."""
-        numbers = particle_numbers(self._scene.experiment)
-        return self._scene.constants.of_particle(*(number.initial for number in numbers))
+        initial = (number.initial for number in self._of_particle)
+        return self._scene.constants.of_particle(*initial)
 
 
 def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:

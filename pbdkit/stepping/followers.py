@@ -1,19 +1,23 @@
-"""What moves followers: a rule's move, then relaxation and memory."""
+"""What moves followers: a rule's move, then relaxation and memory. Their neighbours stay as they
+are, or are found anew at every step, by distance (model.md, section 4)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from operator import add
 from typing import Any
 
 import numpy as np
 
 from pbdkit.experiment.solvers import Stepping
-from pbdkit.interfaces import Here, RenewsParticles, StoresEnergy
-from pbdkit.scene.declarations import particle_numbers
+from pbdkit.interfaces import Components, Here, StoresEnergy
+from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.vector import vector
+from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.raster import positions
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Contributions, Evaluator
-from pbdkit.stepping.remembered_values import changing, renew
+from pbdkit.stepping.evaluator import Contributions, Evaluator, Mask, Neighbour
 from pbdkit.stepping.state import Floats, State
 from pbdkit.stepping.surroundings import Surroundings, blocks
 
@@ -57,42 +61,43 @@ class SlotFollowers(Followers):
     def __init__(self, scene: Scene, solver: Stepping | None = None) -> None:
         self._scene = scene
         self._solver = solver or scene.experiment.stepping
-        self._rule = scene.experiment.rule
         self._inner = SlotFollowers(scene.inner, Stepping()) if scene.inner else None
-        self._numbers = particle_numbers(scene.experiment)
         self._evaluator = Evaluator(scene)
         self._blocks = blocks(scene)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
         for around, total, here in self._summed(m, state):
-            self._place(around, self._evaluator.move(total, here), m, new)
-            if isinstance(self._rule, RenewsParticles):
-                own = changing(self._numbers, around.own(state))
-                renew(own, self._evaluator.remember(total, here), around.movable)
+            planes = around.where.of(m), self._evaluator.move(total, here), around.where.of(new)
+            for u, move, plane in zip(*planes, strict=True):
+                _write(plane, target(u, move, plane, self._solver), around.movable, u)
+            self._evaluator.renew_particles(total, here, around.own(state), around.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        out = np.zeros_like(m)
-        for around, total, here in self._summed(m, state):
-            _write(self._evaluator.move(total, here), around, out)
-        return out
+        return self._of_all(self._evaluator.move, m, state)
 
     def forces(self, m: Floats, state: State) -> Floats:
         """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
         zero where there is no neighbour."""
+        return self._of_all(self._evaluator.force, m, state)
+
+    def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
+        """What a function makes of the sums of contributions, zero where there is none."""
         out = np.zeros_like(m)
         for around, total, here in self._summed(m, state):
-            _write(self._evaluator.force(total, here), around, out)
+            for value, plane in zip(function(total, here), around.where.of(out), strict=True):
+                _write(plane, value, around.movable, 0.0)
         return out
 
     def energy(self, m: Floats, state: State) -> float:
         """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
-        if not isinstance(self._rule, StoresEnergy):
+        if not isinstance(self._scene.experiment.rule, StoresEnergy):
             return self._work(m, self.forces(m, state))
-        seen, out = self._seen(m, state), np.zeros_like(m[:1])
+        seen, out = self._seen(m, state), np.zeros_like(m[0])
         for around in self._blocks:
-            _write(around.sums(self._evaluator.energy, seen, state), around, out)
+            (value,) = around.sums(self._evaluator.energy, seen, state)
+            _write(around.where.of(out), value, around.movable, 0.0)
         return float(out.sum())
 
     def _work(self, u: Floats, forces: Floats) -> float:
@@ -121,15 +126,100 @@ class SlotFollowers(Followers):
             total = around.sums(self._evaluator.contribution, seen, state)
             yield around, total, around.here(seen, state)
 
-    def _place(self, around: Surroundings, move: Any, m: Floats, new: Floats) -> None:
-        """Writes where the particles of a block go."""
-        u, out = around.where.of(m), around.where.of(new)
-        for here, step, plane in zip(u, move, out, strict=True):
-            moved = target(here, step, plane, self._solver)
-            plane[...] = moved if around.movable is None else np.where(around.movable, moved, here)
+
+def _write(plane: Floats, value: Any, where_: Mask | None, otherwise: Any) -> None:
+    plane[...] = value if where_ is None else np.where(where_, value, otherwise)
 
 
-def _write(values: Any, around: Surroundings, out: Floats) -> None:
-    """The values of the particles that have neighbours, a plane each."""
-    for value, plane in zip(values, around.where.of(out), strict=True):
-        plane[...] = value if around.movable is None else np.where(around.movable, value, 0.0)
+class GatheringFollowers(Followers):
+    """Moves the followers of a scene in which neighbours come and go.
+
+    The same `gather` and `apply` run on tables: a row a pair of neighbours, a row a particle.
+    Neighbours of the reference configuration are summed first, in the order of their slots and with
+    the rest offsets of these, so that a body at rest stays as it is, exactly.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        raster, near = scene.raster, scene.experiment.neighbours.nearness()
+        assert near
+        self._scene, self._evaluator = scene, Evaluator(scene)
+        self._none = next(iter(scene.constants.weights.values()))
+        everybody = np.arange(raster.count)
+        self.place, self.body = raster.place_of(everybody), raster.body_rows
+        self._site = raster.cells_of(everybody)
+        local = positions(raster.lattice.cell(), *self._site)
+        self.X = np.stack(local)
+        self._at = local.each(np.add, raster.lattice.origin)
+        self._centred = local.each(np.subtract, scene.middle)
+        self._rank, self._rest = _tables(scene.neighbourhood)
+        self._scale = np.sqrt(np.array(near.weights))
+        self._radius = near.radius * (1 + 1e-9)
+
+    def move(self, m: Floats, new: Floats, state: State) -> None:
+        """Bonds do not last here, so that none can be broken."""
+        flat, count = new.reshape(len(new), -1), len(self.place)
+        u, before = m.reshape(len(m), -1)[:, self.place], flat[:, self.place]
+        j, k, rest = self.pairs(m)
+        to = Neighbour(vector(rest), self._none)
+        d = vector(u[:, k] - u[:, j])
+        parts = self._evaluator.contribution(d, vector(u[:, j]), to)
+        total = tuple(_summed(part, j, count) for part in parts)
+        own = [value.ravel()[self.place] for value in state.particle_values]
+        of_particle = self._scene.constants.of_particle(*own)
+        here = Here(vector(u), self._at, self._centred, of_particle)
+        move = self._evaluator.move(total, here)
+        movable = self.body[np.bincount(j, minlength=count)[self.body] > 0]
+        place = self.place[movable]
+        self._evaluator.renew_particles(total, here, own, None)
+        for values, renewed in zip(state.particle_values, own, strict=True):
+            values.reshape(-1)[place] = renewed[movable]
+        flat[:, self.place[self.body]] = u[:, self.body]
+        solver = self._scene.experiment.stepping
+        for plane, here_, step, was in zip(flat, u, move, before, strict=True):
+            plane[place] = target(here_, step, was, solver)[movable]
+
+    def pairs(self, m: Floats) -> tuple[Indices, Indices, Floats]:
+        """(j, k, rest): in the configuration m every body particle j with each of its neighbours k
+        and the rest offset, (axis, pair), sorted by j, by slot and by k."""
+        from scipy.spatial import cKDTree
+
+        x = self.X + m.reshape(len(m), -1)[:, self.place]
+        tree = cKDTree(x.T * self._scale)
+        pairs = tree.query_pairs(self._radius, output_type="ndarray").astype(np.intp)
+        both = np.concatenate([pairs, pairs[:, ::-1]])
+        j, k = both[np.isin(both[:, 0], self.body)].T
+        rank, rest = self._of_slots(j, k)
+        # One key for (j, slot, k) sorts faster than three.
+        order = np.argsort((j * (len(self._rest[0]) + 1) + rank) * len(self.place) + k)
+        return j[order], k[order], rest[:, order]
+
+    def _of_slots(self, j: Indices, k: Indices) -> tuple[Indices, Floats]:
+        """The number of each pair's slot, the largest of all where it is none, and the rest offset,
+        (axis, pair)."""
+        s, *cells = self._site
+        sizes = np.array(self._rank.shape[2:])[:, None]
+        step = np.stack([n[k] - n[j] for n in cells]) + sizes // 2
+        near = ((step >= 0) & (step < sizes)).all(axis=0)
+        rank, rest = np.full(len(j), len(self._rest[0])), self.X[:, k] - self.X[:, j]
+        rank[near] = self._rank[(s[j[near]], s[k[near]], *step[:, near])]
+        known = rank < len(self._rest[0])
+        rest[:, known] = self._rest[:, rank[known]]
+        return rank, rest
+
+
+def _tables(neighbourhood: Neighbourhood) -> tuple[Indices, Floats]:
+    """The number of a slot by (sublattice, sublattice, step of cells along each axis), the count of
+    slots where there is none; and the rest offset by that number, (axis, slot)."""
+    slots = [slot for own in neighbourhood.slots for slot in own]
+    reach, size = neighbourhood.reach_in_cells, len(neighbourhood.slots)
+    rank = np.full((size, size, *(2 * n + 1 for n in reach)), len(slots))
+    for number, slot in enumerate(slots):
+        rank[(slot.source, slot.target, *map(add, slot.cell, reach))] = number
+    return rank, np.array([slot.rest for slot in slots]).T
+
+
+def _summed(part: Any, owner: Indices, count: int) -> Any:
+    """Σ over the pairs of each owner, in their order."""
+    if isinstance(part, Components):
+        return part.each(lambda values: _summed(values, owner, count))
+    return np.bincount(owner, np.broadcast_to(part, owner.shape), count)

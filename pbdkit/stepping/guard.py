@@ -61,12 +61,7 @@ class Guard:
         raise FloatingPointError(f"particle {worst + 1}, found at step {state.step},")
 
     def last_good(
-        self,
-        scene: Scene,
-        engine: Engine,
-        before: int,
-        patience: int,
-        stopping: Callable[[], bool],
+        self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
     ) -> State | None:
         """The last good state before a step, found by stepping once more, `patience` steps a call,
         from where the guard kept a copy; None where `stopping` says so meanwhile."""

@@ -10,10 +10,9 @@ import numpy as np
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
-from pbdkit.stepping.followers import Followers, SlotFollowers
-from pbdkit.stepping.moving_neighbours import GatheringFollowers
+from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import State
 
 
 class Engine(ABC):
@@ -38,10 +37,8 @@ class Stepper(Engine):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
-        near = scene.experiment.neighbours.nearness()
-        self._followers: Followers = followers or (
-            GatheringFollowers(scene, near) if near else SlotFollowers(scene)
-        )
+        kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
+        self._followers = followers or kind(scene)
 
     def advance(self, state: State, steps: int = 1) -> State:
         """One step after the other."""
@@ -61,11 +58,7 @@ class Stepper(Engine):
             self._followers.move(u, new, state)
         place(new, led)
         place(u, before)
-        self._move_frame(u, new)
-        return replace(state, step=step, u=new, previous=u, starts=starts)
-
-    def _move_frame(self, old: Floats, new: Floats) -> None:
-        """u of every frame point from the body's, of this step or, with lag, of the last."""
         if self._scene.frame:
-            body = old if self._scene.frame.map.lag else new
-            self._scene.frame.follow(body.reshape(len(body), -1), new.reshape(len(new), -1))
+            body = u if self._scene.frame.map.lag else new
+            self._scene.frame.follow(body.reshape(len(u), -1), new.reshape(len(u), -1))
+        return replace(state, step=step, u=new, previous=u, starts=starts)

@@ -18,17 +18,16 @@ Starts = tuple[Floats | None, ...]
 def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
     """The leaders of a step with their displacements, and where each motion has started."""
     led: Led = []
-    starts = list(state.starts)
-    for n, leading in enumerate(scene.leading):
-        if not leading.group.leads(step):
-            continue
-        begun = starts[n]
-        if begun is None:
-            starts[n] = begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
-        n_th = step - leading.group.from_ + 1
-        offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
-        led.append((leading.place, begun + np.atleast_2d(offset).T))
-    if scene.leaders_overlap:
+    starts: list[Floats | None] = []
+    for leading, begun in zip(scene.leading, state.starts, strict=True):
+        if leading.group.leads(step):
+            if begun is None:
+                begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
+            n_th = step - leading.group.from_ + 1
+            offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
+            led.append((leading.place, begun + np.atleast_2d(offset).T))
+        starts.append(begun)
+    if scene.leaders_overlap and len(led) > 1:
         _refuse_contradiction(scene, led, step)
     return led, tuple(starts)
 
@@ -36,15 +35,13 @@ def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
 def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     """What could not be known before: groups that move one particle differently from where it
     stands."""
-    if len(led) < 2:
-        return
     places = np.concatenate([p for p, _ in led])
     u = np.concatenate([v for _, v in led], axis=1)
     order = np.argsort(places, kind="stable")
-    same = np.diff(places[order]) == 0
     apart = np.abs(np.diff(u[:, order], axis=1)).max(axis=0) > 1e-9 * max(1.0, np.abs(u).max())
-    if (same & apart).any():
-        place = places[order][:-1][same & apart][:1]
+    clashes = np.flatnonzero((np.diff(places[order]) == 0) & apart)
+    if len(clashes):
+        place = places[order[clashes[:1]]]
         number = int(scene.raster.rows_at(*np.unravel_index(place, scene.raster.shape))[0]) + 1
         raise ExperimentError(
             f"two groups move particle {number} differently in step {step}; select it in one of "

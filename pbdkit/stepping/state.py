@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from operator import sub
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Pair, StartsCracked
+from pbdkit.errors import PluginError
+from pbdkit.interfaces import (
+    Bonds,
+    Draws,
+    FollowerRule,
+    FractureModel,
+    Particles,
+    Remembered,
+    StartsCracked,
+)
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.fracture_model import Segment
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, crosses, plane_block
+from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.remembered_values import Values, initial_bond_values, initial_particle_values
 
+Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]
+Values = tuple[Array, ...]
+"""One array a number that is remembered, in the order in which the part declares them."""
 
 
 @dataclass
@@ -45,45 +64,50 @@ class State:
         """The same state in arrays of its own, or in those of a state of the same scene that
         nobody needs any more: memory that is new costs several times as much as what is copied."""
         if over is None:
-            over = replace(self, **{name: _copied(getattr(self, name)) for name in _CARRIED})
-        else:
-            for name in _CARRIED:
-                _copy(getattr(self, name), getattr(over, name))
+            return deepcopy(self)
+        for mine, others in zip(self._arrays(), over._arrays(), strict=True):
+            np.copyto(others, mine)
         return replace(over, step=self.step, starts=self.starts)
 
-
-_CARRIED = ("u", "previous", "broken_step", "broken_length", "bond_values", "particle_values")
-"""What steps are written into."""
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(array.copy() for array in value)
-    return None if value is None else value.copy()
+    def _arrays(self) -> list[Array]:
+        """What steps are written into."""
+        bonds = (self.broken_step, self.broken_length, *self.bond_values)
+        carried = (self.u, self.previous, *bonds, *self.particle_values)
+        return [array for array in carried if array is not None]
 
 
-def _copy(value: Any, over: Any) -> None:
-    if value is not None:
-        for array, target in zip(_each(value), _each(over), strict=True):
-            np.copyto(target, array)
+def unmoved_state(scene: Scene, cells: Sequence[int]) -> State:
+    """The state at time 0 on rasters of so many cells: nothing is displaced, broken or drawn."""
+    experiment, sites = scene.experiment, (scene.raster.shape[0], *cells)
+    bonds, precision = (len(scene.neighbourhood.planes), *cells), experiment.stepping.precision
+    u, previous = (np.zeros((scene.axes, *sites), precision) for _ in range(2))
+    broken, lengths = None, None
+    if scene.has_fracture:
+        broken, lengths = np.full(bonds, -1, np.int32), np.zeros(bonds, precision)
+    kept = bond_numbers(experiment), particle_numbers(experiment)
+    values = (started(scene, *of) for of in zip(kept, (bonds, sites), strict=True))
+    return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), *values)
 
 
-def _each(value: Any) -> tuple[Any, ...]:
-    return value if isinstance(value, tuple) else (value,)
+def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -> Values:
+    """Arrays of remembered numbers at their `initial`."""
+    precision = scene.experiment.stepping.precision
+    dtypes = [precision if number.dtype == "f8" else number.dtype for number in numbers]
+    return tuple(np.full(shape, n.initial, d) for n, d in zip(numbers, dtypes, strict=True))
 
 
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
     the given cracks broken at step 0. Nothing has moved before."""
-    shape, precision = (scene.axes, *scene.raster.shape), scene.experiment.stepping.precision
-    u, previous = np.zeros(shape, precision), np.zeros(shape, precision)
-    if not scene.experiment.initial.at_rest:
-        _displace(scene, u.reshape(scene.axes, -1))
-        previous[...] = u
-    broken = _broken_by_cracks(scene) if scene.has_fracture else None
-    lengths = None if broken is None else np.zeros(broken.shape, precision)
-    bonds, particles = initial_bond_values(scene), initial_particle_values(scene)
-    return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), bonds, particles)
+    experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
+    if not experiment.initial.at_rest:
+        _displace(scene, state.u.reshape(scene.axes, -1))
+        state.previous[...] = state.u
+    if state.broken_step is not None and isinstance(experiment.fracture, StartsCracked):
+        _crack(scene, experiment.fracture.segments(), state.broken_step)
+    _draw(scene, "fracture", bond_numbers(experiment), state.bond_values)
+    _draw(scene, "rule", particle_numbers(experiment), state.particle_values)
+    return state
 
 
 def _displace(scene: Scene, u: Floats) -> None:
@@ -97,24 +121,96 @@ def _displace(scene: Scene, u: Floats) -> None:
         scene.frame.follow(u, u)
 
 
-def _broken_by_cracks(scene: Scene) -> NDArray[np.int32]:
-    """(plane, cell, cell): 0 where a bond crosses a crack of the experiment, else -1."""
-    raster, planes, model = scene.raster, scene.neighbourhood.planes, scene.experiment.fracture
-    cracks = model.segments() if isinstance(model, StartsCracked) else ()
-    broken = np.full((len(planes), *raster.shape[1:]), -1, np.int32)
-    for n, plane in enumerate(planes):
-        block = plane_block(raster, plane)
-        for a, b in cracks if block else ():
-            assert block is not None
-            crack = (_from_origin(scene, a), _from_origin(scene, b))
+def _crack(scene: Scene, cracks: Sequence[Segment], broken: NDArray[np.int32]) -> None:
+    """Breaks the bonds, (plane, cell, cell), that cross a crack, at step 0."""
+    raster, origin = scene.raster, scene.experiment.lattice.origin
+    for n, plane in enumerate(scene.neighbourhood.planes if cracks else ()):
+        if block := plane_block(raster, plane):
             start = raster.reference_planes(block)
-            end = start + plane.slot.rest
-            crossed = crosses(start, end, crack) & bonds_in(raster, block, plane, frame_too=True)
-            broken[(n, *block.slices()[1:])][crossed] = 0
-    return broken
+            bonds = bonds_in(raster, block, plane, frame_too=True)
+            for crack in cracks:
+                # As the rasters count: from the lattice's site (0, 0).
+                a, b = (tuple(map(sub, point, origin)) for point in crack)
+                crossed = bonds & crosses(start, start + plane.slot.rest, (a, b))
+                block.within(broken[n])[crossed] = 0
 
 
-def _from_origin(scene: Scene, point: Pair) -> Pair:
-    """A point as the rasters count: from the lattice's site (0, 0)."""
-    x, y = scene.experiment.lattice.origin
-    return point[0] - x, point[1] - y
+def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Values) -> None:
+    """Writes where the numbers of the part at a field start, if it draws them; those of frame
+    points are left out."""
+    part: FractureModel | FollowerRule = getattr(scene.experiment, field)
+    if not (numbers and isinstance(part, Draws)):
+        return
+    owners: Bonds | Particles = describe_particles(scene)
+    place = scene.raster.place_of(scene.raster.body_rows)
+    if field == "fracture":
+        owners, bonds = describe_bonds(scene), scene.bonds
+        place = bonds.plane * math.prod(scene.raster.shape[1:]) + bonds.place
+    generator = generator_for(scene.experiment.seed, field)
+    with blaming(part, "to draw where its numbers start", field):
+        array_of = {number.name: value for number, value in zip(numbers, values, strict=True)}
+        for name, value in part.draw(owners, generator).items():
+            if name not in array_of:
+                raise PluginError(
+                    f"'{part.type}' draws '{name}', which it does not remember"
+                    f"{did_you_mean(name, array_of)}"
+                )
+            if np.shape(value) != (len(owners),) or not np.isfinite(value).all():
+                raise PluginError(
+                    f"'{part.type}' draws '{name}' with the shape {np.shape(value)}, finite: "
+                    f"{bool(np.isfinite(value).all())}; needed are ({len(owners)},) finite numbers"
+                )
+            array_of[name].reshape(-1)[place] = value
+
+
+def generator_for(seed: int, part: str) -> np.random.Generator:
+    """The random numbers of one part of the experiment, by its field: the same whatever other parts
+    draw."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(part.encode())))
+
+
+def describe_particles(scene: Scene) -> Particles:
+    """The particles of the body with their places."""
+    rows = scene.raster.body_rows
+    return Particles(rows.astype(np.int64) + 1, scene.raster.reference(rows))
+
+
+def describe_bonds(scene: Scene) -> Bonds:
+    """The table of bonds with their places."""
+    table, raster = scene.bonds, scene.raster
+    rests = np.array([plane.slot.rest for plane in scene.neighbourhood.planes])
+    rest = rests[table.plane]
+    return Bonds(table.ends + 1, table.shell, rest, raster.reference(table.ends[:, 0]) + rest / 2)
+
+
+def renew(
+    numbers: Sequence[Remembered], own: Sequence[Array], new: Sequence[Any], where: Array | None
+) -> None:
+    """Writes the new values of the numbers that change over what is remembered, in place, where it
+    is asked for (None: everywhere); all are there before any is written.
+
+    Raises ValueError for another number of values, TypeError for fractions of an integer.
+    """
+    old = [value for number, value in zip(numbers, own, strict=True) if number.changes]
+    if len(new) != len(old):
+        raise ValueError(
+            f"it returned {len(new)} value{'s' * (len(new) != 1)}, and it remembers {len(old)} "
+            "that change: declare `changes=False` for those that stay"
+        )
+    fresh = [
+        np.array(value) if where is None else np.where(where, value, plane)
+        for plane, value in zip(old, new, strict=True)
+    ]
+    for plane, value in zip(old, fresh, strict=True):
+        np.copyto(plane, value)
+
+
+def shown(values: Iterable[Any]) -> tuple[Any, ...]:
+    """The same, as components see it: nobody writes to the state but the stepper."""
+    return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in values)
+
+
+def _read_only(value: Array) -> Array:
+    view = value.view()
+    view.flags.writeable = False
+    return view

@@ -15,11 +15,12 @@ from pbdkit.scene.places import Where
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Contributions, Mask, Neighbour, summed
-from pbdkit.stepping.remembered_values import shown
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import State, shown
 
 BLOCK_CELLS = 16384
 """Places a block: small enough for its temporaries to stay in the cache."""
+Contributing = Callable[[Components, Components, Neighbour], Contributions]
+"""What a neighbour contributes, given d and u."""
 
 
 class Surroundings:
@@ -59,20 +60,15 @@ class Surroundings:
     def here(self, u: NDArray[Any], state: State) -> Here:
         """What stands at the particles."""
         own = self._scene.constants.of_particle(*shown(self.own(state)))
-        return Here(read_only(vector(self.where.of(u))), *self._reference, own)
+        return Here(vector(shown(self.where.of(u))), *self._reference, own)
 
     def own(self, state: State) -> list[NDArray[Any]]:
         """What is remembered of the particles; of a block, views into the state."""
         return [self.where.of(value) for value in state.particle_values]
 
-    def sums(
-        self,
-        function: Callable[[Components, Components, Neighbour], Contributions],
-        u: NDArray[Any],
-        state: State,
-    ) -> Contributions:
+    def sums(self, function: Contributing, u: NDArray[Any], state: State) -> Contributions:
         """Σ function(d, u, neighbour), as the evaluator's `contribution` is."""
-        own = read_only(vector(self.where.of(u)))
+        own = vector(shown(self.where.of(u)))
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
         return summed((function(d, own, to), to.present) for d, to in parts)
 
@@ -101,28 +97,17 @@ class Surroundings:
 
 def blocks(scene: Scene) -> list[Surroundings]:
     """The surroundings of the body's particles, block by block."""
-    whole = ((s, scene.raster.body_block(s)) for s in range(scene.raster.shape[0]))
     return [
         Surroundings(scene, part, s)
-        for s, block in whole
-        if block
+        for s in range(scene.raster.shape[0])
+        if (block := scene.raster.body_block(s))
         for part in block.rows(BLOCK_CELLS)
     ]
-
-
-def read_only(v: Any) -> Any:
-    """The same, as components hand it to a rule: nobody writes to the state but the stepper."""
-    for plane in v:
-        plane.flags.writeable = False
-    return v
 
 
 def presence(raster: Raster, place: Where, slots: Sequence[Slot]) -> list[Mask | None]:
     """For each slot, where the neighbour exists, None where it does everywhere; only places with a
     particle count."""
     nobody = place.of(raster.kind) == EMPTY
-    found: list[Mask | None] = []
-    for slot in slots:
-        present = place.seen_through(slot).of(raster.kind) != EMPTY
-        found.append(None if (present | nobody).all() else present)
-    return found
+    there = (place.seen_through(slot).of(raster.kind) != EMPTY for slot in slots)
+    return [None if (present | nobody).all() else present for present in there]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -12,16 +11,18 @@ from typing import Any, Literal
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Component, Lattice, NeighbourMetric
-from pbdkit.interfaces.component import AnswerError
-from pbdkit.registry.blame import remedy
-from pbdkit.testing.fault import NotAskedError, PropertyError
+from pbdkit.registry.blame import worded
 from pbdkit.testing.properties import properties_of
-from pbdkit.testing.property import Property
-from pbdkit.testing.subject import Subject, examples_of, full_name
+from pbdkit.testing.subject import (
+    NotAskedError,
+    Property,
+    PropertyError,
+    Subject,
+    examples_of,
+    full_name,
+)
 
 State = Literal["held", "failed", "skipped"]
-NEEDED = "has-examples"
-"""The one property of a class: that components can be made of it."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,8 @@ class Report:
     def summary(self) -> str:
         """One line: how many ran and failed, and why others were skipped."""
         reasons = Counter(o.reason for o in self.skipped)
-        skipped = "; ".join(f"{n} skipped: {reason}" for reason, n in reasons.items())
-        counts = f"{len(self.ran)} properties ran, {len(self.failed)} failed"
-        return f"{self.component}: {counts}" + (f"; {skipped}" if skipped else "")
+        counts = f"{self.component}: {len(self.ran)} properties ran, {len(self.failed)} failed"
+        return "; ".join([counts, *(f"{n} skipped: {why}" for why, n in reasons.items())])
 
     def __str__(self) -> str:
         wide = max((len(o.property) for o in self.outcomes), default=0)
@@ -90,10 +90,11 @@ def _judged(asked: Property, subject: Subject) -> Outcome:
         asked.check(subject)
     except NotAskedError as reason:
         return Outcome(asked.name, "skipped", str(reason))
-    except (PropertyError, AnswerError) as fault:
+    except PropertyError as fault:
         return Outcome(asked.name, "failed", str(fault))
     except Exception as error:
-        return Outcome(asked.name, "failed", _told(error))
+        package = type(subject.component).__module__.split(".")[0]
+        return Outcome(asked.name, "failed", worded(error, package))
     return Outcome(asked.name, "held")
 
 
@@ -101,15 +102,14 @@ def examine(component: Component | type[Component], **parts: Any) -> Report:
     """The report of one component; a class stands for its first example. `parts` of an experiment
     (lattice=..., neighbours=...) stand in for those that are tried, for a component that goes with
     them alone. Of a class of which none can be made the report says why."""
-    try:
-        one = examples_of(component)[0] if isinstance(component, type) else component
-    except PluginError as error:
-        return _nothing(component, error)
+    one: Any = component
+    if isinstance(component, type):
+        try:
+            one = examples_of(component)[0]
+        except PluginError as error:
+            # The one property of a class: that components can be made of it.
+            return Report(component.__name__, (Outcome("has-examples", "failed", str(error)),))
     return Report(full_name(one), tuple(_outcomes(one, parts)))
-
-
-def _nothing(component: Any, error: PluginError) -> Report:
-    return Report(component.__name__, (Outcome(NEEDED, "failed", str(error)),))
 
 
 def examine_all(components: Sequence[type[Component]]) -> Iterator[Report]:
@@ -119,44 +119,28 @@ def examine_all(components: Sequence[type[Component]]) -> Iterator[Report]:
     that are offered beside it.
     """
     for component in components:
-        try:
-            examples = examples_of(component)
-        except PluginError as error:
-            yield _nothing(component, error)
-            continue
-        yield from (_examined(example, components) for example in examples)
+        for example in _made(component) or (component,):
+            yield _examined(example, components)
 
 
-def _examined(component: Component, beside: Sequence[type[Component]]) -> Report:
-    report = examine(component)
-    if all(outcome.property != "takes-part" for outcome in report.failed):
+def _examined(one: Component | type[Component], beside: Sequence[type[Component]]) -> Report:
+    report = examine(one)
+    takes_part = all(outcome.property != "takes-part" for outcome in report.failed)
+    if takes_part or isinstance(one, (Lattice, NeighbourMetric)):
         return report
-    lattices, metrics = _offered(Lattice, beside), _offered(NeighbourMetric, beside)
-    own = [{"lattice": lattices}, {"neighbours": metrics}]
-    for parts in (*own, own[0] | own[1]):
-        if all(parts.values()) and not isinstance(component, (Lattice, NeighbourMetric)):
-            found = examine(component, **parts)
-            if found.holds:
-                return found
+    lattices = {"lattice": [e for c in beside if issubclass(c, Lattice) for e in _made(c)]}
+    around = {"neighbours": [e for c in beside if issubclass(c, NeighbourMetric) for e in _made(c)]}
+    for parts in (lattices, around, lattices | around):
+        if all(parts.values()) and (found := examine(one, **parts)).holds:
+            return found
     return report
 
 
-def _offered(interface: type[Component], offered: Sequence[type[Component]]) -> list[Component]:
-    """Examples of the classes that implement the interface, as far as they can be made."""
-    found: list[Component] = []
-    for component in offered:
-        with suppress(PluginError):
-            found += examples_of(component) if issubclass(component, interface) else []
-    return found
-
-
-def _told(error: Exception) -> str:
-    """What a component's own code has raised, and the last line of it that has."""
-    cause = error.__cause__ or error
-    frames = traceback.extract_tb(cause.__traceback__)
-    own = [f for f in frames if "/pbdkit/" not in f.filename.replace("\\", "/")] or frames
-    told = f"{type(error).__name__}: {error}{remedy(error)}"
-    return f"{told} ({own[-1].filename}, line {own[-1].lineno})"
+def _made(component: type[Component]) -> list[Component]:
+    """The examples of a class; none where none can be made."""
+    with suppress(PluginError):
+        return examples_of(component)
+    return []
 
 
 def conformance(*components: Component | type[Component], **parts: Any) -> Any:
@@ -173,11 +157,9 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
 
     if not components:
         raise ValueError("conformance() is given no component")
-    tried = [
-        one
-        for given in components
-        for one in (examples_of(given) if isinstance(given, type) else [given])
-    ]
+    tried: list[Component] = []
+    for given in components:
+        tried += examples_of(given) if isinstance(given, type) else [given]
     report_of = cache(lambda n: examine(tried[n], **parts))
     cases = [
         pytest.param(n, asked.name, id=f"{full_name(one)}-{asked.name}")

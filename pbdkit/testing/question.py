@@ -1,12 +1,14 @@
 """A question: one call of a component with arrays that are kept; and all that can be asked.
 
-Inputs and answers are trees: arrays and numbers in vectors, tuples, lists and dicts.
+Inputs and answers are trees: arrays and numbers in vectors, tuples, lists and dicts; answers also
+in dataclasses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -31,17 +33,17 @@ from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
-from pbdkit.stepping.remembered_values import generator_for
+from pbdkit.stepping.state import generator_for
 from pbdkit.testing.states import (
     SEED,
     SHAPE,
+    Shown,
     differences,
     frame_showing,
     here,
     moment_of,
     owners,
     remembers,
-    shown,
 )
 
 Arrays = dict[str, Any]
@@ -52,8 +54,9 @@ def flat(tree: Any, name: str = "") -> Arrays:
     """The arrays and numbers of a tree by name."""
     if isinstance(tree, Components):
         parts = {f"{name}.{c}".lstrip("."): v for c, v in zip("xyz", tree, strict=False)}
-    elif isinstance(tree, dict):
-        parts = tree
+    elif isinstance(tree, dict) or is_dataclass(tree):
+        named = tree if isinstance(tree, dict) else vars(tree)
+        parts = {f"{name}.{key}".lstrip("."): part for key, part in named.items()}
     elif isinstance(tree, (tuple, list)):
         parts = {f"{name}{n}": v for n, v in enumerate(tree)}
     else:
@@ -94,18 +97,10 @@ class Question:
         return {name: np.array(value) for name, value in flat(self.asked(change)).items()}
 
 
+@singledispatch
 def questions_of(component: Component, scene: Scene, seed: int) -> list[Question]:
     """Those that its interface allows."""
-    makers: dict[type[Component], Callable[..., list[Question]]] = {
-        FollowerRule: _to_rule,
-        FractureModel: _to_fracture_model,
-        FramePolicy: _to_frame,
-        Diagnostic: _to_diagnostic,
-        Lattice: _to_lattice,
-        NeighbourMetric: _to_metric,
-    }
-    make = next(m for interface, m in makers.items() if isinstance(component, interface))
-    return make(component, scene, seed)
+    raise TypeError(f"{type(component).__name__} is of no interface")
 
 
 def gathered(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
@@ -125,16 +120,17 @@ def _standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
     return Here(u, place, place, scene.constants.of_particle(*own))
 
 
+@questions_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
-    """`gather` and `apply`; `remember`, `force` and `draw` where it has them."""
-    d, evaluator = differences(scene, seed), Evaluator(scene)
+    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force` and `draw`
+    where it has them."""
+    d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
     gather = Question("gather", {"d": d}, lambda d: gathered(scene, d), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
         return [gather]  # they cannot be summed, which is found elsewhere
-    total = each(
-        lambda t: np.broadcast_to(t, SHAPE).copy(), summed((c, None) for c in contributions)
-    )
+    sums = summed((c, None) for c in contributions)
+    total = each(lambda t: np.broadcast_to(t, SHAPE).copy(), sums)
     asks: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
     if isinstance(rule, RenewsParticles):
         asks["remember"] = evaluator.remember
@@ -142,48 +138,50 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
         asks["force"] = evaluator.force
 
     def question(what: str) -> Question:
-        def ask(total: Any, **at: Any) -> Any:
-            return asks[what](total, _standing(scene, **at))
+        def ask(total: Any, **to: Any) -> Any:
+            return asks[what](total, _standing(scene, **to))
 
-        return Question(what, {"total": total} | here(scene, seed), ask, elementwise=True)
+        return Question(what, {"total": total} | at, ask, elementwise=True)
 
-    return [gather, *map(question, asks), *_to_draw(rule, scene)]
+    slots = zip(d, scene.neighbourhood.slots[0], strict=True)
+    meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
+    what = "apply, where all neighbours meet in the particle,"
+    met = Question(what, meeting | at, lambda d, **to: applied(scene, gathered(scene, d), **to))
+    return [gather, *map(question, asks), met, *_to_draw(rule, scene)]
 
 
+@questions_of.register
 def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Question]:
     """`breaks` and `fictitious`; `update`, `seen` and `draw` where it has them."""
-    slots, p, limits = (
-        scene.neighbourhood.slots[0],
-        scene.constants.fracture,
-        scene.constants.limits,
-    )
-    evaluator = Evaluator(scene)
+    slots, evaluator = scene.neighbourhood.slots[0], Evaluator(scene)
+    p, limits = scene.constants.fracture, scene.constants.limits
 
-    def breaks(d: Any, own: Any) -> Any:
-        return [evaluator.breaks(v, s.rest, limits[s], own) for v, s in zip(d, slots, strict=True)]
+    def question(what: str, ask: Callable[..., Any], **inputs: Any) -> Question:
+        """One that is asked along every slot, with the difference along it where there are `d`."""
 
-    def update(d: Any, own: Any) -> Any:
-        return [evaluator.update(v, s.rest, limits[s], own) for v, s in zip(d, slots, strict=True)]
+        def along(d: Any = slots, **given: Any) -> Any:
+            return [ask(v, s.rest, limits[s], **given) for v, s in zip(d, slots, strict=True)]
 
-    def fictitious(u: Any) -> Any:
-        return [as_vector(model.fictitious(u, s.rest, p), "fictitious", u) for s in slots]
+        return Question(what, inputs, along, elementwise=True)
 
-    def seen(d: Any, own: Any, lost: Any) -> Any:
+    def fictitious(_: Any, r: Any, __: Any, u: Any) -> Any:
+        return as_vector(model.fictitious(u, r, p), "fictitious", u)
+
+    def seen(d: Any, r: Any, limits: Any, own: Any, lost: Any) -> Any:
         assert isinstance(model, Softens)
-        c = [scene.constants.of_bond(*limits[s], *own) for s in slots]
-        found = [model.seen(v, lost, s.rest, k, p) for v, s, k in zip(d, slots, c, strict=True)]
-        return [as_vector(one, "seen", lost) for one in found]
+        c = scene.constants.of_bond(*limits, *own)
+        return as_vector(model.seen(d, lost, r, c, p), "seen", lost)
 
     bonds = {"d": differences(scene, seed, share=2.0), "own": remembers(model, scene, seed)}
     u, lost = here(scene, seed)["u"], here(scene, seed + 3)["u"]
     questions = [
-        Question("breaks", bonds, breaks, elementwise=True),
-        Question("fictitious", {"u": u}, fictitious, elementwise=True),
+        question("breaks", evaluator.breaks, **bonds),
+        question("fictitious", fictitious, u=u),
     ]
     if isinstance(model, RenewsBonds):
-        questions.append(Question("update", bonds, update, elementwise=True))
+        questions.append(question("update", evaluator.update, **bonds))
     if isinstance(model, Softens):
-        questions.append(Question("seen", bonds | {"lost": lost}, seen, elementwise=True))
+        questions.append(question("seen", seen, **bonds, lost=lost))
     return [*questions, *_to_draw(model, scene)]
 
 
@@ -193,11 +191,12 @@ def _to_draw(part: Component, scene: Scene) -> list[Question]:
     rows = owners(part, scene)
 
     def draw(**given: Any) -> Any:
-        return dict(part.draw(type(rows)(**given), generator_for(SEED, "fracture")))
+        return part.draw(type(rows)(**given), generator_for(SEED, "fracture"))
 
     return [Question("draw", dict(vars(rows)), draw)]
 
 
+@questions_of.register
 def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
     sites = sites_of_frame(scene.raster, scene.experiment.rule)
     if sites is None:
@@ -205,19 +204,19 @@ def _to_frame(policy: FramePolicy, scene: Scene, _: int) -> list[Question]:
     point, body = sites.nearest()
 
     def follow(**tables: Any) -> Any:
-        return dict(vars(policy.follow(frame_showing(sites, **tables))))
+        return policy.follow(frame_showing(sites, **tables))
 
     return [Question("follow", {"site": sites.site, "point": point, "body": body}, follow)]
 
 
+@questions_of.register
 def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Question]:
     moment = moment_of(scene, seed)
 
     def measure(**tables: Any) -> Any:
-        found: dict[str, Any] = {}
-        measured = diagnostic.measure(shown(moment, tables=tables))
-        for variable, value in zip(diagnostic.variables(), measured, strict=True):
-            values = found[variable.name] = np.asarray(value)
+        found = measured_by(diagnostic, Shown(moment, tables=tables))
+        for variable in diagnostic.variables():
+            values = np.asarray(found[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
             if values.dtype.kind == "f" and sizes.get("particle") == len(moment.body):
                 # NaN may stand at frame points.
@@ -225,25 +224,25 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
                 found[variable.name] = np.where(allowed, 0.0, values)
         return found
 
-    return [Question("measure", shown(moment).tables, measure)]
+    return [Question("measure", Shown(moment).tables, measure)]
 
 
+def measured_by(diagnostic: Diagnostic, now: Any) -> Arrays:
+    """What a diagnostic measures of a moment, by variable."""
+    names = [variable.name for variable in diagnostic.variables()]
+    return dict(zip(names, diagnostic.measure(now), strict=True))
+
+
+@questions_of.register
 def _to_lattice(lattice: Lattice, _: Scene, __: int) -> list[Question]:
-    def cell() -> Any:
-        found = lattice.cell()
-        sites = [(*s.at, *s.index, *s.primitive) for s in found.sites]
-        return {"vectors": found.vectors, "sites": sites} | {
-            name: getattr(found, name) for name in ("period", "primitive")
-        }
-
-    return [Question("cell", {}, cell)]
+    return [Question("cell", {}, lattice.cell)]
 
 
+@questions_of.register
 def _to_metric(metric: NeighbourMetric, scene: Scene, _: int) -> list[Question]:
     cell = scene.experiment.lattice.cell()
 
     def shells() -> Any:
-        around = [metric.shells_around(cell, s) for s in range(len(cell.sites))]
-        return [[[(o.target, *o.cell, *o.rest) for o in s] for s in shells] for shells in around]
+        return [metric.shells_around(cell, s) for s in range(len(cell.sites))]
 
     return [Question("shells_around", {}, shells)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from itertools import accumulate
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,9 +27,7 @@ from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.remembered_values import describe_bonds, describe_particles
-from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.fault import NotAskedError
+from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
 
 Floats = NDArray[np.float64]
 
@@ -58,20 +57,13 @@ def state_with(scene: Scene, u: Any) -> State:
     return state
 
 
-def body_of(scene: Scene, state: State) -> Floats:
-    """u of the body, (body particle, axis), of a state."""
-    places = scene.raster.place_of(scene.raster.body_rows)
-    return state.u.reshape(2, -1)[:, places].T.astype(float)
-
-
 def advanced(scene: Scene, u: Any, steps: int) -> Floats:
     """The body's displacements some steps after those given, (step, body particle, axis)."""
-    stepper, state = Stepper(scene), state_with(scene, u)
-    history = [body_of(scene, state)]
-    for _ in range(steps):
-        state = stepper.advance(state)
-        history.append(body_of(scene, state))
-    return np.array(history)
+    stepper, raster = Stepper(scene), scene.raster
+    states = accumulate(
+        range(steps), lambda state, _: stepper.advance(state), initial=state_with(scene, u)
+    )
+    return np.array([raster.table(state.u)[raster.body_rows] for state in states])
 
 
 SHAPE = (4, 3)
@@ -81,21 +73,14 @@ SEED = 7
 
 
 def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
-    """What a fracture model remembers of each bond, or a rule of each particle.
-
-    Raises NotAskedError where it remembers nothing.
-    """
-    is_rule = isinstance(part, FollowerRule)
-    numbers = particle_numbers(scene.experiment) if is_rule else bond_numbers(scene.experiment)
-    if not numbers:
-        raise NotAskedError(f"it remembers nothing of {'particles' if is_rule else 'bonds'}")
-    return numbers
+    """What a fracture model remembers of each bond, or a rule of each particle."""
+    declared = particle_numbers if isinstance(part, FollowerRule) else bond_numbers
+    return declared(scene.experiment)
 
 
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
     """Those of whom it remembers numbers, as `draw` is shown them."""
-    is_rule = isinstance(part, FollowerRule)
-    return describe_particles(scene) if is_rule else describe_bonds(scene)
+    return (describe_particles if isinstance(part, FollowerRule) else describe_bonds)(scene)
 
 
 def _vector(size: float, rng: np.random.Generator) -> Vector:
@@ -118,28 +103,20 @@ def here(scene: Scene, seed: int) -> dict[str, Any]:
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
     """Numbers that it remembers of some particles, or of some bonds that have not broken, as they
     are at the start or two steps later; those of one owner stand together."""
-    try:
-        numbers_of(part, scene)
-    except NotAskedError:
+    numbers = numbers_of(part, scene)
+    if not numbers:
         return ()
     states = [initial_state(scene)]
     with suppress(PluginError):  # what fails is asked about directly, and named there
         start = state_with(scene, displacements(scene, seed, share=0.1))
         states.append(Stepper(scene).advance(start, 2))
-    pools = [_columns(part, scene, state) for state in states]
+    pools = []
+    for moment in (StateMoment(state, Tables(scene)) for state in states):
+        whose = moment.body if isinstance(part, FollowerRule) else moment.broken_step() < 0
+        pools.append([moment.remembered(number.name)[whose] for number in numbers])
     columns = [np.concatenate(values) for values in zip(*pools, strict=True)]
     rows = np.random.default_rng(seed + 2).integers(0, len(columns[0]), SHAPE)
     return tuple(column[rows] for column in columns)
-
-
-def _columns(part: Component, scene: Scene, state: State) -> list[NDArray[Any]]:
-    if isinstance(part, FollowerRule):
-        places = scene.raster.place_of(scene.raster.body_rows)
-        return [values.ravel()[places] for values in state.particle_values]
-    assert state.broken_step is not None
-    where = scene.bonds.plane, scene.bonds.place
-    broken, *table = (v.reshape(len(v), -1)[where] for v in (state.broken_step, *state.bond_values))
-    return [column[broken < 0] for column in table]
 
 
 def moment_of(scene: Scene, seed: int) -> StateMoment:
@@ -148,16 +125,17 @@ def moment_of(scene: Scene, seed: int) -> StateMoment:
     return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
 
 
-class _Shown:
-    """A moment, its cells or its forces; see `shown`."""
+class Shown:
+    """A moment, its cells or its forces with other tables in the place of its own, or with its
+    particles in another order: row n shows what stands in row order[n]. What is in no order of
+    particles is as it is."""
 
     OWN = ("displacement", "previous_displacement", "reference")
     OF_PARTICLES = ("body", "sum_over_neighbours", "gradient", "on_particles", "remembered")
 
-    def __init__(self, inner: Any, order: Any, tables: Any = None) -> None:
-        self._inner = inner
-        self._order = order
-        self._tables = tables
+    def __init__(self, inner: Any, order: Any = None, tables: Any = None) -> None:
+        self._inner, self._tables = inner, tables
+        self._order = np.arange(len(inner.body)) if order is None else order
 
     @property
     def tables(self) -> dict[str, Any]:
@@ -170,7 +148,7 @@ class _Shown:
             return lambda rows=None: table if rows is None else table[rows]
         found = getattr(self._inner, name)
         if name in ("cells", "forces"):
-            return _Shown(found, self._order)
+            return Shown(found, self._order)
         if not callable(found):
             return self._shown(name, found)
         return lambda *given, **named: self._shown(name, found(*given, **named))
@@ -183,12 +161,6 @@ class _Shown:
             return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
-
-
-def shown(moment: StateMoment, order: Any = None, tables: Any = None) -> Any:
-    """The moment with other tables in the place of its own, or with its particles in another order:
-    row n shows what stands in row order[n]. What is in no order of particles is as it is."""
-    return _Shown(moment, np.arange(len(moment.body)) if order is None else order, tables)
 
 
 def frame_showing(frame: Any, site: Any, point: Any, body: Any) -> Any:

@@ -1,8 +1,11 @@
-"""The small scenes in which a component is tried: every lattice with every neighbourhood."""
+"""What a property is, and the subject of which it is asked: one component, in the small scenes in
+which it is tried, every lattice with every neighbourhood."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -21,7 +24,6 @@ from pbdkit.interfaces import (
 )
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.testing.fault import PropertyError
 from pbdkit.testing.question import Question, questions_of
 
 LATTICES: dict[str, dict[str, Any]] = {
@@ -33,8 +35,7 @@ LATTICES: dict[str, dict[str, Any]] = {
 }
 NEIGHBOURS: dict[str, dict[str, Any]] = {
     f"{name}-{shells}": {"type": name, "shells": shells}
-    for name in ("coordination", "chebyshev")
-    for shells in (1, 2)
+    for name, shells in product(("coordination", "chebyshev"), (1, 2))
 }
 PARTNERS = ({"type": "barycentre"}, {"type": "distance-weighted"})
 """The rules with which lattices and neighbours are tried: a linear one, and one that is not."""
@@ -59,35 +60,29 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     by cell meets frames or rules that do.
     """
     field = next(f for f, i in INTERFACES.items() if i is interface_of(type(component)))
-    given = dict(parts) | {field: component}
+    neighbours = list(NEIGHBOURS.values())
+    given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
     if field == "diagnostics":
-        given |= {field: [component], "fracture": parts.get("fracture", TEARING)}
-        given |= {"leaders": PULLED}
+        given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
+        neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
     choices = {
         "lattice": list(LATTICES.values()),
-        # The fracture model that diagnostics are tried with has one threshold, for one shell.
-        "neighbours": [
-            n for n in NEIGHBOURS.values() if field != "diagnostics" or n["shells"] == 1
-        ],
+        "neighbours": neighbours,
         "rule": _rules(component),
         "frame": [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN],
     }
-    tried = [alternatives(given[n]) if n in given else values for n, values in choices.items()]
-    base = {"name": "conformance", "body": BODY, "steps": 6}
-    for choice in product(*tried):
-        yield Experiment(**base | given | dict(zip(choices, choice, strict=True)))
-
-
-def alternatives(part: Any) -> list[Any]:
-    """The parts to be tried one after the other."""
-    return list(part) if isinstance(part, (list, tuple)) else [part]
+    given[field] = [component] if field == "diagnostics" else component
+    for name in choices.keys() & given.keys():
+        part = given[name]
+        choices[name] = list(part) if isinstance(part, (list, tuple)) else [part]
+    for choice in product(*choices.values()):
+        yield Experiment(**given | dict(zip(choices, choice, strict=True)))
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:
-    wants_material = isinstance(component, Diagnostic) and bool(
-        component.needs & {"material", "forces"}
-    )
-    if wants_material or (isinstance(component, FramePolicy) and component.edges_are_free):
+    if isinstance(component, Diagnostic) and component.needs & {"material", "forces"}:
+        return [ELASTIC]
+    if isinstance(component, FramePolicy) and component.edges_are_free:
         return [ELASTIC]
     return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 
@@ -100,12 +95,20 @@ def place_of(experiment: Experiment) -> str:
     return f"on the {lattice.type} lattice with {around}"
 
 
+class PropertyError(Exception):
+    """A property does not hold; the text names the fault, and the remedy where there is one."""
+
+
+class NotAskedError(Exception):
+    """A property says nothing about this component; the text is the reason."""
+
+
 class Subject:
     """One component; what is asked of it is made once and shared by the properties."""
 
-    def __init__(self, component: Component, parts: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, component: Component, parts: Mapping[str, Any]) -> None:
         self.component: Any = component
-        self.parts = dict(parts or {})
+        self.parts = parts
 
     @cached_property
     def scenes(self) -> list[Scene]:
@@ -113,33 +116,61 @@ class Subject:
 
         Raises PropertyError where it refuses all of them.
         """
-        return scenes_with(self.component, self.parts)
+        scenes: list[Scene] = []
+        refusals: list[ExperimentError] = []
+        for experiment in experiments_with(self.component, self.parts):
+            try:
+                scenes.append(build_scene(experiment))
+            except ExperimentError as error:
+                refusals.append(error)
+        if not scenes:
+            raise PropertyError(
+                f"no scene that was tried takes it; the first: {refusals[0]}; name the parts that "
+                "go with it, `conformance(..., lattice=..., neighbours=...)`"
+            )
+        return scenes
 
-    def scene(self, n: int = 0) -> Scene:
-        """One of the scenes, from the last on for negative n."""
-        return self.scenes[n % len(self.scenes)]
+    @property
+    def scene(self) -> Scene:
+        """The first of the scenes."""
+        return self.scenes[0]
 
     def questions(self, n: int = 0) -> list[Question]:
         """What can be asked of the component directly, on its n-th scene and with seed n."""
-        return questions_of(self.component, self.scene(n), seed=n % 1000)
+        return questions_of(self.component, self.scenes[n], n % 1000)
 
 
-def scenes_with(component: Component, parts: Mapping[str, Any]) -> list[Scene]:
-    """The scenes that a component takes part in, PropertyError if there is none."""
-    scenes: list[Scene] = []
-    refusals: list[ExperimentError] = []
-    experiment: Experiment | None = None
-    for experiment in experiments_with(component, parts):
-        try:
-            scenes.append(build_scene(experiment))
-        except ExperimentError as error:
-            refusals.append(error)
-    if not scenes:
-        raise PropertyError(
-            f"no scene that was tried takes it; the first: {refusals[0]}; name the parts that go "
-            "with it, `conformance(..., lattice=..., neighbours=...)`"
-        )
-    return scenes
+Check = Callable[[Subject], None]
+
+
+@dataclass(frozen=True)
+class Property:
+    """One thing that is asked of every component of some interfaces.
+
+    Where one that `is_needed` does not hold, those after it are not judged: their answers would
+    mean nothing, and a fault is reported once and by its own name.
+    """
+
+    name: str
+    interfaces: tuple[type[Component], ...]
+    check: Check
+    is_needed: bool = False
+
+    @property
+    def asks(self) -> str:
+        """What is asked, in one sentence: the first paragraph of the check's docstring."""
+        return " ".join((inspect.getdoc(self.check) or "").split("\n\n")[0].split())
+
+
+def asked_of(*interfaces: type[Component], is_needed: bool = False) -> Callable[[Check], Property]:
+    """Makes a property of a check, asked of these interfaces, or of all; its name is that of the
+    function."""
+    asked = interfaces or tuple(INTERFACES.values())
+
+    def make(check: Check) -> Property:
+        return Property(check.__name__.replace("_", "-"), asked, check, is_needed)
+
+    return make
 
 
 def examples_of(component: type[Component]) -> list[Component]:
@@ -150,18 +181,17 @@ def examples_of(component: type[Component]) -> list[Component]:
     the class lacks a method of its interface.
     """
     base: dict[str, Any] = {}
-    others: list[tuple[str, Any]] = []
+    others: list[dict[str, Any]] = [{}]
     for name, field in component.model_fields.items():
         key, examples = field.alias or name, list(field.examples or [])
         if field.is_required():
             if not examples:
-                raise PluginError(
-                    f"{component.__name__}.{name} has neither default nor example: write "
-                    f"`{name}: ... = Field(description=..., examples=[...])`"
-                )
+                fault = f"{component.__name__}.{name} has neither default nor example"
+                remedy = f"write `{name}: ... = Field(description=..., examples=[...])`"
+                raise PluginError(f"{fault}: {remedy}")
             base[key] = examples.pop(0)
-        others += [(key, value) for value in examples]
-    return [_made(component, base), *(_made(component, base | {k: v}) for k, v in others)]
+        others += [{key: value} for value in examples]
+    return [_made(component, base | other) for other in others]
 
 
 def _made(component: type[Component], given: dict[str, Any]) -> Component:
@@ -171,10 +201,8 @@ def _made(component: type[Component], given: dict[str, Any]) -> Component:
         raise PluginError(f"{component.__name__} cannot be made: {error}") from None
     except ValidationError as error:
         fault = error.errors()[0]
-        where = ".".join(map(str, fault["loc"])) or "the whole"
-        raise PluginError(
-            f"{component.__name__} refuses its examples {given}: {where}: {fault['msg']}"
-        ) from None
+        told = f"{'.'.join(map(str, fault['loc'])) or 'the whole'}: {fault['msg']}"
+        raise PluginError(f"{component.__name__} refuses its examples {given}: {told}") from None
 
 
 def full_name(component: Component) -> str:

@@ -24,7 +24,7 @@ from engines import engines, limit, threads
 from goals import all_goals
 from peers import peers
 
-from pbdkit.bench.measurement import processors
+from pbdkit.stepping.choice import processors
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -11,7 +11,7 @@ IMPORTS = """
 import pbdkit.api, pbdkit.results.netcdf, pbdkit.stepping.compiled.compiled_stepper, pbdkit.cli.run
 """
 PEAK = """
-from pbdkit.bench.worker import peak_memory
+from pbdkit.runs.course import peak_memory
 print(peak_memory())
 """
 RUN = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -165,4 +166,6 @@ def _processes(first: list[str], second: list[str], turns: int) -> Ratio:
 
 
 def _process(call: list[str]) -> Callable[[], object]:
-    return lambda: subprocess.run(call, check=True, capture_output=True)
+    """The bytecode of what is imported is kept, as pip keeps it of what it installs."""
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    return lambda: subprocess.run(call, check=True, capture_output=True, env=env)

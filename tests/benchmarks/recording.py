@@ -11,8 +11,7 @@ import numpy as np
 from pairing import Ratio, ratio
 from sheets import Running, moving, scene_of
 
-from pbdkit.results.netcdf import NetcdfSink
-from pbdkit.results.sinks import OverlappingSink
+from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
 from pbdkit.runs.course import Run, record
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,126 +12,113 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot
 from pbdkit.scene.bonds import plane_block
+from pbdkit.scene.neighbourhood import BondPlane
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.plan import Level
-from pbdkit.stepping.state import State
+from pbdkit.stepping.compiled.plan import Plan
+from pbdkit.stepping.state import Floats, State
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, Any]
 
 
-def constant_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
+def constant_arrays(plan: Plan) -> Arrays:
     """What does not change from step to step."""
-    frame, cell = scene.frame, scene.raster.lattice.cell()
-    real = np.dtype(scene.experiment.stepping.precision)
-    none = np.empty(0, np.intp)
-    entries, mapped = none, np.empty(0)
-    if frame:
-        counts = np.bincount(frame.map.point, minlength=len(frame.place))
-        entries, mapped = np.concatenate([[0], np.cumsum(counts)]), frame.map.weight
-    return {
+    scene, slots = plan.scene, plan.scene.neighbourhood.slots
+    most, real = max(map(len, slots)), np.dtype(scene.experiment.stepping.precision)
+    # Sublattices with fewer neighbours than others have the first once more, which nobody reads.
+    padded = [slot for own in slots for slot in (*own, *own[:1] * (most - len(own)))]
+    by_slot = _stacked([_of_slot(plan, slot) for slot in padded], real)
+    arrays = {
         "kind": scene.raster.kind,
-        "share": np.array(scene.cells.share if scene.cells else np.empty(0), real),
         "first": np.array(scene.raster.first, np.int64),
-        "at": np.array([site.at for site in cell.sites]),
-        "points": frame.place if frame else none,
-        "entries": entries,
-        "bodies": frame.body_place if frame else none,
-        "mapped": mapped.astype(real),
-        **rule_arrays(scene, levels),
-        **_by_slot(scene, levels, real),
-        **_by_plane(scene, real),
+        "at": np.array([site.at for site in scene.raster.lattice.cell().sites]),
+        "counts": np.array([len(own) for own in slots]),
+        **rule_arrays(plan),
+        **{name: v.reshape(len(slots), most, *v.shape[1:]) for name, v in by_slot.items()},
+        **_stacked([_of_plane(scene, plane) for plane in scene.neighbourhood.planes], real),
+    }
+    if scene.cells:
+        arrays["share"] = np.array(scene.cells.share, real)
+    if frame := scene.frame:
+        counts = np.bincount(frame.map.point, minlength=len(frame.place))
+        arrays |= {"points": frame.place, "bodies": frame.body_place}
+        arrays["entries"] = np.concatenate([[0], np.cumsum(counts)])
+        arrays["mapped"] = frame.map.weight.astype(real)
+    return arrays
+
+
+def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
+    """Displacements u, those of the step before, and what a state remembers."""
+    return {
+        **dict(zip([*plan.each("u_@"), *plan.each("v_@")], [*u, *v], strict=True)),
+        **{f"bond{n}": value for n, value in enumerate(state.bond_values)},
+        **{f"own{n}": value for n, value in enumerate(state.particle_values)},
+        "broken": state.broken_step,
+        "lengths": state.broken_length,
     }
 
 
-def rule_arrays(scene: Scene, levels: Sequence[Level]) -> Arrays:
+def rule_arrays(plan: Plan) -> Arrays:
     """The parameters of rules and solver."""
-    solver = scene.experiment.stepping
-    real = np.dtype(solver.precision)
+    solver = plan.scene.experiment.stepping
     # One more, so that no array is empty.
-    rules = {level.number: [*level.scene.constants.rule, 0.0] for level in levels}
+    rules = {f"rule{n}": [*own.scene.constants.rule, 0.0] for n, own in enumerate(plan.levels)}
+    numbers = {"solver": [solver.relaxation, solver.memory], **rules}
+    return {name: np.array(values, solver.precision) for name, values in numbers.items()}
+
+
+def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
+    """The numbers of all rows by name, (row, ...)."""
+    stacked = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return {name: v.astype(real if v.dtype.kind == "f" else int) for name, v in stacked.items()}
+
+
+def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
+    """Rest offset, limits, weights, the sign of d at the home of its bonds, and from a particle's
+    place in flat arrays the way to the neighbour, to the home of the bond in planes of bonds, and
+    to the shares of the cells beside it."""
+    scene, shape = plan.scene, plan.scene.raster.shape
+    away, (plane, here) = slot_step(shape, slot), scene.neighbourhood.home[slot]
+    home = plane - (slot.source if here else slot.target)
+    beside = scene.cells.tiling.beside[slot] if scene.cells else ()
+    cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in beside]
     return {
-        "solver": np.array([solver.relaxation, solver.memory], real),
-        **{f"rule{n}": np.array(values, real) for n, values in rules.items()},
+        "rests": slot.rest,
+        "limits": scene.constants.limits[slot],
+        "signs": 1.0 if here else -1.0,
+        "away": away,
+        "bonds_away": home * math.prod(shape[1:]) + (0 if here else away),
+        "cells_away": [kind * math.prod(shape) + step for kind, step in cells],
+        **{f"weights{n}": own.scene.constants.weights[slot] for n, own in enumerate(plan.levels)},
     }
 
 
-def _by_slot(scene: Scene, levels: Sequence[Level], real: np.dtype[Any]) -> Arrays:
-    """Numbers of each slot, (sublattice, slot, ...): rest offset, limits, weights, the sign of d at
-    the home of its bonds, and from a particle's place in flat arrays the way to the neighbour, to
-    the home of the bond in planes of bonds, and to the shares of the cells beside it."""
-    around, shape, limits = scene.neighbourhood, scene.raster.shape, scene.constants.limits
-    beside = scene.cells.tiling.beside if scene.cells else {}
-    plane_size, size = math.prod(shape[1:]), math.prod(shape)
-
-    def bonds_away(slot: Slot) -> int:
-        plane, here = around.home[slot]
-        source = slot.source if here else slot.target
-        return (plane - source) * plane_size + (0 if here else slot_step(shape, slot))
-
-    def cells_away(slot: Slot) -> list[int]:
-        return [
-            side.kind * size + (slot_step(shape, side.first) if side.first else 0)
-            for side in beside.get(slot, ())
-        ]
-
-    numbers: dict[str, tuple[Any, Any]] = {
-        "rests": (lambda slot: slot.rest, real),
-        "limits": (lambda slot: limits.get(slot, ()), real),
-        "signs": (lambda slot: 1.0 if around.home[slot][1] else -1.0, real),
-        "away": (lambda slot: slot_step(shape, slot), np.int64),
-        "bonds_away": (bonds_away, np.int64),
-        "cells_away": (cells_away, np.int64),
-    }
-    for level in levels:
-        weights = level.scene.constants.weights
-        numbers[f"weights{level.number}"] = (weights.__getitem__, real)
-    most = max(map(len, around.slots))
-    found: Arrays = {"counts": np.array([len(own) for own in around.slots])}
-    for name, (value, dtype) in numbers.items():
-        one = np.array(value(around.slots[0][0]), dtype)
-        found[name] = np.zeros((shape[0], most, *one.shape), dtype)
-        for s, own in enumerate(around.slots):
-            for k, slot in enumerate(own):
-                found[name][s, k] = np.array(value(slot), dtype)
-    return found
-
-
-def _by_plane(scene: Scene, real: np.dtype[Any]) -> Arrays:
-    """Numbers of each plane of bonds: source, target and step, rest offset, limits, block."""
-    planes, limits = scene.neighbourhood.planes, scene.constants.limits
-    blocks = np.zeros((len(planes), 2 * scene.axes), np.int64)
-    for n, plane in enumerate(planes):
-        if block := plane_block(scene.raster, plane):
-            blocks[n, ::2], blocks[n, 1::2] = block.start, block.stop
+def _of_plane(scene: Scene, plane: BondPlane) -> dict[str, Any]:
+    """Of a plane of bonds source, target and step, rest offset, limits, block."""
+    slot, block = plane.slot, plane_block(scene.raster, plane)
+    spans = zip(block.start, block.stop, strict=True) if block else [(0, 0)] * scene.axes
     return {
-        "ends": np.array([(p.slot.source, p.slot.target, *p.slot.cell) for p in planes]),
-        "end_rests": np.array([p.slot.rest for p in planes], real),
-        "end_limits": np.array([limits.get(p.slot, ()) for p in planes], real),
-        "end_blocks": blocks,
+        "ends": (slot.source, slot.target, *slot.cell),
+        "end_rests": slot.rest,
+        "end_limits": scene.constants.limits[slot],
+        "end_blocks": list(chain(*spans)),
     }
 
 
-def bits_for(scene: Scene) -> Any:
+def bits_for(scene: Scene) -> np.dtype[Any]:
     """The smallest unsigned integer with a bit for every slot."""
-    most = max(map(len, scene.neighbourhood.slots))
-    return next(t for t, bits in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32)) if most <= bits)
+    return np.min_scalar_type(2 ** max(map(len, scene.neighbourhood.slots)) - 1)
 
 
 def lost_bits(scene: Scene, state: State) -> NDArray[np.unsignedinteger[Any]]:
     """Bit k of a particle: the bond along its slot k is broken; both ends know."""
     assert state.broken_step is not None
-    dtype = bits_for(scene)
-    lost = np.zeros(scene.raster.shape, dtype)
+    lost = np.zeros(scene.raster.shape, bits_for(scene))
     for n, plane in enumerate(scene.neighbourhood.planes):
-        block = plane_block(scene.raster, plane)
-        if block is None:
-            continue
-        broken = (block.within(state.broken_step[n]) >= 0).astype(dtype)
-        for slot, seen in ((plane.slot, block), (plane.opposite, block.seen_through(plane.slot))):
-            seen.of(lost)[...] |= broken << dtype(_place_of(scene, slot))
+        if block := plane_block(scene.raster, plane):
+            broken = (block.within(state.broken_step[n]) >= 0).astype(lost.dtype)
+            ends = (plane.slot, block), (plane.opposite, block.seen_through(plane.slot))
+            for slot, seen in ends:
+                bit = scene.neighbourhood.slots[slot.source].index(slot)
+                seen.of(lost)[...] |= broken << lost.dtype.type(bit)
     return lost
-
-
-def _place_of(scene: Scene, slot: Slot) -> int:
-    return scene.neighbourhood.slots[slot.source].index(slot)

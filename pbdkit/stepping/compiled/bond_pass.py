@@ -6,66 +6,61 @@ from __future__ import annotations
 from pbdkit.interfaces import RenewsBonds
 from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
+from pbdkit.stepping.compiled.particle import parameters
 from pbdkit.stepping.compiled.plan import Function, Plan, values
 
 
 def write_bond_pass(plan: Plan) -> Function:
     """The function that renews the bonds of some rows, and breaks them."""
     out = Function(plan.shared, "judge_bonds", "first_row", "last_row")
-    axes, seen = range(len(plan.axes)), plan.levels[-1].seen
-    bonds = [number for number in seen.bond if number.home is Home.BOND]
-    literal = [plan.number(value) for value in plan.scene.constants.fracture]
-    out.add(0, f"q = Fracture({values(seen.fracture, {}, literal)})")
-    out.add(0, "for n in range(len(ends)):")
-    out.add(1, f"r = {plan.vector(f'end_rests[n, {a}]' for a in axes)}")
+    axes = range(len(plan.axes))
     low, high = ([f"end_blocks[n, {2 * a + b}]" for a in axes] for b in (0, 1))
+    out.add(0, parameters(plan, plan.levels[-1])[-1], "for n in range(len(ends)):")
+    out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
     out.add(1, f"for i in range(max({low[0]}, first_row), min({high[0]}, last_row)):")
-    depth = 2
-    if len(plan.axes) == 3:
-        out.add(2, f"for l in range({low[1]}, {high[1]}):")
-        depth = 3
-    out.add(depth, f"j0, j1 = {low[-1]}, {high[-1]}")
+    for depth, name in enumerate(plan.lead[1:], 2):
+        out.add(depth, f"for {name} in range({low[depth - 1]}, {high[depth - 1]}):")
+    out.depth = len(plan.axes)
     step = [f"ends[n, {a + 2}]" for a in axes]
-    for c in plan.axes:
-        out.add(depth, f"h{c} = {plan.row(f'u_{c}', 'ends[n, 0]')}")
-        out.add(depth, f"n{c} = {plan.row(f'u_{c}', 'ends[n, 1]', step)}")
-    out.add(depth, f"one = {plan.row('kind', 'ends[n, 0]')}")
-    out.add(depth, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
-    out.add(depth, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
-    out.add(depth, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(len(bonds))))
-    _write_judging(out, plan, depth, [number.changes for number in bonds])
+    out.add(0, f"j0, j1 = {low[-1]}, {high[-1]}")
+    out.add(0, *plan.each(f"h@ = {plan.row('u_@', 'ends[n, 0]')}"))
+    out.add(0, *plan.each(f"n@ = {plan.row('u_@', 'ends[n, 1]', step)}"))
+    out.add(0, f"one = {plan.row('kind', 'ends[n, 0]')}")
+    out.add(0, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
+    out.add(0, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
+    out.add(0, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(plan.bonds)))
+    _write_judging(out, plan)
     return out
 
 
-def _write_judging(out: Function, plan: Plan, depth: int, changes: list[bool]) -> None:
-    """One row of bonds; of the numbers that they remember some change."""
-    model, seen = plan.model, plan.levels[-1].seen
-    c = values(seen.bond, {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]"})
+def _write_judging(out: Function, plan: Plan) -> None:
+    """One row of bonds."""
+    model, numbers = plan.model, plan.levels[-1].seen.bond
+    c = values(numbers, {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]"})
     can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
     if model.breaks_frame_bonds():
         can = (
             f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
-    d = f"d = {plan.vector(f'n{c}[j] - h{c}[j]' for c in plan.axes)}"
-    news: list[str] = []
-    changing = [m for m, changing in enumerate(changes) if changing]
-    if isinstance(model, RenewsBonds):
-        news = [f"new = update(d, r, Constants({c}), q)"]
-        news += [f"new{m} = new[{position}]" for position, m in enumerate(changing)]
-        for m in changing:
-            c = c.replace(f"b{m}[j]", f"new{m}")
+    look = [f"d = {plan.vector('n@[j] - h@[j]')}"]
+    kept = [number.changes for number in numbers if number.home is Home.BOND]
+    changing = [m for m, changes in enumerate(kept) if changes and isinstance(model, RenewsBonds)]
+    if changing:
+        look.append(f"new = update(d, r, Constants({c}), q)")
+    for position, m in enumerate(changing):
+        look.append(f"new{m} = new[{position}]")
+        c = c.replace(f"b{m}[j]", f"new{m}")
     breaks = f"breaks(d, r, Constants({c}), q)"
-    # One loop that looks, and vectorises; another one writes, where there is anything to write.
-    changing = changing if news else []
     differ = "".join(f" | (new{m} != b{m}[j])" for m in changing)
-    out.add(depth, "some = 0", "for j in range(j1 - j0):")
-    out.add(depth + 1, d, *news, f"fresh = (since[j] < 0) & {can} & ({breaks}{differ})")
-    out.add(depth + 1, "some = some | (1 if fresh else 0)")
-    out.add(depth, "if some:", "    for j in range(j1 - j0):")
-    out.add(depth + 2, f"if (since[j] < 0) & {can}:")
-    out.add(depth + 3, d, *news, *(f"b{m}[j] = new{m}" for m in changing))
-    out.add(depth + 3, f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)")
+    # One loop that looks, and vectorises; another one writes, where there is anything to write.
+    out.add(0, "some = 0", "for j in range(j1 - j0):")
+    out.add(1, *look, f"fresh = (since[j] < 0) & {can} & ({breaks}{differ})")
+    out.add(1, "some = some | (1 if fresh else 0)")
+    out.add(0, "if some:", "    for j in range(j1 - j0):")
+    out.add(2, f"if (since[j] < 0) & {can}:")
+    out.add(3, *look, *(f"b{m}[j] = new{m}" for m in changing))
+    out.add(3, f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)")
 
 
 def write_events(plan: Plan) -> Function:
@@ -77,11 +72,8 @@ def write_events(plan: Plan) -> Function:
     out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
     # The home end notes it, or this end where that is no particle of the body.
     out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
-    out.add(
-        2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:", "    flat_broken[home] = step"
-    )
-    d = plan.vector(f"flat_u_{c}[there] - flat_u_{c}[here]" for c in plan.axes)
-    r = plan.vector(f"rests[s, k, {a}]" for a in range(len(plan.axes)))
+    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
+    out.add(3, "flat_broken[home] = step")
+    d, r = plan.vector("flat_u_@[there] - flat_u_@[here]"), plan.vector("rests[s, k, #]")
     out.add(3, f"flat_lengths[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
-    out.flatten()
     return out

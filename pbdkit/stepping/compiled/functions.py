@@ -7,8 +7,9 @@ import inspect
 import operator
 import types
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
+from itertools import chain
 from typing import Any
 
 import numba
@@ -55,35 +56,24 @@ def _dot(a: Any, b: Any) -> Any:
     return _written(a, "a, b", "", products)
 
 
-@overload(operator.add)
-def _add(a: Any, b: Any) -> Any:
-    return _written(a, "a, b", "a.@ + b.@") if _is_vector(a) and _is_vector(b) else None
-
-
-@overload(operator.sub)
-def _sub(a: Any, b: Any) -> Any:
-    return _written(a, "a, b", "a.@ - b.@") if _is_vector(a) and _is_vector(b) else None
-
-
 @overload(operator.neg)
 def _neg(a: Any) -> Any:
     return _written(a, "a", "-a.@") if _is_vector(a) else None
 
 
-@overload(operator.mul)
-def _mul(a: Any, b: Any) -> Any:
-    if _is_vector(a) and isinstance(b, numba.types.Number):
-        return _written(a, "a, b", "a.@ * b")
-    if _is_vector(b) and isinstance(a, numba.types.Number):
-        return _written(b, "a, b", "a * b.@")
-    return None
+def _arithmetic(sign: str) -> Function:
+    """An operation on two vectors, or on a vector and a number."""
+
+    def overloaded(a: Any, b: Any) -> Any:
+        one, other = _is_vector(a), _is_vector(b)
+        term = f"a{'.@' * one} {sign} b{'.@' * other}"
+        return _written(a if one else b, "a, b", term) if one or other else None
+
+    return overloaded
 
 
-@overload(operator.truediv)
-def _truediv(a: Any, b: Any) -> Any:
-    if _is_vector(a) and isinstance(b, numba.types.Number):
-        return _written(a, "a, b", "a.@ / b")
-    return None
+for _operation, _sign in (("add", "+"), ("sub", "-"), ("mul", "*"), ("truediv", "/")):
+    overload(getattr(operator, _operation))(_arithmetic(_sign))
 
 
 def compiled(function: Function) -> Any:
@@ -107,13 +97,12 @@ def source_key(*functions: Function) -> str:
     so that a kernel is rather made anew than out of date.
     """
     digest = hashlib.sha256()
-    for function in functions:
-        for reached in _reached(function):
-            digest.update(f"{reached.__module__}.{reached.__qualname__}".encode())
-            digest.update(_source(reached.__code__).encode())
-            digest.update(repr((reached.__defaults__, reached.__kwdefaults__)).encode())
-            for name, value in sorted(_names(reached).items()):
-                digest.update(f"{name}={_content(value)}".encode())
+    for reached in chain.from_iterable(map(_reached, functions)):
+        found = sorted(_names(reached).items())
+        parts = [reached.__module__, reached.__qualname__, _source(reached.__code__)]
+        parts.append(repr((reached.__defaults__, reached.__kwdefaults__)))
+        parts += [f"{name}={_content(value)}" for name, value in found]
+        digest.update("\n".join(parts).encode())
     return digest.hexdigest()
 
 
@@ -137,35 +126,31 @@ def _source(code: types.CodeType) -> str:
         return repr((code.co_code, code.co_consts, code.co_names))
 
 
-def _reached(function: Function) -> Iterator[Function]:
+def _reached(function: Function) -> list[Function]:
     """The function and, once each, every Python function that it reaches by name."""
-    seen: list[Function] = []
-    waiting = [function]
-    while waiting:
-        here = waiting.pop()
-        if here not in seen:
-            seen.append(here)
-            found = [getattr(v, "py_func", v) for v in _names(here).values()]
-            waiting += [v for v in found if isinstance(v, types.FunctionType)]
-    yield from seen
+    found = [function]
+    for here in found:
+        for value in _names(here).values():
+            reached = getattr(value, "py_func", value)
+            if isinstance(reached, types.FunctionType) and reached not in found:
+                found.append(reached)
+    return found
 
 
 def _names(function: Function) -> dict[str, Any]:
     """What the names in a function, and in functions inside it, stand for: globals, closures, and
     members of modules."""
-    names, waiting = set(), [function.__code__]
-    while waiting:
-        code = waiting.pop()
-        names |= set(code.co_names)
-        waiting += [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    codes = [function.__code__]
+    for code in codes:
+        codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    names = {name for code in codes for name in code.co_names}
     found = {n: function.__globals__[n] for n in names if n in function.__globals__}
     found |= inspect.getclosurevars(function).nonlocals
     modules = [v for v in found.values() if isinstance(v, types.ModuleType)]
-    while modules:
-        module = modules.pop()
+    for module in modules:
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
-            for name in names & set(dir(module)):  # pbdkit's own are loaded when first used
-                member = getattr(module, name)
-                found[f"{module.__name__}.{name}"] = member
-                modules += [member] if isinstance(member, types.ModuleType) else []
+            # pbdkit's own are loaded when first used.
+            members = {name: getattr(module, name) for name in names & set(dir(module))}
+            found |= {f"{module.__name__}.{name}": value for name, value in members.items()}
+            modules += [v for v in members.values() if isinstance(v, types.ModuleType)]
     return found

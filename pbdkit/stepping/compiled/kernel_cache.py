@@ -41,13 +41,14 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     The key covers the source of every function that rule and fracture model reach, so that an
     edited rule never runs an old kernel.
     """
-    parts = [source, source_key(*functions.values(), length), repr(_types(arguments))]
-    parts += [numba.__version__, np.__version__, sys.version, repr(_processor())]
-    parts.append(str(_interpreted()))
-    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+    interpreted = bool(vars(numba.config)["DISABLE_JIT"])
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    parts = [source, source_key(*functions.values(), length), vars(numba)["typeof"](arguments)]
+    parts += [numba.__version__, np.__version__, sys.version, processor, interpreted]
+    key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
     if (known := (_asked_folder(), key)) not in _loaded:
         names = {name: compiled(function) for name, function in functions.items()}
-        kept = None if _interpreted() else _kept(source, key, names, arguments)
+        kept = None if interpreted else _kept(source, key, names, arguments)
         _loaded[known] = kept or _ready(source, names, arguments)
     return _loaded[known]
 
@@ -70,19 +71,6 @@ def cache_folder() -> Path | None:
 def _asked_folder() -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(os.environ.get("PBDKIT_CACHE_DIR") or Path(home) / "pbdkit")
-
-
-def _processor() -> Any:
-    """What machine code is made for."""
-    return cpu_target.target_context.codegen().magic_tuple()
-
-
-def _types(arguments: tuple[Any, ...]) -> Any:
-    return vars(numba)["typeof"](arguments)
-
-
-def _interpreted() -> bool:
-    return bool(vars(numba.config)["DISABLE_JIT"])
 
 
 def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
@@ -132,30 +120,16 @@ def _ready(
     source: str, names: dict[str, Any], arguments: tuple[Any, ...], folder: Path | None = None
 ) -> Any:
     """The kernel after its first call: compiled, or read from its folder."""
-    run = _module(source, names, folder).run
-    run(*arguments)
-    return run
-
-
-def _module(source: str, names: dict[str, Any], folder: Path | None) -> ModuleType:
-    given = {
-        **{kind.__name__: kind for kind in KINDS.values()},
-        "Here": Here,
-        "namedtuple": namedtuple,
-        "njit": numba.njit,
-        "prange": numba.prange,
-        "np": np,
-        "int64": np.int64,
-        "real": np.float32,
-        "double": np.float64,
-        "length": compiled(length),
-        "KEPT": folder is not None,
-    }
-    file = folder / SOURCE if folder else None
+    file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")
-    vars(module).update(given | names)
-    if file:
-        module.__file__ = str(file)
+    scope = vars(module)
+    scope |= {kind.__name__: kind for kind in KINDS.values()} | names
+    scope.update(Here=Here, length=compiled(length), namedtuple=namedtuple, KEPT=bool(folder))
+    scope.update(njit=numba.njit, prange=numba.prange, np=np)
+    scope.update(int64=np.int64, real=np.float32, double=np.float64)
+    if folder:
+        module.__file__ = file
         sys.modules[module.__name__] = module  # numba looks for what it has kept by this name
-    exec(compile(source, str(file or "<kernel>"), "exec"), vars(module))
-    return module
+    exec(compile(source, file, "exec"), scope)
+    module.run(*arguments)
+    return module.run

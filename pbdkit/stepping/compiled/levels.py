@@ -12,7 +12,6 @@ from pbdkit.interfaces import (
     FollowerRule,
     FractureModel,
     Here,
-    Remembered,
     RenewsBonds,
     RenewsParticles,
     Softens,
@@ -25,9 +24,16 @@ from pbdkit.stepping.compiled.kernel_cache import load_kernel
 from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.followers import target
-from pbdkit.stepping.remembered_values import changing, renew
+from pbdkit.stepping.state import started
 
-Function = Callable[..., Any]
+FUNCTIONS: dict[type[Any], tuple[str, ...]] = {
+    FollowerRule: ("gather", "apply"),
+    RenewsParticles: ("remember",),
+    FractureModel: ("breaks", "fictitious"),
+    Softens: ("seen",),
+    RenewsBonds: ("update",),
+}
+"""The elementwise functions of rules and fracture models, and of those with a capability."""
 
 
 def levels_of(scene: Scene) -> tuple[Level, ...]:
@@ -35,25 +41,19 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
     scenes = [scene]
     while inner := scenes[0].inner:
         scenes.insert(0, inner)
-    return tuple(Level(n, of, _parts(of), last=of is scene) for n, of in enumerate(scenes))
+    return tuple(Level(n, of, _parts(of)) for n, of in enumerate(scenes))
 
 
-def functions_of(levels: Sequence[Level]) -> dict[str, Function]:
-    """The elementwise functions by their names in the kernel."""
-    found: dict[str, Function] = {}
-    for level in levels:
-        rule = level.scene.experiment.rule
-        named: dict[str, Function] = {"gather": rule.gather, "apply": rule.apply}
-        if isinstance(rule, RenewsParticles):
-            named["remember"] = rule.remember
-        found |= {f"{name}{level.number}": function for name, function in named.items()}
+def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
+    """The elementwise functions by their names in the kernel, a rule's with its level's number."""
+    parts: dict[str, Any] = {str(level.number): level.scene.experiment.rule for level in levels}
     if levels[-1].scene.has_fracture:
-        model = levels[-1].scene.experiment.fracture
-        found |= {"breaks": model.breaks, "fictitious": model.fictitious}
-        if isinstance(model, Softens):
-            found["seen"] = model.seen
-        if isinstance(model, RenewsBonds):
-            found["update"] = model.update
+        parts[""] = levels[-1].scene.experiment.fracture
+    found: dict[str, Callable[..., Any]] = {}
+    for number, part in parts.items():
+        for kind, names in FUNCTIONS.items():
+            if isinstance(part, kind):
+                found |= {f"{name}{number}": getattr(part, name) for name in names}
     return found
 
 
@@ -68,21 +68,12 @@ def load_blamed(levels: Sequence[Level], source: str, arguments: tuple[Any, ...]
 
 def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | FractureModel:
     """The part whose function an error of the compiler names, else the rule."""
-    experiment, text = levels[-1].scene.experiment, str(error)
-    model, rules = experiment.fracture, [level.scene.experiment.rule for level in levels]
-    names = {f.__qualname__ for name, f in functions_of(levels).items() if not name[-1].isdigit()}
-    if any(f"function {name} " in text for name in names):
-        return model
-    return next((r for r in rules if f"function {r.apply.__qualname__} " in text), rules[-1])
-
-
-def sample_values(scene: Scene, numbers: Sequence[Remembered], shape: tuple[int, ...]) -> Any:
-    """Arrays of one place as remembered numbers are kept in."""
-    precision = scene.experiment.stepping.precision
-    return tuple(
-        np.full(shape, number.initial, precision if number.dtype == "f8" else number.dtype)
-        for number in numbers
-    )
+    functions, text = functions_of(levels).items(), str(error)
+    named = [name for name, of in functions if f"function {of.__qualname__} " in text]
+    if any(not name[-1].isdigit() for name in named):
+        return levels[-1].scene.experiment.fracture
+    culprit = next((level for level in levels if f"apply{level.number}" in named), levels[-1])
+    return culprit.scene.experiment.rule
 
 
 def _parts(scene: Scene) -> tuple[int, ...]:
@@ -91,13 +82,13 @@ def _parts(scene: Scene) -> tuple[int, ...]:
     experiment, evaluator = scene.experiment, Evaluator(scene)
     ones = np.ones(1, experiment.stepping.precision)
     one: Components = vector([ones] * scene.axes)
-    own = sample_values(scene, particle_numbers(experiment), (1,))
+    own = started(scene, particle_numbers(experiment), (1,))
     slot = scene.neighbourhood.slots[0][0]
     with np.errstate(all="ignore"):
         if scene.has_fracture:
             with blaming(experiment.fracture, "to compile"):
                 limits = scene.constants.limits[slot]
-                bond = sample_values(scene, bond_numbers(experiment), (1,))
+                bond = started(scene, bond_numbers(experiment), (1,))
                 evaluator.renew_bonds(one, slot.rest, limits, bond, np.ones(1, bool))
                 evaluator.breaks(one, slot.rest, limits, bond)
         with blaming(experiment.rule, "to compile"):
@@ -105,7 +96,5 @@ def _parts(scene: Scene) -> tuple[int, ...]:
             here = Here(one, one, one, scene.constants.of_particle(*own))
             for component in evaluator.move(total, here):
                 target(ones, component, ones, experiment.stepping)
-            if isinstance(experiment.rule, RenewsParticles):
-                fresh = changing(particle_numbers(experiment), own)
-                renew(fresh, evaluator.remember(total, here), None)
+            evaluator.renew_particles(total, here, own, None)
     return tuple(len(part) if isinstance(part, Components) else 1 for part in total)

@@ -2,106 +2,71 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from pbdkit.scene.declarations import particle_numbers
-from pbdkit.scene.raster import positions
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.arguments import rule_arrays
-from pbdkit.stepping.compiled.emitter import write_tuples
-from pbdkit.stepping.compiled.levels import levels_of, load_blamed, sample_values
-from pbdkit.stepping.compiled.particle import contributions, named_tuples, target_lines
-from pbdkit.stepping.compiled.plan import Function, Level, Plan
-from pbdkit.stepping.followers import Followers
-from pbdkit.stepping.moving_neighbours import GatheringFollowers
-from pbdkit.stepping.state import Floats, State
-
-PAIRS = ("begin", "other", "rests", "place", "body", "local", "solver")
-"""By body particle its first pair, by pair the row of the neighbour and the rest offset; by row of
-the table place and X from site (0, 0); the rows of the body."""
+from pbdkit.stepping.compiled.arguments import Arrays, rule_arrays, state_arrays
+from pbdkit.stepping.compiled.emitter import write_module, write_pass
+from pbdkit.stepping.compiled.levels import levels_of, load_blamed
+from pbdkit.stepping.compiled.particle import contributions, difference, parameters, target_lines
+from pbdkit.stepping.compiled.plan import Function, Plan
+from pbdkit.stepping.followers import Followers, GatheringFollowers
+from pbdkit.stepping.state import Floats, State, unmoved_state
 
 
 class PairFollowers(Followers):
     """Moves the followers of a scene in which neighbours come and go."""
 
     def __init__(self, scene: Scene, threads: int) -> None:
-        near = scene.experiment.neighbours.nearness()
-        assert near
-        self._finder, self._chunks = GatheringFollowers(scene, near), 4 * threads
-        raster, self._axes = scene.raster, scene.axes
-        everybody = np.arange(raster.count)
-        (level,) = levels_of(scene)
-        self._plan = Plan(scene, (level,), (), threads > 1)
-        self._arrays = rule_arrays(scene, [level]) | {
-            "place": raster.place_of(everybody),
-            "body": raster.body_rows,
-            "local": np.stack(positions(raster.lattice.cell(), *raster.cells_of(everybody))),
+        self._finder = finder = GatheringFollowers(scene)
+        self._chunks = 4 * threads
+        self._plan = Plan(scene, levels_of(scene), threads > 1)
+        self._arrays = rule_arrays(self._plan) | {
+            "place": finder.place,
+            "body": finder.body,
+            "local": finder.X,
         }
-        source, self._names = _write_kernel(self._plan, level)
-        shape = (1,) * (scene.axes + 1)
-        u = np.zeros((scene.axes, *shape), scene.experiment.stepping.precision)
-        own = sample_values(scene, particle_numbers(scene.experiment), shape)
-        state = State(0, u, u, None, None, (), (), own)
-        none = np.zeros(0, np.intp)
-        given = self._given(u, u, state, none, none, np.zeros((scene.axes, 0)))
-        self._run = load_blamed((level,), source, (given, 0, 0, self._chunks))
+        start, none = unmoved_state(scene, (1,) * scene.axes), np.zeros(0, np.intp)
+        pairs = {"first_pair": none, "partner": none, "rests": np.zeros((scene.axes, 0))}
+        arrays = self._named(start.u, start.previous, start, **pairs)
+        source, self._names = _write_kernel(replace(self._plan, shared=tuple(arrays)))
+        arguments = tuple(arrays[name] for name in self._names), 0, 0, self._chunks
+        self._run = load_blamed(self._plan.levels, source, arguments)
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Neighbours in the order in which the numpy engine sums them."""
-        u = m.reshape(len(m), -1)[:, self._arrays["place"]]
-        j, other, rest = self._finder.pairs(self._arrays["local"] + u)
-        count = len(self._arrays["body"])
-        begin = np.searchsorted(j, np.append(self._arrays["body"], len(u[0])))
-        given = self._given(m, new, state, begin, other, rest)
-        self._run(given, 0, count, self._chunks)
+        j, other, rest = self._finder.pairs(m)
+        first = np.searchsorted(j, np.append(self._finder.body, len(self._finder.place)))
+        rest = np.ascontiguousarray(rest)
+        arrays = self._named(m, new, state, first_pair=first, partner=other, rests=rest)
+        given = tuple(arrays[name] for name in self._names)
+        self._run(given, 0, len(self._finder.body), self._chunks)
 
-    def _given(
-        self, m: Floats, new: Floats, state: State, begin: Any, other: Any, rest: Floats
-    ) -> tuple[Any, ...]:
-        planes = (("u", m), ("v", new))
-        arrays = self._arrays | {
-            f"{name}_{c}": plane.reshape(-1)
-            for name, each in planes
-            for c, plane in zip(self._plan.axes, each, strict=True)
-        }
-        arrays |= {"begin": begin, "other": other, "rests": np.ascontiguousarray(rest)}
-        arrays |= {f"own{n}": value.reshape(-1) for n, value in enumerate(state.particle_values)}
-        return tuple(arrays[name] for name in self._names)
+    def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
+        """By name the arrays of the kernel: `first_pair` is by particle of the body, `partner` and
+        `rests` by pair, `place` and `local` by row of the table."""
+        return self._arrays | state_arrays(self._plan, m, new, state) | pairs
 
 
-def _write_kernel(plan: Plan, level: Level) -> tuple[str, list[str]]:
+def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
     """A module with ``run(given, first, last, chunks)`` for the particles of the body from `first`
     to `last`, and the names of the arrays that it is given."""
-    shared = [name for name in plan.shared if name not in PAIRS] + list(PAIRS)
-    sweep = Function(shared, "sweep", "first_body", "last_body")
-    sums = range(sum(level.parts))
-    sweep.add(0, *named_tuples(plan, level))
-    for c in plan.axes:
-        sweep.add(0, f"o{c} = v_{c}")
-    sweep.add(0, *(f"a{n} = own{n}" for n in range(len(level.seen.own))))
-    sweep.add(
-        0, "for e in range(first_body, last_body):", "    row = body[e]", "    j = place[row]"
-    )
-    sweep.add(1, f"u = {plan.vector(f'u_{c}[j]' for c in plan.axes)}")
-    sweep.add(1, *(f"t{n} = double(0.0)" for n in sums))
-    sweep.add(1, "for n in range(begin[e], begin[e + 1]):", "    there = place[other[n]]")
-    sweep.add(2, f"d = {plan.vector(f'u_{c}[there] - u.{c}' for c in plan.axes)}")
-    sweep.add(2, f"r = {plan.vector(f'rests[{a}, n]' for a in range(len(plan.axes)))}")
-    sweep.add(2, f"{contributions(level)}, = gather0(d, r, Weights0(), p)")
-    sweep.add(2, *(f"t{n} = t{n} + c{n}" for n in sums))
-    sweep.add(1, "moves = begin[e + 1] > begin[e]")
-    local = [f"local[{a}, row]" for a in range(len(plan.axes))]
-    sweep.add(1, *target_lines(plan, level, local, [f"t{n}" for n in sums], "moves"))
-    run = Function(shared, "run", "given", "first_body", "last_body", "chunks")
-    run.add(0, f"for c in {'prange' if plan.parallel else 'range'}(chunks):")
-    span = (f"first_body + (last_body - first_body) * {c} // chunks" for c in ("c", "(c + 1)"))
-    run.add(1, sweep.call(*span))
-    head = [
-        f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)',
-        f"def run({', '.join(run.own)}):",
-        f"    {', '.join(run.used)}, = given",
-    ]
-    lines = [*write_tuples(plan), *sweep.source, "", "", *head]
-    return "\n".join([*lines, *("    " + line for line in run.lines)]) + "\n", run.used
+    (level,) = plan.levels
+    sweep = Function(plan.shared, "sweep", "first_body", "last_body")
+    sweep.add(0, *parameters(plan, level), *plan.each("o@ = flat_v_@"))
+    sweep.add(0, *(f"a{n} = flat_own{n}" for n in range(len(level.seen.own))))
+    sweep.add(0, "for e in range(first_body, last_body):")
+    sweep.add(1, "row = body[e]", "j = place[row]", f"u = {plan.vector('flat_u_@[j]')}")
+    sweep.add(1, *(f"{t} = double(0.0)" for t in level.totals))
+    sweep.add(1, "for n in range(first_pair[e], first_pair[e + 1]):")
+    sweep.add(2, "there = place[partner[n]]", difference(plan, level, "flat_u_@[there]"))
+    sweep.add(2, f"r = {plan.vector('rests[#, n]')}", contributions(level, "r", ""))
+    sweep.add(2, *(f"{t} = {t} + c{n}" for n, t in enumerate(level.totals)))
+    sweep.add(1, "moves = first_pair[e + 1] > first_pair[e]")
+    sweep.add(1, *target_lines(plan, level, plan.each("local[#, row]"), level.totals, "moves"))
+    run = Function(plan.shared, "run", "given", "first_body", "last_body", "chunks")
+    write_pass(run, plan, 0, sweep, "first_body", "last_body")
+    return write_module(plan, [sweep], run)

@@ -2,127 +2,138 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import islice
 
+from pbdkit.interfaces import RenewsParticles, Softens
 from pbdkit.scene.homes import Home
-from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
-
-
-def named_tuples(plan: Plan, level: Level) -> list[str]:
-    """p of the rule, and of the fracture model, whose numbers are literals: they decide what is to
-    be computed at all."""
-    n = level.number
-    lines = [f"p = Rule{n}({values(level.seen.rule, {Home.SCENE: f'rule{n}[{{n}}]'})})"]
-    if plan.model is not None:
-        literal = [plan.number(value) for value in plan.scene.constants.fracture]
-        lines.append(f"q = Fracture({values(level.seen.fracture, {}, literal)})")
-    return lines
-
+from pbdkit.stepping.compiled.plan import Function, Level, Plan, listed, values
 
 RUNS = ("first_run", "last_run", "first_row", "last_row")
 """What functions of rows are given: some runs, and the rows of the first axis to keep to."""
 
 
-def write_row_loop(out: Function, plan: Plan) -> None:
-    """The loop over the rows of some runs, as far as motion has come; what comes after stands in
-    it."""
-    out.add(0, "for n in range(first_run, last_run):")
+def parameters(plan: Plan, level: Level) -> list[str]:
+    """p of the rule, and of the fracture model, whose numbers are literals: they decide what is to
+    be computed at all."""
+    n = level.number
+    rule = f"p = Rule{n}({values(level.seen.rule, {Home.SCENE: f'rule{n}[{{n}}]'})})"
+    literal = listed(map(plan.number, plan.scene.constants.fracture))
+    return [rule, f"q = Fracture({literal})"] if plan.model else [rule]
+
+
+def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
+    """The loop over the rows of some runs, as far as motion has come, with the rows of what stands
+    at the particles themselves and of where their moves go; what comes after stands in it."""
+    out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
     *lead, name = plan.lead
-    for a, outer in enumerate(lead):
-        out.add(1, f"{outer} = runs[n, {a}]")
-    a = len(lead)
+    a, n = len(lead), level.number
+    out.add(1, *(f"{outer} = runs[n, {m}]" for m, outer in enumerate(lead)))
     out.add(1, f"j0 = max(runs[n, {a + 2}], box[{2 * a + 2}])")
     out.add(1, f"j1 = min(runs[n, {a + 3}], box[{2 * a + 3}])", "if j0 >= j1:", "    continue")
     low, high = (f"box[{2 * a}]", f"box[{2 * a + 1}]") if a else ("first_row", "last_row")
     out.add(1, f"for {name} in range(max(runs[n, {a}], {low}), min(runs[n, {a + 1}], {high})):")
     out.depth += 2
+    rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
+    if n:
+        rows["z@"] = f"{level.source}_@"
+    for row, of in rows.items():
+        out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
+    out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
 
 
-def here_rows(plan: Plan, level: Level, s: str) -> list[str]:
-    """The rows of what stands at the particles themselves, and of where their moves go."""
-    lines = []
-    out = "v" if level.last else f"z{level.number}"
-    for c in plan.axes:
-        lines += [f"h{c} = {plan.row(f'u_{c}', s)}", f"o{c} = {plan.row(f'{out}_{c}', s)}"]
-        if level.number:
-            lines.append(f"z{c} = {plan.row(f'z{level.number - 1}_{c}', s)}")
-    lines += [f"a{n} = {plan.row(f'own{n}', s)}" for n in range(len(level.seen.own))]
-    return lines
+def displacements(plan: Plan, level: Level) -> list[str]:
+    """u of the particle, and z, which the rule sees, on later levels."""
+    u, z = (f"{name} = {plan.vector(f'{row}@[j]')}" for name, row in ("uh", "zz"))
+    return [u, z] if level.number else [u]
 
 
-def lost_lines(plan: Plan, r: str, c: str) -> list[str]:
-    """d as the rule sees it: softened, or that of the fictitious point where the bond is lost."""
-    softened = [f"d = seen(d, f, {r}, {c}, q)"] if plan.softens else []
-    chosen = plan.vector(f"f.{c} if is_lost else d.{c}" for c in plan.axes)
-    return [f"f = fictitious(u, {r}, q)", *softened, f"d = {chosen}"]
+def difference(plan: Plan, level: Level, there: str) -> str:
+    """d to the neighbour whose components have this pattern."""
+    return f"d = {plan.vector(f'{there} - {level.source[0]}.@')}"
 
 
-def contributions(level: Level) -> str:
-    """The contributions by name, those of a vector together."""
-    return _pattern(level, [f"c{n}" for n in range(sum(level.parts))], "")
+def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
+    """d as the rule sees it at slot k: softened, or that of the fictitious point where the bond
+    `breaks` or is lost `since` a step."""
+    if plan.model is None:
+        return []
+    lines = [f"is_lost = {since} >= 0"]
+    if plan.judged:
+        lines = [
+            f"breaks_now = 1 if {breaks} else 0",
+            f"is_lost = ((bits >> {k}) & 1) | breaks_now",
+            f"now = now | (is_lost << {k})",
+        ]
+    lines.append(f"f = fictitious(u, {r}, q)")
+    if isinstance(plan.model, Softens):
+        lines.append(f"d = seen(d, f, {r}, {c}, q)")
+    return [*lines, f"d = {plan.vector('f.@ if is_lost else d.@')}"]
+
+
+def contributions(level: Level, r: str, weights: str) -> str:
+    """What a neighbour contributes, by name."""
+    n = level.number
+    names = _pattern(level, [f"c{total[1:]}" for total in level.totals], "")
+    return f"{names}, = gather{n}(d, {r}, Weights{n}({weights}), p)"
 
 
 def target_lines(
-    plan: Plan, level: Level, local: list[str], totals: list[str], movable: str = ""
+    plan: Plan, level: Level, local: Sequence[str], totals: list[str], movable: str = ""
 ) -> list[str]:
-    """Where the particle goes, and what it remembers, where it is `movable` (everywhere); `u` is
-    its displacement, and `z` that which the rule sees, on later levels. `local` are the components
-    of X from site (0, 0)."""
-    n, move, lines = level.number, [f"move.{c}" for c in plan.axes], list[str]()
+    """Where the particle goes, and what it remembers, where it is `movable` (everywhere). `local`
+    are the components of X from site (0, 0)."""
+    n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
-    X = centred = plan.vector([plan.number(0.0)] * len(plan.axes))
+    lines = list[str]()
+    X = centred = plan.literal([0.0] * len(plan.axes))
     if level.scene.experiment.rule.uses_reference:
         lines = [f"X{c} = {value}" for c, value in zip(plan.axes, local, strict=True)]
         X = _shifted(plan, "+", plan.scene.raster.lattice.origin)
         centred = _shifted(plan, "-", plan.scene.middle)
     own = values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
-    here = f"Here({'z' if n else 'u'}, {X}, {centred}, Own{n}({own}))"
-    lines += [f"here = {here}", f"move = apply{n}(({sums},), here, p)"]
-    if level.renews:
+    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({own}))")
+    lines.append(f"move = apply{n}(({sums},), here, p)")
+    changing: list[int] = []
+    if isinstance(level.scene.experiment.rule, RenewsParticles):
+        changing = [m for m, number in enumerate(level.seen.own) if number.changes]
         lines.append(f"new = remember{n}(({sums},), here, p)")
-    for c, step in zip(plan.axes, move, strict=True):
-        if not level.last:
-            lines.append(f"o{c}[j] = {_chosen(step, movable, plan.number(0.0))}")
-            continue
-        solver = plan.scene.experiment.stepping
-        relaxed = f"solver[0] * {step}" if solver.relaxation != 1.0 else step
-        lines.append(f"new_{c} = u.{c} + {relaxed}")
-        if solver.memory != 0.0:
-            lines.append(f"new_{c} = new_{c} + solver[1] * (u.{c} - o{c}[j])")
-        lines.append(f"o{c}[j] = {_chosen(f'new_{c}', movable, f'u.{c}')}")
-    if level.renews:
-        changing = [n for n, number in enumerate(level.seen.own) if number.changes]
-        lines += [
-            f"a{n}[j] = {_chosen(f'new[{m}]', movable, f'a{n}[j]')}" for m, n in enumerate(changing)
-        ]
-    return lines
+    if level is not plan.levels[-1]:
+        lines += plan.each(f"o@[j] = {_chosen('move.@', movable, plan.number(0.0))}")
+    else:
+        relaxed = "solver[0] * move.@" if solver.relaxation != 1.0 else "move.@"
+        swing = ["new_@ = new_@ + solver[1] * (u.@ - o@[j])"] if solver.memory != 0.0 else []
+        out = f"o@[j] = {_chosen('new_@', movable, 'u.@')}"
+        for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
+            lines += plan.each(pattern)
+    return lines + [
+        f"a{n}[j] = {_chosen(f'new[{m}]', movable, f'a{n}[j]')}" for m, n in enumerate(changing)
+    ]
+
+
+def _shifted(plan: Plan, sign: str, by: Iterable[float]) -> str:
+    parts = (f"X{c} {sign} {plan.number(v)}" for c, v in zip(plan.axes, by, strict=True))
+    return f"Vector({', '.join(parts)})"
 
 
 def _chosen(value: str, where: str, otherwise: str) -> str:
     return f"{value} if {where} else {otherwise}" if where else value
 
 
-def _shifted(plan: Plan, sign: str, by: Iterable[float]) -> str:
-    return plan.vector(
-        f"X{c} {sign} {plan.number(value)}" for c, value in zip(plan.axes, by, strict=True)
-    )
-
-
 def local_places(plan: Plan, s: str) -> list[str]:
     """X from site (0, 0), in the order of operations of the rasters."""
-    cell = plan.scene.raster.lattice.cell()
     index = [f"{name} + first[{n}]" for n, name in enumerate((*plan.lead, "j + j0"))]
-    return [
-        f"at[{s}, {n}] + ("
-        + " + ".join(f"({at}) * {float(v[n])!r}" for at, v in zip(index, cell.vectors, strict=True))
-        + ")"
-        for n in range(len(plan.axes))
-    ]
+    places = []
+    for n, along in enumerate(zip(*plan.scene.raster.lattice.cell().vectors, strict=True)):
+        terms = [f"({at}) * {float(v)!r}" for at, v in zip(index, along, strict=True)]
+        places.append(f"at[{s}, {n}] + ({' + '.join(terms)})")
+    return places
 
 
 def _pattern(level: Level, names: list[str], kind: str) -> str:
-    found, rest = [], list(names)
+    """Names of components, those of a vector together."""
+    found, rest = [], iter(names)
     for size in level.parts:
-        own, rest = rest[:size], rest[size:]
+        own = list(islice(rest, size))
         found.append(own[0] if size == 1 else f"{kind}({', '.join(own)})")
     return ", ".join(found)

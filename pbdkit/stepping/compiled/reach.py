@@ -10,6 +10,10 @@ looked at in every step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +23,7 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compiled.plan import Level
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.prescription import Led
 from pbdkit.stepping.state import Floats, State
@@ -31,23 +36,23 @@ Box = NDArray[np.int64]
 class Reach:
     """`box` is what has been reached, `growth` how it grows in a step, (2 axes,)."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, levels: Sequence[Level]) -> None:
+        scene = levels[-1].scene
         experiment, self._shape = scene.experiment, scene.raster.shape
         self._everything = _interleaved(np.zeros(scene.axes), np.array(self._shape[1:]))
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
-        self._rests = not self._renews and _rests_by_construction(scene)
-        self._bond = _growth(scene)
+        self._rests = not self._renews and _rests_by_construction(levels)
+        self._bond = len(levels) * _growth(scene)
         self._leaders = [np.unravel_index(led.place, self._shape)[1:] for led in scene.leading]
-        self._known = self._empty = False
-        self.box, self.growth = self._everything.copy(), np.zeros_like(self._everything)
+        self._known = False
+        self._keep_to(self._everything)
 
     def begin(self, state: State) -> None:
         """A state that did not come from here: what has moved is known only where nothing has."""
-        self._known = self._empty = self._rests and state.step == 0
-        self.box = np.zeros_like(self._everything) if self._known else self._everything.copy()
-        self.growth = np.zeros_like(self._everything)
+        self._known = self._rests and state.step == 0
+        self._keep_to(np.zeros_like(self._bond) if self._known else self._everything)
 
     def before(self, led: Led, count: int) -> int:
         """Takes the leaders of the coming steps in; returns how many of `count` can be made in
@@ -55,49 +60,50 @@ class Reach:
         if not self._known:
             return count if self._renews else 1
         for place, values in led:
-            away = place[(values != 0.0).any(axis=0)]
-            if len(away):
-                self._join(_around(np.unravel_index(away, self._shape)[1:]))
+            self._join(np.unravel_index(place[(values != 0.0).any(axis=0)], self._shape)[1:])
         return count
 
     def after(self, now: Floats, before: Floats) -> None:
         """Looks once at what the first step has moved."""
-        if self._renews:
-            return
         if self._known:
             np.clip(self.box, 0, self._everything.max(), out=self.box)
-            return
-        self._known = True
-        moved = (now != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
-        for cells in self._leaders:  # who is held where it would not rest moves once released
-            moved[cells] = True
-        self._empty = not moved.any()
-        self.box = np.zeros_like(self._bond) if self._empty else _around(np.nonzero(moved))
-        self.growth = np.zeros_like(self._bond) if self._empty else self._bond.copy()
+        elif not self._renews:
+            self._known = True
+            moved = (now != 0.0).any(axis=(0, 1)) | (before != 0.0).any(axis=(0, 1))
+            for cells in self._leaders:  # who is held where it would not rest moves once released
+                moved[cells] = True
+            self._keep_to(np.zeros_like(self._bond))
+            self._join(np.nonzero(moved))
 
-    def _join(self, box: Box) -> None:
-        if self._empty:
-            self.box, self.growth, self._empty = box, self._bond.copy(), False
+    def _keep_to(self, box: Box) -> None:
+        self.box, self.growth = box.copy(), np.zeros_like(box)
+
+    def _join(self, cells: tuple[NDArray[np.intp], ...]) -> None:
+        """Takes in cells that have moved."""
+        if not len(cells[0]):
+            return
+        box = _interleaved([n.min() for n in cells], [n.max() + 1 for n in cells])
+        if not self.box.any():  # nothing has been reached yet
+            self.box, self.growth = box, self._bond
         self.box[::2] = np.minimum(self.box[::2], box[::2])
         self.box[1::2] = np.maximum(self.box[1::2], box[1::2])
 
 
-def _rests_by_construction(scene: Scene) -> bool:
+def _rests_by_construction(levels: Sequence[Level]) -> bool:
     """Whether the reference configuration stays as it is: every neighbour is there, all start at
     rest, no bond is broken or breaks at rest, and the rules' moves from there are zero. Where
     particles or bonds have numbers of their own it is looked at instead."""
-    experiment, raster = scene.experiment, scene.raster
-    rule, fracture = experiment.rule, experiment.fracture
+    scene = levels[-1].scene
+    experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = isinstance(fracture, StartsCracked) and fracture.segments()
-    if not experiment.initial.at_rest or rule.uses_reference or cracked:
-        return False
-    if particle_numbers(experiment) or bond_numbers(experiment):
+    remembered = particle_numbers(experiment) or bond_numbers(experiment)
+    if not experiment.initial.at_rest or experiment.rule.uses_reference or cracked or remembered:
         return False
     for s, slots in enumerate(scene.neighbourhood.slots):
         block = raster.body_block(s)
         if block and any(there is not None for there in presence(raster, block, slots)):
             return False
-    return _stays(scene)
+    return all(_stays(level.scene) for level in levels)
 
 
 def _stays(scene: Scene) -> bool:
@@ -105,45 +111,33 @@ def _stays(scene: Scene) -> bool:
     experiment, evaluator = scene.experiment, Evaluator(scene)
     still, slots = vector(np.zeros(scene.axes)), scene.neighbourhood.slots
     with blaming(experiment.rule, "when asked whether it rests"):
-        moves = [evaluator.at_rest(own) for own in slots]
-    if any(component != 0.0 for move in moves for component in move):
-        return False
-    if scene.has_fracture:
-        with blaming(experiment.fracture, "when asked what breaks at rest"):
-            limits = scene.constants.limits
-            if any(evaluator.breaks(still, k.rest, limits[k], ()) for own in slots for k in own):
-                return False
-    return scene.inner is None or _stays(scene.inner)
+        if any(component != 0.0 for own in slots for component in evaluator.at_rest(own)):
+            return False
+    if not scene.has_fracture:
+        return True
+    with blaming(experiment.fracture, "when asked what breaks at rest"):
+        limits = scene.constants.limits
+        return not any(evaluator.breaks(still, k.rest, limits[k], ()) for k in chain(*slots))
 
 
-def _around(cells: tuple[NDArray[np.intp], ...]) -> Box:
-    return _interleaved([n.min() for n in cells], [n.max() + 1 for n in cells])
-
-
-def _interleaved(low: object, high: object) -> Box:
-    found: Box = np.stack([np.asarray(low), np.asarray(high)], axis=1).astype(np.int64).ravel()
-    return found
+def _interleaved(low: Any, high: Any) -> Box:
+    return np.stack([low, high], axis=1).astype(np.int64).ravel()
 
 
 def _growth(scene: Scene) -> Box:
-    """How far, in cells, a step carries a motion along each direction: by a bond for each rule, or
+    """How far, in cells, a step of a rule carries a motion along each direction: by a bond, or
     by a frame point that follows one particle and is a neighbour of another."""
-    slots = [slot for own in scene.neighbourhood.slots for slot in own]
-    rules, inner = 1, scene.inner
-    while inner:
-        rules, inner = rules + 1, inner.inner
+    slots = list(chain(*scene.neighbourhood.slots))
     carried = [np.array([slot.cell for slot in slots])]
     if scene.frame:
-        points = scene.frame.place[scene.frame.map.point]
-        _, *at = np.unravel_index(points, scene.raster.shape)
-        _, *body = np.unravel_index(scene.frame.body_place, scene.raster.shape)
         kinds = scene.raster.kind
+        places = scene.frame.place[scene.frame.map.point], scene.frame.body_place
+        at, body = (np.stack(np.unravel_index(p, kinds.shape)[1:], axis=1) for p in places)
         for slot in slots:
             # The particle at `seeing` sees the frame point through this slot.
-            seeing = np.stack(at) - np.array(slot.cell)[:, None]
-            inside = ((seeing.T >= 0) & (kinds.shape[1:] > seeing.T)).all(axis=1)
-            seeing = seeing[:, inside]
-            follows = kinds[(slot.source, *seeing)] == FOLLOWER
-            carried.append((seeing - np.stack(body)[:, inside]).T[follows])
-    most = rules * np.concatenate(carried)
+            seeing = at - slot.cell
+            inside = ((seeing >= 0) & (seeing < kinds.shape[1:])).all(axis=1)
+            follows = kinds[(slot.source, *seeing[inside].T)] == FOLLOWER
+            carried.append((seeing - body)[inside][follows])
+    most = np.concatenate(carried)
     return _interleaved(np.minimum(most.min(axis=0), 0), np.maximum(most.max(axis=0), 0))

@@ -4,19 +4,18 @@ offsets, steps and weights are literals, so that what cancels at rest folds away
 from __future__ import annotations
 
 from pbdkit.interfaces import Slot
-from pbdkit.interfaces.polygons import Side
 from pbdkit.scene.homes import Home
 from pbdkit.stepping.compiled.particle import (
     RUNS,
+    bond_lines,
     contributions,
-    here_rows,
+    difference,
+    displacements,
     local_places,
-    lost_lines,
-    named_tuples,
     target_lines,
     write_row_loop,
 )
-from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
+from pbdkit.stepping.compiled.plan import Function, Level, Plan, listed, values
 
 NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
 """Kinds of rows: those where no particle follows; where something may be missing; where all
@@ -25,31 +24,26 @@ neighbours are there and cells are whole; where cells are not."""
 
 def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | None) -> Function:
     """The function that moves the particles of such a row."""
-    name, with_cells = f"row{level.number}_{s}_{kind}", kind == WITH_CELLS
-    out = Function(plan.shared, name, *RUNS)
+    out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
     slots = plan.scene.neighbourhood.slots[s]
-    out.add(0, *named_tuples(plan, level))
-    write_row_loop(out, plan)
-    out.add(0, *here_rows(plan, level, str(s)))
-    source = _source(level)
+    write_row_loop(out, plan, level, str(s))
     for k, slot in enumerate(slots):
-        for c in plan.axes:
-            out.add(0, f"n{k}{c} = {plan.row(f'{source}_{c}', slot.target, slot.cell)}")
-        out.add(0, *_bond_rows(plan, k, slot))
-    if with_cells:
-        out.add(0, *_share_rows(plan, s))
+        there = plan.row(f"{level.source}_@", slot.target, slot.cell)
+        out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
+    shares: dict[str, str] = {}
+    if kind == WITH_CELLS:
+        rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
+        shares = {row: f"s{n}" for n, row in enumerate(rows)}
+    out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
     if plan.judged:
         out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
     out.add(0, "for j in range(j1 - j0):")
-    out.add(1, f"u = {plan.vector(f'h{c}[j]' for c in plan.axes)}")
-    if level.number:
-        out.add(1, f"z = {plan.vector(f'z{c}[j]' for c in plan.axes)}")
+    out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, "bits = int64(gone[j])", "now = bits")
     for k, slot in enumerate(slots):
-        _write_slot(out, plan, level, k, slot, with_cells)
-    totals = [f"t{n}" for n in range(sum(level.parts))]
-    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), totals))
+        out.add(1, *_slot_lines(plan, level, k, slot, shares))
+    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
     if events:
         out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
         out.add(0, "if changed:")
@@ -57,43 +51,24 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     return out
 
 
-def _write_slot(
-    out: Function, plan: Plan, level: Level, k: int, slot: Slot, with_cells: bool
-) -> None:
-    """The contributions of one neighbour."""
-    r = plan.vector(map(plan.number, slot.rest))
-    here = "z" if level.number else "u"
-    out.add(1, f"d = {plan.vector(f'n{k}{c}[j] - {here}.{c}' for c in plan.axes)}")
-    if plan.model is not None:
-        _, at_home = plan.scene.neighbourhood.home[slot]
-        bond = {Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]", Home.BOND: f"b{k}_{{n}}[j]"}
-        c = f"Constants({values(level.seen.bond, bond)})"
-        if plan.judged:
-            # A bond is judged as its home end sees it, so that both ends agree to the last bit.
-            seen, sign = ("d", 1.0) if at_home else ("-d", -1.0)
-            rest = plan.vector(plan.number(sign * value) for value in slot.rest)
-            out.add(1, f"breaks_now = 1 if breaks({seen}, {rest}, {c}, q) else 0")
-            out.add(1, f"is_lost = ((bits >> {k}) & 1) | breaks_now")
-            out.add(1, f"now = now | (is_lost << {k})")
-        else:
-            out.add(1, f"is_lost = f{k}[j] >= 0")
-        out.add(1, *lost_lines(plan, r, c))
-    literal = [plan.number(value) for value in level.scene.constants.weights[slot]]
-    if with_cells:
-        left, right = (f"{_share_name(plan, slot, side)}[j]" for side in _beside(plan, slot))
-        literal = [
-            {"left": left, "right": right}.get(name.name, text)
-            for name, text in zip(level.seen.weights, literal, strict=True)
-        ]
-    w = f"Weights{level.number}({values(level.seen.weights, {}, literal)})"
-    out.add(1, f"{contributions(level)}, = gather{level.number}(d, {r}, {w}, p)")
-    for n in range(sum(level.parts)):
-        out.add(1, f"t{n} = c{n}" if k == 0 else f"t{n} = t{n} + c{n}")
-
-
-def _source(level: Level) -> str:
-    """The planes that a level's differences are taken of."""
-    return f"z{level.number - 1}" if level.number else "u"
+def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str]) -> list[str]:
+    """The contributions of one neighbour; `shares` are the names of rows of shares of cells."""
+    bond = {Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]", Home.BOND: f"b{k}_{{n}}[j]"}
+    c = f"Constants({values(level.seen.bond, bond)})"
+    # A bond is judged as its home end sees it, so that both ends agree to the last bit.
+    _, at_home = plan.scene.neighbourhood.home[slot]
+    seen = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
+    literal = level.scene.constants.weights[slot]._asdict()
+    weights = {name: plan.number(value) for name, value in literal.items()}
+    if shares:
+        weights["left"], weights["right"] = (f"{shares[row]}[j]" for row in _beside(plan, slot))
+    r = plan.literal(slot.rest)
+    return [
+        difference(plan, level, f"n{k}@[j]"),
+        *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", f"f{k}[j]"),
+        contributions(level, r, listed(weights.values())),
+        *(f"t{n} = t{n} + c{n}" if k else f"t{n} = c{n}" for n in range(len(level.totals))),
+    ]
 
 
 def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
@@ -101,29 +76,18 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
     if plan.model is None:
         return []
     plane, at_home = plan.scene.neighbourhood.home[slot]
+    rows = {f"b{k}_{n}": f"bond{n}" for n in range(plan.bonds)}
+    if not plan.judged:
+        rows[f"f{k}"] = "broken"
     step = None if at_home else slot.cell
-    bonds = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
-    lines = [f"b{k}_{n} = {plan.row(f'bond{n}', plane, step)}" for n in range(len(bonds))]
-    return lines if plan.judged else [*lines, f"f{k} = {plan.row('broken', plane, step)}"]
+    return [f"{name} = {plan.row(array, plane, step)}" for name, array in rows.items()]
 
 
-def _beside(plan: Plan, slot: Slot) -> tuple[Side, Side]:
+def _beside(plan: Plan, slot: Slot) -> list[str]:
+    """The rows of shares of the cells on both sides of a slot."""
     assert plan.scene.cells
-    return plan.scene.cells.tiling.beside[slot]
-
-
-def _share_name(plan: Plan, slot: Slot, side: Side) -> str:
-    """The row of shares of the cells to one side of a slot."""
-    slots = plan.scene.neighbourhood.slots[slot.source]
-    return f"s{side.kind}_{'own' if side.first is None else slots.index(side.first)}"
-
-
-def _share_rows(plan: Plan, s: int) -> list[str]:
-    """The rows of shares of all cells around the particles of a row, once each."""
-    rows = {}
-    for slot in plan.scene.neighbourhood.slots[s]:
-        for side in _beside(plan, slot):
-            target, step = (side.first.target, side.first.cell) if side.first else (s, None)
-            at = f"{side.kind}, {target}"
-            rows[_share_name(plan, slot, side)] = plan.row("share", at, step)
-    return [f"{name} = {row}" for name, row in rows.items()]
+    rows = []
+    for side in plan.scene.cells.tiling.beside[slot]:
+        target, step = (side.first.target, side.first.cell) if side.first else (slot.source, None)
+        rows.append(plan.row("share", f"{side.kind}, {target}", step))
+    return rows

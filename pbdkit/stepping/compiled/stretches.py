@@ -23,7 +23,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
     beside each other share, sorted by sublattice and kind, then as they lie; (group, row, 2): the
     first run that reaches a row of the first axis, and the first that begins there or later; and
     the sublattice and kind of each group."""
-    found, starts, groups, total = [], [], [], 0
+    found, starts, groups = list[Ints](), list[Ints](), list[tuple[int, int]]()
     rows = np.arange(scene.raster.shape[1] + 1)
     for s in range(scene.raster.shape[0]):
         if block := scene.raster.body_block(s):
@@ -34,28 +34,22 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
                 last = own[:, 1] if scene.axes == 2 else own[:, 0] + 1
                 reach = np.searchsorted(np.maximum.accumulate(last), rows, side="right")
                 begin = np.searchsorted(own[:, 0], rows)
-                starts.append(total + np.stack([reach, begin], axis=1))
+                starts.append(sum(map(len, found)) + np.stack([reach, begin], axis=1))
                 found.append(own)
                 groups.append((s, kind))
-                total += len(own)
     return np.concatenate(found), np.stack(starts), tuple(groups)
 
 
 def _joined(lines: Ints) -> Ints:
     """Stretches at one place of rows that follow each other, as one."""
     *lead, row, begin, end = lines.T
-    order = np.lexsort((row, end, begin, *reversed(lead)))
-    *lead, row, begin, end = lines[order].T
-    goes_on = np.ones(len(row) - 1, bool)
-    for places in (*lead, begin, end):
-        goes_on &= np.diff(places) == 0
-    goes_on &= np.diff(row) == 1
+    lines = lines[np.lexsort((row, end, begin, *reversed(lead)))]
+    step = np.diff(lines, axis=0)
+    goes_on = (np.delete(step, -3, axis=1) == 0).all(axis=1) & (step[:, -3] == 1)
     first = np.flatnonzero(np.concatenate([[True], ~goes_on]))
     last = np.append(first[1:], len(row)) - 1
-    runs = np.stack([*(n[first] for n in lead), row[first], row[last] + 1, begin[first],
-                     end[first]], axis=1)  # fmt: skip
-    ordered: Ints = runs[np.lexsort(tuple(runs.T[::-1]))]
-    return ordered
+    runs = np.insert(lines[first], -2, lines[last, -3] + 1, axis=1)
+    return np.take(runs, np.lexsort(tuple(runs.T[::-1])), axis=0)
 
 
 def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
@@ -80,25 +74,22 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
 
 def _lines_of(kinds: Ints) -> Ints:
     """The stretches of one kind, in each row along the last axis."""
-    closed = np.full((*kinds.shape[:-1], kinds.shape[-1] + 1), NOBODY)
-    closed[..., :-1] = kinds
+    beyond = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
+    closed = np.pad(kinds, beyond, constant_values=NOBODY)
     flat = closed.ravel()
     for these, beside in (([PLAIN], WITH_CELLS), ([PLAIN, WITH_CELLS], GENERAL)):
         begin, end, kind = _stretches(flat)
-        touches = np.zeros(len(kind), bool)
-        touches[1:] |= kind[:-1] == beside
-        touches[:-1] |= kind[1:] == beside
+        # The last is of nobody, so that no end touches the other.
+        touches = (np.roll(kind, 1) == beside) | (np.roll(kind, -1) == beside)
         short = np.isin(kind, these) & (end - begin < SHORT) & touches
         flat = np.repeat(np.where(short, beside, kind), end - begin)
     begin, end, kind = _stretches(flat)
     *lead, first = np.unravel_index(begin, closed.shape)
     lines = np.stack([*lead, first, first + end - begin, kind], axis=1)
-    some: Ints = lines[kind != NOBODY].astype(np.int64)
-    return some
+    return np.compress(kind != NOBODY, lines, axis=0).astype(np.int64)
 
 
 def _stretches(flat: Ints) -> tuple[Ints, Ints, Ints]:
     """(begin, end, value) of the stretches of equal values."""
-    edges = np.flatnonzero(np.diff(flat)) + 1
-    begin = np.concatenate([[0], edges])
-    return begin, np.concatenate([edges, [len(flat)]]), flat[begin]
+    begin = np.flatnonzero(np.diff(flat, prepend=-1))
+    return begin, np.append(begin[1:], len(flat)), flat[begin]

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from functools import partial
+from operator import methodcaller
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import BreaksAtStrain, Draws, FollowerRule, FractureModel, RenewsBonds
+from pbdkit.interfaces import Draws, FollowerRule, FractureModel
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator
-from pbdkit.testing.fault import NotAskedError, PropertyError
-from pbdkit.testing.property import asked_of
+from pbdkit.testing.properties.start import remembered
 from pbdkit.testing.question import Question, applied, flat, gathered
-from pbdkit.testing.states import SEED, SHAPE, differences, here, owners, remembers
-from pbdkit.testing.subject import Subject
+from pbdkit.testing.states import SEED, SHAPE, differences, here, owners
+from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of
 
 ROUNDING = 1e-12
 """Some thousand roundings: functions of numpy may differ in the last digit from place to place."""
@@ -28,15 +26,45 @@ def returns_a_value_a_particle(subject: Subject) -> None:
     for question in _elementwise(subject):
         for name, value in question.answer().items():
             if value.shape not in ((), SHAPE):
-                raise PropertyError(
-                    f"`{question.what}` returns the shape {value.shape} for particles of shape "
-                    f"{SHAPE} ({name}): it is not elementwise"
-                )
+                fault = f"returns the shape {value.shape} for particles of shape {SHAPE} ({name})"
+                raise PropertyError(f"`{question.what}` {fault}: it is not elementwise")
     if isinstance(subject.component, FollowerRule):
-        scene = subject.scene()
+        scene = subject.scene
         counts = {len(c) for c in gathered(scene, differences(scene, 0))}
         if len(counts) > 1:
             raise PropertyError(f"`gather` returns now {min(counts)}, now {max(counts)} values")
+
+
+@asked_of()
+def is_finite(subject: Subject) -> None:
+    """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
+    one NaN spreads over the body within a few steps."""
+    for question in subject.questions():
+        for name, value in question.answer().items():
+            if value.dtype.kind in "fc" and not np.isfinite(value).all():
+                worst = value[~np.isfinite(value)].flat[0]
+                remedy = "guard the division, as in `a / where(b > 0.0, b, 1.0)`"
+                raise PropertyError(f"`{question.what}` answers {worst} ({name}): {remedy}")
+
+
+@asked_of(FollowerRule, FractureModel, is_needed=True)
+def renews_what_it_remembers(subject: Subject) -> None:
+    """`update`, or `remember`, returns one value for each number that changes, in their order, and
+    a whole number where one is declared."""
+    changing = [number for number in remembered(subject, subject.scene) if number.changes]
+    asked = [q for q in subject.questions() if q.what in ("update", "remember")]
+    if not asked:
+        raise NotAskedError("what it remembers stays as it starts")
+    what, answer = asked[0].what, asked[0].asked()
+    for values in answer if what == "update" else [answer]:
+        if len(values) != len(changing):
+            returned = f"{len(values)} value{'s' * (len(values) != 1)}"
+            fault = f"`{what}` returns {returned}, and {len(changing)} of the numbers change"
+            raise PropertyError(f"{fault}: declare `changes=False` for those that stay")
+        for number, value in zip(changing, map(np.asarray, values), strict=True):
+            if not np.can_cast(value.dtype, number.dtype, "same_kind"):
+                fault = f"`{what}` returns {value.dtype} for '{number.name}', which is declared"
+                raise PropertyError(f"{fault} as {number.dtype}: fractions would be lost")
 
 
 @asked_of(FollowerRule, FractureModel)
@@ -63,13 +91,12 @@ def takes_particles_in_any_order(subject: Subject) -> None:
         for name, value in mixed.items():
             expected = _in_order(np.broadcast_to(whole[name], SHAPE), order)
             if (place := _apart(np.broadcast_to(value, SHAPE), expected)) is not None:
-                raise PropertyError(
-                    f"`{question.what}` gives a particle another answer where it stands in another "
-                    f"order ({name}: {value[place]} and {expected[place]})"
-                )
+                fault = "gives a particle another answer where it stands in another order"
+                told = f"({name}: {value[place]} and {expected[place]})"
+                raise PropertyError(f"`{question.what}` {fault} {told}")
     _refuse_an_order_of_rows(subject)
     if isinstance(subject.component, FollowerRule):
-        _refuse_an_order_of_slots(subject.scene())
+        _refuse_an_order_of_slots(subject.scene)
 
 
 class Alike(np.random.Generator):
@@ -90,31 +117,26 @@ class Alike(np.random.Generator):
 
 
 def _refuse_an_order_of_rows(subject: Subject) -> None:
-    part, scene = subject.component, subject.scene()
+    part = subject.component
     if not isinstance(part, Draws):
         return
-    shown = owners(subject.component, scene)
+    shown = owners(subject.component, subject.scene)
     order = np.random.default_rng(0).permutation(len(shown))
     mixed = type(shown)(**{name: table[order] for name, table in vars(shown).items()})
     one, other = (part.draw(rows, Alike(np.random.PCG64(SEED))) for rows in (shown, mixed))
     for name, values in one.items():
         if not np.array_equal(np.asarray(values)[order], other[name]):
-            raise PropertyError(
-                f"`draw` gives '{name}' by the row: take it from what a row holds, or from the "
-                "generator"
-            )
+            remedy = "take it from what a row holds, or from the generator"
+            raise PropertyError(f"`draw` gives '{name}' by the row: {remedy}")
 
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
     contributions, at = gathered(scene, differences(scene, 0)), here(scene, 0)
-    one = applied(scene, contributions, **at)
-    other = applied(scene, contributions[::-1], **at)
-    for name, value in one._asdict().items():
-        if _apart(np.asarray(value), np.asarray(getattr(other, name))) is not None:
-            raise PropertyError(
-                f"the move depends on the order in which neighbours are summed ({name}): do not "
-                "sum large numbers that cancel"
-            )
+    one, other = (flat(applied(scene, c, **at)) for c in (contributions, contributions[::-1]))
+    for name, value in one.items():
+        if _apart(value, other[name]) is not None:
+            fault = f"the move depends on the order in which neighbours are summed ({name})"
+            raise PropertyError(f"{fault}: do not sum large numbers that cancel")
 
 
 @asked_of(FollowerRule, FractureModel, is_needed=True)
@@ -125,99 +147,20 @@ def is_local(subject: Subject) -> None:
         whole = question.answer()
         for place in [(0, 0), (2, 1), (3, 2)]:
             try:
-                alone = flat(question.asked(partial(_item, place)))
+                alone = flat(question.asked(methodcaller("item", *place)))
             except Exception as error:
-                raise PropertyError(
-                    f"`{question.what}` fails with plain numbers in the place of arrays: "
-                    f"{type(error).__name__}: {error}"
-                ) from None
+                fault = f"`{question.what}` fails with plain numbers in the place of arrays"
+                raise PropertyError(f"{fault}: {type(error).__name__}: {error}") from None
             for name, value in alone.items():
                 among = np.broadcast_to(whole[name], SHAPE)[place]
-                if np.shape(value) or _apart(np.asarray(value), np.asarray(among)) is not None:
-                    raise PropertyError(
-                        f"`{question.what}` gives a particle another answer alone than among "
-                        f"others ({name}: {value} and {among}): it is not elementwise"
-                    )
-
-
-def _item(place: tuple[int, int], value: NDArray[Any]) -> Any:
-    return value[place].item()
+                if np.shape(value) or _apart(value, among) is not None:
+                    fault = "gives a particle another answer alone than among others"
+                    told = f"({name}: {value} and {among}): it is not elementwise"
+                    raise PropertyError(f"`{question.what}` {fault} {told}")
 
 
 def _single(value: NDArray[Any]) -> NDArray[Any]:
     return value.astype(np.float32) if value.dtype.kind == "f" else value.copy()
-
-
-CLOSE = 1e-9
-"""How near to its breaking strain a bond is tried, as a share of its length."""
-
-
-@asked_of(FractureModel, is_needed=True)
-def is_seen_alike_from_both_ends(subject: Subject) -> None:
-    """A bond breaks for both ends or for none: `breaks` and `update` answer the same for (-d, -r)
-    as for (d, r), and `constants` for a slot and its opposite; they are called for one end only."""
-    model, scene = subject.component, subject.scene()
-    for plane in scene.neighbourhood.planes:
-        here, there = model.constants(plane.slot), model.constants(plane.opposite)
-        if here != there:
-            raise PropertyError(
-                f"`constants` are {here} for the slot {plane.slot.site} and {there} for its "
-                "opposite: take lengths and shells, not directions"
-            )
-    evaluator, own = Evaluator(scene), remembers(model, scene, 0)
-    asks = {"breaks": evaluator.breaks}
-    if isinstance(model, RenewsBonds):
-        asks["update"] = evaluator.update
-    slots = scene.neighbourhood.slots[0]
-    for slot, d in zip(slots, differences(scene, 0, share=2.0), strict=True):
-        limits = scene.constants.limits[slot]
-        for what, ask in asks.items():
-            one, other = ask(d, slot.rest, limits, own), ask(-d, -slot.rest, limits, own)
-            if not np.array_equal(np.asarray(one), np.asarray(other)):
-                raise PropertyError(
-                    f"`{what}` answers otherwise for (-d, -r) than for (d, r) along {slot.site}"
-                )
-
-
-@asked_of(FractureModel)
-def breaks_as_declared(subject: Subject) -> None:
-    """Where it declares `can_break = False` nothing breaks, however long: the scene then has no
-    bond state."""
-    model, scene = subject.component, subject.scene()
-    if model.can_break:
-        return
-    slots, breaks = scene.neighbourhood.slots[0], Evaluator(scene).breaks
-    for slot, d in zip(slots, differences(scene, 0, share=1e3), strict=True):
-        if np.any(breaks(d, slot.rest, scene.constants.limits[slot], ())):
-            raise PropertyError("it declares `can_break = False`, and `breaks` says yes")
-
-
-@asked_of(FractureModel)
-def breaks_beyond_its_strain(subject: Subject) -> None:
-    """Where it tells a `breaking_strain`, a bond that is drawn out along itself breaks a little
-    above it and, if it has not broken, not a little below: `pbdkit explain` tells users so."""
-    model, scene = subject.component, subject.scene()
-    tells = isinstance(model, BreaksAtStrain)
-    if not tells:
-        raise NotAskedError("it tells no `breaking_strain`")
-    evaluator, own, p = Evaluator(scene), remembers(model, scene, 0), scene.constants.fracture
-    for slot in scene.neighbourhood.slots[0]:
-        r, limits = slot.rest, scene.constants.limits[slot]
-        c = scene.constants.of_bond(*limits, *own)
-        told = model.breaking_strain(r, c, p)
-        limit = np.broadcast_to(told, SHAPE)
-        for side, expected in ((CLOSE, True), (-CLOSE, False)):
-            stretch = limit + side * (1.0 + np.abs(limit))
-            d = r * stretch
-            now = [np.array(value) for value in own]
-            evaluator.renew_bonds(d, r, limits, now, np.ones(SHAPE, bool))
-            wrong = np.broadcast_to(evaluator.breaks(d, r, limits, now), SHAPE) != expected
-            if wrong.any():
-                at = float(stretch[wrong][0])
-                raise PropertyError(
-                    f"`breaking_strain` and `breaks` disagree: at strain {at:.6g} along "
-                    f"{slot.site} the bond {'stays' if expected else 'breaks'}"
-                )
 
 
 def _elementwise(subject: Subject) -> list[Question]:
@@ -228,12 +171,12 @@ def _in_order(value: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
     return value.reshape(-1)[order].reshape(value.shape)
 
 
-def _apart(one: NDArray[Any], other: NDArray[Any]) -> tuple[int, ...] | None:
+def _apart(value: Any, expected: Any) -> tuple[int, ...] | None:
     """The first place at which two answers differ by more than rounding."""
+    one, other = np.asarray(value), np.asarray(expected)
     if one.dtype == bool:
         differs = one != other
     else:
         size = max(1e-300, float(np.abs(other).max(initial=0.0)))
         differs = ~(np.abs(one - other) <= ROUNDING * size)
-    places = np.argwhere(differs)
-    return tuple(places[0].tolist()) if len(places) else None
+    return next(map(tuple, np.argwhere(differs).tolist()), None)

@@ -13,40 +13,28 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import (
-    INTERFACES,
     Component,
     Diagnostic,
     FollowerRule,
     FractureModel,
     FramePolicy,
 )
-from pbdkit.testing.fault import PropertyError
-from pbdkit.testing.property import asked_of
-from pbdkit.testing.question import Arrays, Question, applied, each, flat, gathered
-from pbdkit.testing.states import differences, here
-from pbdkit.testing.subject import Subject
+from pbdkit.testing.question import Arrays, each, flat
+from pbdkit.testing.subject import PropertyError, Subject, asked_of
 
-ALL = tuple(INTERFACES.values())
 UNUSUAL = 918273645
 """A seed that nobody else takes."""
 
 
 def differing(one: Arrays, other: Arrays) -> list[str]:
     """The names of the answers that are not the same to the last bit."""
-    names = [name for name in one if name not in other or not _same(one[name], other[name])]
-    return names + [name for name in other if name not in one]
+    shared = one.keys() & other.keys()
+    return [n for n in one | other if n not in shared or not _same(one[n], other[n])]
 
 
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    numbers = a.dtype.kind in "fc"
-    return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=numbers)
-
-
-@asked_of(*ALL, is_needed=True)
-def takes_part(subject: Subject) -> None:
-    """A scene can be built with it: at least one of those tried takes it, and none makes it fail
-    with anything but an ExperimentError."""
-    subject.scene()
+def _same(one: Any, other: Any) -> bool:
+    a, b = np.asarray(one), np.asarray(other)
+    return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
 
 
 @asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, is_needed=True)
@@ -69,26 +57,24 @@ def _written(function: str, where: str) -> str:
     return f"`{function}` writes into {where}: make new arrays, `x = x + 1` and not `x += 1`"
 
 
-@asked_of(*ALL, is_needed=True)
+@asked_of(is_needed=True)
 def remembers_nothing(subject: Subject) -> None:
     """What it was asked before does not matter: whatever must be remembered belongs to the state of
     the run, or a run that is continued would differ from one that was never interrupted."""
     for question, other in zip(subject.questions(0), subject.questions(-1), strict=False):
-        before = remembered(subject.component)
-        answers = [question.answer() for _ in range(3)]
+        before = reached_by(subject.component)
+        _, one, again = (question.answer() for _ in range(3))
         other.answer()
         question.answer(lambda v: 10.0 * v if v.dtype.kind == "f" else v.copy())
-        later = question.answer()
-        kept = changed(before, remembered(subject.component))
-        steady = not differing(answers[1], answers[2])
-        if differing(answers[2], later) and (steady or kept):
+        later, after = question.answer(), reached_by(subject.component)
+        kept = sorted(n for n in before | after if before.get(n) != after.get(n))
+        if differing(again, later) and (kept or not differing(one, again)):
             what = f", and keeps {_listed(kept)} from call to call" if kept else ""
-            raise PropertyError(
-                f"`{question.what}` answers the same question otherwise after another one{what}"
-            )
+            told = f"`{question.what}` answers the same question otherwise after another one"
+            raise PropertyError(told + what)
 
 
-@asked_of(*ALL, is_needed=True)
+@asked_of(is_needed=True)
 def answers_the_same(subject: Subject) -> None:
     """The same question gets the same answer to the last bit, and the generators of random numbers
     that all share stay as they are, so that every run can be repeated."""
@@ -96,54 +82,22 @@ def answers_the_same(subject: Subject) -> None:
         kept = random.getstate(), np.random.get_state()
         random.seed(UNUSUAL)
         np.random.seed(UNUSUAL)
-        before = pickle.dumps((random.getstate(), np.random.get_state()))
+        before = _shared_generators()
         names = differing(question.answer(), question.answer())
-        after = pickle.dumps((random.getstate(), np.random.get_state()))
+        after = _shared_generators()
         random.setstate(kept[0])
         np.random.set_state(kept[1])
-        if not names and after != before:
-            raise PropertyError(
-                f"`{question.what}` seeds or uses the generator of random numbers that all share"
-            )
         if names:
-            raise PropertyError(
-                f"`{question.what}` answers the same question otherwise the second time "
-                f"({_listed(names)}): it draws numbers at random that nobody gave "
-                "it, or looks at a clock"
-            )
+            fault = f"answers the same question otherwise the second time ({_listed(names)})"
+            cause = "it draws numbers at random that nobody gave it, or looks at a clock"
+            raise PropertyError(f"`{question.what}` {fault}: {cause}")
+        if after != before:
+            fault = "seeds or uses the generator of random numbers that all share"
+            raise PropertyError(f"`{question.what}` {fault}")
 
 
-@asked_of(*ALL)
-def is_finite(subject: Subject) -> None:
-    """Finite numbers get finite answers, for a rule also where all neighbours meet in the particle:
-    one NaN spreads over the body within a few steps."""
-    for question in [*subject.questions(), *_meeting(subject)]:
-        for name, value in question.answer().items():
-            if value.dtype.kind in "fc" and not np.isfinite(value).all():
-                worst = value[~np.isfinite(value)].flat[0]
-                raise PropertyError(
-                    f"`{question.what}` answers {worst} ({name}): guard the division, as in "
-                    "`a / where(b > 0.0, b, 1.0)`"
-                )
-
-
-def _meeting(subject: Subject) -> list[Question]:
-    """A rule asked where r + d = 0 along every slot."""
-    rule = subject.component
-    if not isinstance(rule, FollowerRule):
-        return []
-    scene = subject.scene()
-    slots = scene.neighbourhood.slots[0]
-    meeting = [
-        d.each(lambda v, r: np.full_like(v, -r), slot.rest)
-        for d, slot in zip(differences(scene, 0), slots, strict=True)
-    ]
-
-    def ask(d: Any, **at: Any) -> Any:
-        return applied(scene, gathered(scene, d), **at)
-
-    inputs = {"d": meeting} | here(scene, 0)
-    return [Question("apply, where all neighbours meet in the particle,", inputs, ask)]
+def _shared_generators() -> bytes:
+    return pickle.dumps((random.getstate(), np.random.get_state()))
 
 
 def _listed(names: list[str]) -> str:
@@ -151,26 +105,16 @@ def _listed(names: list[str]) -> str:
     return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-Kept = dict[str, bytes]
-
-
-def remembered(component: Component) -> Kept:
+def reached_by(component: Component) -> dict[str, bytes]:
     """Every value that the component's functions can reach and change, by name, as bytes."""
     return {name: _content(value) for name, value in _reached(component)}
-
-
-def changed(before: Kept, after: Kept) -> list[str]:
-    """The names of the values that differ."""
-    return sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
 
 
 def _reached(component: Component) -> Iterator[tuple[str, Any]]:
     yield "private attributes", dict(component.__pydantic_private__ or {})
     cached = {n for k in type(component).__mro__ for n, v in vars(k).items()
               if isinstance(v, cached_property)}  # fmt: skip
-    for name, value in vars(component).items():
-        if name not in cached:
-            yield name, value
+    yield from ((name, value) for name, value in vars(component).items() if name not in cached)
     for owner in type(component).__mro__:
         if owner.__module__.startswith(("pbdkit.interfaces", "pydantic", "builtins", "abc")):
             continue
@@ -180,22 +124,20 @@ def _reached(component: Component) -> Iterator[tuple[str, Any]]:
             function = inspect.unwrap(getattr(value, "__func__", value))
             if isinstance(function, types.FunctionType):
                 yield from _of_function(function)
-            elif not isinstance(value, types.FunctionType):
+            else:
                 yield f"{owner.__name__}.{name}", value
 
 
-def _of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+def _of_function(function: types.FunctionType, helpers: bool = True) -> Iterator[tuple[str, Any]]:
     """Globals, closures, defaults and attributes of a function; helpers one call away."""
     yield f"defaults of {function.__name__}", (function.__defaults__, function.__kwdefaults__)
     yield f"attributes of {function.__name__}", vars(function)
     reached = inspect.getclosurevars(function)
     for name, value in {**reached.globals, **reached.nonlocals}.items():
-        if isinstance(value, types.FunctionType):
-            if not value.__module__.startswith(("pbdkit.", "numpy")):
-                yield f"attributes of {value.__name__}", vars(value)
-                yield from inspect.getclosurevars(value).globals.items()
-        else:
+        if not isinstance(value, types.FunctionType):
             yield name, value
+        elif helpers and not value.__module__.startswith(("pbdkit.", "numpy")):
+            yield from _of_function(value, helpers=False)
 
 
 def _content(value: Any) -> bytes:

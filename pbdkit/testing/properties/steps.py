@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import pickle
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import (
-    INTERFACES,
     Anchors,
     Diagnostic,
     FollowerRule,
@@ -23,16 +20,13 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
-from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.fault import NotAskedError, PropertyError
 from pbdkit.testing.properties.repetition import differing
-from pbdkit.testing.property import asked_of
-from pbdkit.testing.question import Arrays
+from pbdkit.testing.question import flat, measured_by
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
-from pbdkit.testing.subject import Subject, place_of, scenes_with
+from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
-ALL = tuple(INTERFACES.values())
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
 ROUNDING = 1e-12
 """As a share of the largest displacement; a few steps are some hundred roundings of 1e-16."""
@@ -43,27 +37,23 @@ STEPS = 4
 def rests(subject: Subject) -> None:
     """A body at rest inside a frame stays at rest exactly, and none of its bonds breaks: what moves
     by 1e-17 has moved."""
-    quiet = [scene for scene in subject.scenes if not _warned(scene)]
+    fracture = [(scene, scene.experiment.fracture) for scene in subject.scenes]
+    quiet = [scene for scene, model in fracture if not model.check(scene.neighbourhood.shells())]
     if not quiet:
         raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
     for scene in quiet:
-        framed, engine, state = scene.frame is not None, Stepper(scene), initial_state(scene)
+        engine, state = Stepper(scene), initial_state(scene)
         for _ in range(STEPS):
             state = engine.advance(state)
             where = f"in step {state.step} {place_of(scene.experiment)}"
             if state.broken_step is not None and (state.broken_step > 0).any():
                 broken = int((state.broken_step > 0).sum())
                 raise PropertyError(f"{broken} bonds of a body at rest break {where}")
-            if framed and state.u.any():
-                moved = float(np.abs(state.u).max())
-                raise PropertyError(
-                    f"a body at rest moves by {moved:.3g} {where}: zero differences must give a "
-                    "move of exactly zero; let terms of opposite neighbours cancel one by one"
-                )
-
-
-def _warned(scene: Scene) -> bool:
-    return bool(scene.experiment.fracture.check(scene.neighbourhood.shells()))
+            if scene.frame and state.u.any():
+                fault = f"a body at rest moves by {np.abs(state.u).max():.3g} {where}"
+                wanted = "zero differences must give a move of exactly zero"
+                remedy = "let terms of opposite neighbours cancel one by one"
+                raise PropertyError(f"{fault}: {wanted}; {remedy}")
 
 
 @asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)
@@ -73,59 +63,54 @@ def follows_translations(subject: Subject) -> None:
     component, most = subject.component, 0.0
     anchors = isinstance(component, Anchors)
     for scene in _free(subject):
-        u, size = displacements(scene, 1), spacing(scene)
-        shift = size * np.array([0.75, -1.5])
+        u, shift = displacements(scene, 1), spacing(scene) * np.array([0.75, -1.5])
         moved, there = advanced(scene, u, STEPS) + shift, advanced(scene, u + shift, STEPS)
         most = max(most, _apart(there[-1], moved[-1], moved))
         if most > ROUNDING and not anchors:
-            remedy = {
-                FollowerRule: "use differences `d`, not `here.u`, or declare `uses_reference`",
-                FramePolicy: "let the weights of each point sum to 1, or take on `pbdkit.Anchors`",
-            }.get(next(i for i in STEPPED if isinstance(component, i)), "")
-            raise PropertyError(
-                f"a translated body moves otherwise, by {most:.3g} of its displacement, "
-                f"{place_of(scene.experiment)}" + (f": {remedy}" if remedy else "")
-            )
+            remedy = ""
+            if isinstance(component, FollowerRule):
+                remedy = ": use differences `d`, not `here.u`, or declare `uses_reference`"
+            elif isinstance(component, FramePolicy):
+                remedy = ": let the weights of each point sum to 1, or take on `pbdkit.Anchors`"
+            fault = f"a translated body moves otherwise, by {most:.3g} of its displacement"
+            raise PropertyError(f"{fault}, {place_of(scene.experiment)}{remedy}")
     if anchors and most <= ROUNDING:
         raise PropertyError("it says that it `anchors` the body, and follows every translation")
 
 
 def _free(subject: Subject) -> list[Scene]:
     """The scenes in which nothing else counts where particles stand; NotAskedError without any."""
-    parts = [(scene, scene.experiment) for scene in subject.scenes]
-    free = [
-        scene
-        for scene, e in parts
-        if not e.rule.uses_reference
-        and (e.frame is subject.component or not isinstance(e.frame, Anchors))
-    ]
+    free = []
+    for scene in subject.scenes:
+        rule, frame = scene.experiment.rule, scene.experiment.frame
+        anchored = isinstance(frame, Anchors) and frame is not subject.component
+        if not rule.uses_reference and not anchored:
+            free.append(scene)
     if not free:
-        whose = "it" if isinstance(subject.component, FollowerRule) else "the rule"
-        raise NotAskedError(
-            f"{whose} declares `uses_reference`, or a frame anchors: where a body lies may count"
-        )
+        reason = f"{_whose(subject)} declares `uses_reference`, or a frame anchors"
+        raise NotAskedError(f"{reason}: where a body lies may count")
     return free
+
+
+def _whose(subject: Subject) -> str:
+    return "it" if isinstance(subject.component, FollowerRule) else "the rule"
 
 
 @asked_of(FollowerRule, FramePolicy)
 def superposes(subject: Subject) -> None:
     """Where a rule declares `linear`, and with every frame, the steps from two displacements
     together are the steps from each, added, to rounding."""
-    component = subject.component
     scenes = [scene for scene in subject.scenes if scene.experiment.rule.linear]
     if not scenes:
-        whose = "it" if isinstance(component, FollowerRule) else "the rule"
-        raise NotAskedError(f"{whose} does not declare `linear`")
+        raise NotAskedError(f"{_whose(subject)} does not declare `linear`")
     for scene in scenes:
         one, other = displacements(scene, 2, share=0.5), displacements(scene, 3, share=0.5)
         both, a, b, none = (advanced(scene, u, STEPS) for u in (one + other, one, other, 0.0 * one))
         off = _apart((both - none)[-1], (a + b - 2 * none)[-1], np.array([both, a, b, none]))
         if not off <= ROUNDING:
-            raise PropertyError(
-                f"displacements do not superpose, by {off:.3g} of the largest, "
-                f"{place_of(scene.experiment)}: "
-                + ("do not declare `linear`" if isinstance(component, FollowerRule) else "")
-            )
+            remedy = "do not declare `linear`" if _whose(subject) == "it" else ""
+            fault = f"displacements do not superpose, by {off:.3g} of the largest"
+            raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
 
 
 def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
@@ -134,7 +119,7 @@ def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
     return float(np.abs(one - other).max() / max(1e-300, np.abs(all_of_them).max()))
 
 
-@asked_of(*ALL, is_needed=True)
+@asked_of(is_needed=True)
 def continues_where_it_stopped(subject: Subject) -> None:
     """A run that is saved, read by a component made anew from its JSON and continued is the same to
     the last bit as one that was never interrupted."""
@@ -142,9 +127,8 @@ def continues_where_it_stopped(subject: Subject) -> None:
     anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
     if any(getattr(anew, name) != getattr(component, name) for name in kind.model_fields):
         raise NotAskedError("it is another one after JSON")
-    for n, (scene, again) in enumerate(
-        zip(subject.scenes, scenes_with(anew, subject.parts), strict=True)
-    ):
+    scenes = zip(subject.scenes, Subject(anew, subject.parts).scenes, strict=True)
+    for n, (scene, again) in enumerate(scenes):
         start = displacements(scene, n, share=0.4)
         _refuse_difference(initial_state(again), initial_state(scene), "a run made anew", scene)
         whole = Stepper(scene).advance(state_with(scene, start), 2 * STEPS)
@@ -156,30 +140,23 @@ def continues_where_it_stopped(subject: Subject) -> None:
         copied = Stepper(again).advance(kept, STEPS)
         _refuse_difference(copied, whole, f"a run continued from a copy of step {STEPS}", scene)
         if isinstance(component, Diagnostic):
-            measured = _measured(component, scene, whole), _measured(anew, again, continued)
-            if names := differing(*measured):
-                raise PropertyError(
-                    f"`{names[0]}` of a run continued at step {STEPS} is another one"
-                )
-
-
-def _measured(diagnostic: Any, scene: Scene, state: State) -> Arrays:
-    names = [variable.name for variable in diagnostic.variables()]
-    values = diagnostic.measure(StateMoment(state, Tables(scene)))
-    return {name: np.array(value) for name, value in zip(names, values, strict=True)}
+            one = measured_by(anew, StateMoment(continued, Tables(again)))
+            other = measured_by(component, StateMoment(whole, Tables(scene)))
+            for name in differing(other, one):
+                raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
 
 
 @asked_of(*STEPPED)
 def is_the_same_compiled(subject: Subject) -> None:
     """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
     compile is stepped by numpy, and says so."""
-    scene = subject.scene()
+    scene = subject.scene
     if reason := obstacle():
         raise NotAskedError(reason)
     from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
     try:
-        compiled: Engine = CompiledStepper(scene)
+        compiled = CompiledStepper(scene)
     except PluginError as error:
         text = str(error).splitlines()[0]
         raise NotAskedError(f"numpy alone steps it, more slowly: {text}") from None
@@ -191,24 +168,10 @@ def is_the_same_compiled(subject: Subject) -> None:
 
 
 def _refuse_difference(state: State, expected: State, whose: str, scene: Scene) -> None:
-    for field in fields(expected):
-        one, other = getattr(state, field.name), getattr(expected, field.name)
-        if not _identical(one, other):
-            raise PropertyError(
-                f"{whose} gives another `{field.name}`{_by(one, other)} at step {expected.step}, "
-                f"{place_of(scene.experiment)}"
-            )
-
-
-def _identical(one: Any, other: Any) -> bool:
-    if isinstance(one, (tuple, list)):
-        return len(one) == len(other) and all(map(_identical, one, other))
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
-    return bool(one == other)
-
-
-def _by(one: Any, other: Any) -> str:
-    if not isinstance(one, np.ndarray) or np.shape(one) != np.shape(other):
-        return ""
-    return f", by {np.abs(one.astype(float) - other.astype(float)).max():.3g} at most,"
+    found, needed = flat(state), flat(expected)
+    for name in differing(needed, found):
+        by, one, other = "", np.asarray(found.get(name)), np.asarray(needed.get(name))
+        if one.shape == other.shape:
+            by = f", by {np.abs(one.astype(float) - other).max():.3g} at most,"
+        where = f"at step {expected.step}, {place_of(scene.experiment)}"
+        raise PropertyError(f"{whose} gives another `{name}`{by} {where}")
