@@ -16,7 +16,7 @@ from pbdkit.cli.options import with_no_plugins
 MODULES = {
     "run": "run",
     "experiments": "check identify experiments init schema bench",
-    "result": "plot explain",
+    "result": "plot explain verify",
     "plugins": "plugins",
 }
 COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}

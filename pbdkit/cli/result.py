@@ -1,4 +1,4 @@
-"""``pbdkit plot`` and ``explain``: a result looked at."""
+"""``pbdkit plot``, ``explain`` and ``verify``: a result looked at."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from pbdkit.cli.options import json_option
 if TYPE_CHECKING:
     from pbdkit.results.explanation import Explained, Standing
 
+PATH = click.Path(path_type=Path)
 SHOWN = 20
 """So many broken bonds are listed in words; --json has all."""
 
 
 @click.command()
-@click.argument("file", metavar="OUT.nc", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="PNG, SVG or PDF.")
+@click.argument("file", metavar="OUT.nc", type=PATH)
+@click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
 @click.option("--time", "times", type=int, multiple=True, help="A recorded step; several panels.")
 @click.option("--color", metavar="VARIABLE", help="Colour by a variable, e.g. pe1.")
 @click.option("--contours", is_flag=True, help="Fill contours of the variable.")
@@ -53,7 +54,34 @@ def plot(
 
 
 @click.command()
-@click.argument("file", metavar="OUT.nc", type=click.Path(path_type=Path))
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=PATH)
+def verify(files: tuple[Path, ...]) -> int:
+    """Recompute the digests of results and say, a line a file, which are as they were written."""
+    faults = [fault for file in files if (fault := _verified(file))]
+    return 6 if faults else 0
+
+
+def _verified(file: Path) -> str:
+    """What a file's line says against it, if anything."""
+    from pbdkit.cli.output import refusals_as
+    from pbdkit.errors import StorageError
+    from pbdkit.results.accessor import UNSEALED
+    from pbdkit.results.seal import SealedFile
+
+    fault = ""
+    try:
+        with refusals_as(str(file)), SealedFile(file) as content:
+            content.check()
+            if content.seal is None:
+                fault = f"{file}: {UNSEALED}"
+    except StorageError as error:
+        fault = str(error)
+    click.echo(fault or f"{file}: is as it was written")
+    return fault
+
+
+@click.command()
+@click.argument("file", metavar="OUT.nc", type=PATH)
 @click.option("--bond", nargs=2, type=int, metavar="A B", help="The bond between two numbers.")
 @json_option
 def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:

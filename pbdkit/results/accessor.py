@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,22 +10,27 @@ from typing import TYPE_CHECKING, Any
 
 import xarray
 
-from pbdkit.errors import ExperimentError, PbdkitError, StorageError
+from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
+from pbdkit.results.seal import BrokenSealError, opened, seal_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
+
 
 def open(path: str | Path) -> xarray.Dataset:
-    """The dataset in a result file; its values are read when they are used.
+    """The dataset in a result file; its values are read, and checked, when they are used.
 
     Raises ExperimentError for an experiment, and StorageError where there is no such file, where it
-    cannot be read as netCDF, where pbdkit did not make it, where variables are missing, or where a
-    newer pbdkit made it than this one can read.
+    is not as it was written, where it cannot be read as netCDF, where pbdkit did not make it, where
+    variables are missing, or where a newer pbdkit made it than this one can read. A change that is
+    met later, as values are read, raises StorageError too. Warns, with pbdkit.PbdkitWarning, of a
+    file without a seal.
     """
     file = Path(path)
     if not file.is_file():
@@ -34,8 +40,9 @@ def open(path: str | Path) -> xarray.Dataset:
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
         )
     try:
-        # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
-        dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
+        dataset = _opened(file)
+    except StorageError:
+        raise
     except Exception as error:  # whatever the libraries below make of a damaged file
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
@@ -43,6 +50,19 @@ def open(path: str | Path) -> xarray.Dataset:
         dataset.close()
         raise StorageError(f"{file}: {fault}")
     return dataset
+
+
+def _opened(file: Path) -> xarray.Dataset:
+    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
+    with file.open("rb", buffering=0) as start:
+        sealed = seal_of(start) is not None
+    if not sealed:
+        dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
+        warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
+        return dataset
+    manager = xarray.backends.CachingFileManager(opened, file.absolute(), mode="r")
+    store = xarray.backends.H5NetCDFStore(manager)
+    return xarray.open_dataset(store, decode_times=False)
 
 
 @contextmanager
@@ -55,6 +75,8 @@ def reading(path: str | Path) -> Iterator[xarray.Dataset]:
     with open(path) as dataset:
         try:
             yield dataset
+        except BrokenSealError:
+            raise
         except (ExperimentError, StorageError) as error:
             raise type(error)(f"{path}: {'; '.join(str(error).splitlines())}") from None
         except (PbdkitError, MemoryError):

@@ -19,6 +19,7 @@ import numpy as np
 from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.results.recorder import Sink
+from pbdkit.results.seal import put_seal
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading
@@ -87,6 +88,7 @@ class NetcdfSink(Sink):
         with self._storing():
             self._file.setncatts(attributes)
             self._file.close()
+            put_seal(self._temporary)
             _sync(self._temporary)
             self._give_name(attributes["status"] in WHOLE)
         with suppress(OSError):  # the result is there; some file systems cannot sync a folder

@@ -1,1 +1,0 @@
-"""The store of an unfinished run: everything that is needed to go on with it, safe on disk."""
