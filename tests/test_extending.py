@@ -69,7 +69,7 @@ def test_a_page_tells_every_method_and_declaration(interface):
     annotations = inspect.get_annotations(interface, eval_str=True)
     declared = {n for n, kind in annotations.items() if get_origin(kind) is ClassVar}
     methods = {
-        n for n, v in vars(interface).items() if inspect.isroutine(getattr(v, "__func__", v))
+        n for n, v in list(vars(interface).items()) if inspect.isroutine(getattr(v, "__func__", v))
     }
     fields = set(interface.model_fields) - set(Component.model_fields)
     names = {n for n in declared | methods | fields if not n.startswith(("_", "model_"))}

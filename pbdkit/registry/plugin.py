@@ -128,7 +128,7 @@ def checked(component: Any) -> Offer:
 def _check_functions(component: type[Component]) -> None:
     """What the interface declares is called as the interface declares it."""
     interface, of = interface_of(component), component.__name__
-    for name, declared in vars(interface).items():
+    for name, declared in list(vars(interface).items()):
         if name.startswith("_") or not callable(getattr(interface, name)):
             continue
         own = inspect.getattr_static(component, name)
