@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+import warnings
 from importlib import import_module
 from typing import Any
 
@@ -76,7 +77,10 @@ def main(arguments: list[str] | None = None) -> None:
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]
     try:
-        code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", errors.PbdkitWarning)
+            warnings.showwarning = _warn
+            code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         where = getattr(error.__cause__, "args", error.args)
         code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
@@ -89,6 +93,12 @@ def main(arguments: list[str] | None = None) -> None:
             traceback.print_exc()
         code = _report(error)
     sys.exit(code or 0)
+
+
+def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+    ours = issubclass(category, errors.PbdkitWarning)
+    told = str(message) if ours else f"{category.__name__}: {message}"
+    click.echo(f"warning: {errors.printable(told)}", err=True)
 
 
 def _report(error: BaseException) -> int:
