@@ -17,8 +17,21 @@ from pbdkit.components import pbdkit_components
 from pbdkit.components.rules import MixedCoordinate
 from pbdkit.interfaces import INTERFACES
 from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of, properties_of
+from pbdkit.testing.subject import full_name
 
 test_built_in_components_conform = conformance(*pbdkit_components())
+FIRST = {full_name(examples_of(component)[0]) for component in pbdkit_components()}
+
+
+@pytest.fixture(autouse=True)
+def interpreted(request, monkeypatch):
+    """One example of each built-in component is compiled; Python itself runs the kernels of the
+    others, as `test_engines` compiles them too."""
+    test, _, example = request.node.name.partition("[")
+    is_first = any(example.startswith(f"{name}-") for name in FIRST)
+    if test == "test_built_in_components_conform" and not is_first:
+        monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+
 
 SOUND = [
     rules.Sound(),

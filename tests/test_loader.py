@@ -29,6 +29,7 @@ EVERY_COMMAND = {
     "init": ["init", "new.yaml"],
     "plot": ["plot", "made.nc"],
     "explain": ["explain", "torn.nc"],
+    "verify": ["verify", "torn.nc"],
     "identify": ["identify", "e.json", HEALTHY],
     "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
     "plugins": ["plugins", "list"],

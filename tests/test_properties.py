@@ -27,7 +27,7 @@ from property_cases import (
 import pbdkit
 from pbdkit.stepping import bond_breaker, surroundings
 
-few = settings(max_examples=8, deadline=None, derandomize=True)
+few = settings(max_examples=4, deadline=None, derandomize=True)
 small = st.floats(-2.0, 2.0, allow_subnormal=False)
 combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_NEIGHBOURS)
 every_rule = pytest.mark.parametrize("rule", RULES)
