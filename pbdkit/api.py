@@ -87,7 +87,7 @@ def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
 def identify(experiment: Given, *, components: Components = ()) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
     elastic body, with its constants, from the rule's answer to plane waves."""
-    from pbdkit.identity.identity import identified
+    from pbdkit.identity.identification import identified
 
     return identified(build_scene(_experiment(experiment, components)))
 

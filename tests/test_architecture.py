@@ -1,6 +1,7 @@
 """Imports follow the data: experiment, scene, stepping, results, runs, command line."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,14 @@ def test_imports_lead_upstream_only(path):
     own = room(".".join(("pbdkit", *path.relative_to(PACKAGE).with_suffix("").parts)))
     downstream = [module for module in imported(path) if room(module) > own]
     assert downstream == []
+
+
+def test_no_files_import_each_other_in_a_circle():
+    """Not for their types either, within a room as little as between rooms."""
+    named = {".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p for p in FILES}
+    modules = {name.removesuffix(".__init__"): path for name, path in named.items()}
+    needs = {name: modules.keys() & set(imported(path)) for name, path in modules.items()}
+    assert len(list(TopologicalSorter(needs).static_order())) == len(modules)
 
 
 def calls_of(method, path):

@@ -20,7 +20,7 @@ from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, exampl
 from pbdkit.testing.subject import full_name
 
 test_built_in_components_conform = conformance(*pbdkit_components())
-FIRST = {full_name(examples_of(component)[0]) for component in pbdkit_components()}
+FURTHER = [full_name(e) for c in pbdkit_components() for e in examples_of(c)[1:]]
 
 
 @pytest.fixture(autouse=True)
@@ -28,8 +28,8 @@ def interpreted(request, monkeypatch):
     """One example of each built-in component is compiled; Python itself runs the kernels of the
     others, as `test_engines` compiles them too."""
     test, _, example = request.node.name.partition("[")
-    is_first = any(example.startswith(f"{name}-") for name in FIRST)
-    if test == "test_built_in_components_conform" and not is_first:
+    is_further = any(example.startswith(f"{name}-") for name in FURTHER)
+    if test == "test_built_in_components_conform" and is_further:
         monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
 
 

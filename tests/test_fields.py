@@ -52,12 +52,18 @@ def close(found, expected, atol=1e-12):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("field", [rotation, tension, bending], ids=lambda f: f.__name__)
-@pytest.mark.parametrize("name", CASES)
+# Linear triangles, the hexagonal lattice's cells, do not bend exactly, in any theory.
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        (name, field)
+        for name in CASES
+        for field in (rotation, tension, bending)
+        if field is not bending or "hexagonal" not in name
+    ],
+)
 def test_solutions_have_their_strain_rotation_and_stress_everywhere(name, field):
     """Small rotation, free tension and pure bending: at edges and leaders too."""
-    if field is bending and "hexagonal" in name:
-        pytest.skip("linear triangles do not bend exactly, in any theory")
     given, _ = held_as(field, CASES[name], width=0.3)
     ds = pbdkit.run(given | {"diagnostics": FIELDS}, progress=False)
     c = build_scene(pbdkit.Experiment(**given)).experiment.rule.stiffness()

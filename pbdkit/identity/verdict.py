@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL
-from pbdkit.identity.dispersion import Range
+from pbdkit.identity.dispersion import LongWaves, Range
 from pbdkit.identity.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
+from pbdkit.identity.identity import Identity
 from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from pbdkit.identity.dispersion import LongWaves
-    from pbdkit.identity.identity import Identity
 
 SYMMETRIES = {
     "isotropic": "isotropic {}",

@@ -177,6 +177,6 @@ def conformance(*components: Component | type[Component], **parts: Any) -> Any:
         if outcome.state == "failed":
             pytest.fail(f"{report.component}: {asked}: {outcome.reason}", pytrace=False)
         if outcome.state == "skipped":
-            pytest.skip(outcome.reason)
+            pytest.skip(outcome.reason)  # it is not asked of this component, and says why
 
     return test_conformance
