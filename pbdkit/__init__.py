@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         identify as identify,
         load as load,
         rerun as rerun,
+        resume as resume,
         run as run,
     )
     from pbdkit.errors import (
@@ -89,7 +90,7 @@ _HOME = {
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",
-    "pbdkit.api": "analyse identify load rerun run",
+    "pbdkit.api": "analyse identify load rerun resume run",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 

@@ -18,7 +18,7 @@ from pbdkit.experiment.source import Source, with_setting
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.progress import Watch, progress_bar
-from pbdkit.results.recorder import MemorySink
+from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
@@ -102,6 +102,33 @@ def rerun(
     experiment = experiment_of(dataset, components)
     _warn_of_versions(dataset, experiment)
     return _run(experiment, progress)
+
+
+def resume(
+    output: str | Path, *, steps: int | None = None, anyway: bool = False, progress: bool = True
+) -> xarray.Dataset:
+    """Goes on with the unfinished run that was to write `output`, or continues a finished one to
+    so many `steps`, and returns the dataset in the file: that of the uninterrupted run, bit for
+    bit.
+
+    Raises ExperimentError where there is nothing to go on with, where another process writes it
+    and, unless `anyway`, where the experiment, pbdkit or a plugin changed since; StorageError for a
+    damaged store or disk; DivergedError, as `run` does, with no dataset: the file holds it.
+    """
+    from pbdkit.results.accessor import open
+    from pbdkit.runs.resumption import resumption
+
+    path = Path(output)
+    with progress_bar(progress) as show:
+        found = resumption(path, Watch(show=show), steps=steps, anyway=anyway)
+        if found is None:
+            return open(path)
+        _warn(found.run.warnings)
+        report = found.record()
+    if report.outcome.status in ("diverged", "unconverged"):
+        raise DivergedError(report.outcome.stop_reason)
+    _warn(report.warnings)
+    return open(found.sink.written)
 
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:

@@ -15,6 +15,7 @@ ORDER = [
     "experiment",
     "scene",
     "stepping",
+    "storage",
     "results",
     "analysis",
     "identity",

@@ -178,7 +178,7 @@ def test_an_onset_beyond_failure_is_refused():
 
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
-    from pbdkit.results.netcdf import NetcdfSink
+    from pbdkit.results.netcdf_sink import NetcdfSink
     from pbdkit.runs.course import Run, record
 
     given = bar(9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, **SHEET)

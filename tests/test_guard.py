@@ -7,7 +7,7 @@ import pytest
 
 import pbdkit
 from pbdkit.results.progress import Watch
-from pbdkit.results.recorder import MemorySink
+from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping import guard

@@ -10,7 +10,7 @@ import xarray
 from paper_cases import FOLLOWER, FRAME, LEADER, TORN, every_case, moved, run
 
 import pbdkit
-from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

@@ -16,7 +16,7 @@ import pbdkit
 from pbdkit.equilibrium.settlement import Pace
 from pbdkit.experiment.solvers import Equilibrium, Solver
 from pbdkit.results.progress import Watch
-from pbdkit.results.recorder import MemorySink
+from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import DRIVERS, Run, record
 from pbdkit.runs.drivers import Stepwise
 from pbdkit.scene.scene import Scene, build_scene

@@ -10,7 +10,7 @@ import pytest
 
 import pbdkit
 from pbdkit.analysis.forecast import forecast
-from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 
@@ -51,7 +51,7 @@ PEAK = """
 import json, sys
 from pathlib import Path
 from pbdkit.api import load
-from pbdkit.results.netcdf import NetcdfSink
+from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 from pbdkit.scene.sizes import sizes_of

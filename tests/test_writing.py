@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.results.netcdf import LARGE_BYTES, MOST_WAITING, NetcdfSink, OverlappingSink
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.overlapping_sink import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.results.progress import Watch
-from pbdkit.results.recorder import Sink
+from pbdkit.results.sink import Sink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
+from pbdkit.storage.standing import Standing
 
 LARGE = np.zeros(LARGE_BYTES // 8)
+STANDING = Standing({}, {})
 
 
 class Noting(Sink):
@@ -33,7 +36,16 @@ class Noting(Sink):
         if self.calls[-1] == self.fails_at:
             raise pbdkit.StorageError("the disk is full")
 
-    def finish(self, attributes):
+    def due(self):
+        return False
+
+    def keep(self, standing):
+        self.calls.append("keep")
+
+    def suspend(self, standing):
+        return False
+
+    def finish(self, attributes, standing):
         self.calls.append("finish")
 
     def abandon(self):
@@ -45,7 +57,7 @@ def test_small_values_are_written_at_once():
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})
     sink.put({"a": np.zeros(3)})
-    sink.finish({})
+    sink.finish({}, STANDING)
     assert inner.calls == ["begin", "a", "finish"]
     assert inner.threads == {threading.main_thread()}
 
@@ -56,7 +68,7 @@ def test_large_values_are_written_in_order_by_one_other_thread():
     sink.begin([], {}, {})
     for name in "abcdefgh":
         sink.put({name: LARGE if name in "adf" else np.zeros(1)})
-    sink.finish({})
+    sink.finish({}, STANDING)
     assert inner.calls == ["begin", *"abcdefgh", "finish"]
     assert len(inner.threads) == 1
     assert inner.threads != {threading.main_thread()}
@@ -78,7 +90,7 @@ def test_memory_stays_bounded_when_the_disk_is_slow():
     assert len(done) <= MOST_WAITING
     inner.gate.set()
     producer.join(10)
-    sink.finish({})
+    sink.finish({}, STANDING)
     assert inner.calls == [*map(str, range(10)), "finish"]
 
 
@@ -89,7 +101,7 @@ def test_what_fails_in_the_other_thread_is_raised():
     def produce():
         for name in "abcdefgh":
             sink.put({name: LARGE})
-        sink.finish({})
+        sink.finish({}, STANDING)
 
     with pytest.raises(pbdkit.StorageError, match="the disk is full"):
         produce()

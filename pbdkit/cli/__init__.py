@@ -15,9 +15,9 @@ from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 
 MODULES = {
-    "run": "run",
+    "run": "run resume",
     "experiments": "check identify experiments init schema bench",
-    "result": "plot explain verify",
+    "result": "plot explain status verify",
     "plugins": "plugins",
 }
 COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
@@ -72,7 +72,8 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
-    broken plugin, 4 diverged, 6 storage failed, 130 interrupted."""
+    broken plugin, 4 diverged, 6 storage failed, 130 interrupted, 128 and the number of another
+    signal."""
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]

@@ -76,6 +76,26 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
         raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 
+def refuse_unfinished(path: Path, *, force: bool) -> None:
+    """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
+    process is writing it."""
+    from pbdkit.storage.unfinished import is_unfinished, remove_unfinished
+
+    try:
+        found = is_unfinished(path)
+    except StorageError:
+        if not force:
+            raise
+        found = True
+    if found and not force:
+        raise ExperimentError(
+            f"{path}: an unfinished run of it is here; `pbdkit resume {path}` goes on with it, "
+            "--force discards it, -o names another file"
+        )
+    if found:
+        remove_unfinished(path)
+
+
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """What is to be said where the output may not fit on its disk."""
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output

@@ -1,4 +1,4 @@
-"""``pbdkit plot``, ``explain`` and ``verify``: a result looked at."""
+"""``pbdkit plot``, ``explain``, ``status`` and ``verify``: a result, or a run, looked at."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _verified(file: Path) -> str:
     from pbdkit.cli.output import refusals_as
     from pbdkit.errors import StorageError
     from pbdkit.results.accessor import UNSEALED
-    from pbdkit.results.seal import SealedFile
+    from pbdkit.storage.seal import SealedFile
 
     fault = ""
     try:
@@ -78,6 +78,35 @@ def _verified(file: Path) -> str:
         fault = str(error)
     click.echo(fault or f"{file}: is as it was written")
     return fault
+
+
+@click.command()
+@click.argument("output", metavar="OUT.nc", type=PATH)
+@json_option
+def status(output: Path, as_json: bool) -> None:
+    """Say of an unfinished run how far it is, at which rate, and when it will end."""
+    from pbdkit.errors import ExperimentError
+    from pbdkit.storage.run_status import status_of
+
+    found = status_of(output)
+    if found is None:
+        what = "is finished" if output.exists() else "there is no such run"
+        raise ExperimentError(f"{output}: {what}; runs of less than a second leave no trace")
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    click.echo(f"{output}: step {found['step']} of {found['steps']}, {found['state']}")
+    if found["rate"]:
+        click.echo(f"rate: {found['rate']:.3g} steps a second")
+    if found["state"] == "running" and found["left_s"] is not None:
+        click.echo(f"time left: about {_duration(found['left_s'])}")
+    elif found["state"] != "running":
+        click.echo(f"`pbdkit resume {output}` goes on with it")
+
+
+def _duration(seconds: float) -> str:
+    hours, rest = divmod(round(seconds), 3600)
+    return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s"
 
 
 @click.command()

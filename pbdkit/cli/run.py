@@ -1,12 +1,10 @@
-"""``pbdkit run``, which Ctrl-C and SIGTERM end between two steps: what is kept is whole."""
+"""``pbdkit run`` and ``resume``, which signals end between two steps: what is kept is whole."""
 
 from __future__ import annotations
 
 import json
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,17 +12,23 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pbdkit.cli.options import experiment_argument, json_option, set_option
+from pbdkit.cli.stopping import Stop, asked_to_stop
 
 if TYPE_CHECKING:
-    from pbdkit.runs.course import Report
+    from pbdkit.results.netcdf_sink import NetcdfSink
+    from pbdkit.results.progress import Watch
+    from pbdkit.runs.course import Report, Run
+
+PATH = click.Path(path_type=Path)
+quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 
 @click.command()
 @experiment_argument
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="The file to write.")
+@click.option("-o", "--output", type=PATH, help="The file to write.")
 @set_option
 @click.option("--force", is_flag=True, help="Replace an existing output by a whole result.")
-@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+@quiet_option
 @json_option
 def run(
     experiment: str,
@@ -36,9 +40,9 @@ def run(
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.api import load
-    from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output
-    from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
-    from pbdkit.results.progress import Watch, progress_bar
+    from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output, refuse_unfinished
+    from pbdkit.results.netcdf_sink import NetcdfSink
+    from pbdkit.results.overlapping_sink import OverlappingSink
     from pbdkit.runs.course import Run, record
     from pbdkit.scene.scene import build_scene
 
@@ -46,43 +50,71 @@ def run(
         loaded = load(experiment, settings=settings)
         path = output or Path(loaded.name.replace("/", "-") + ".nc")
     refuse_output(path, force=force, experiment=Path(experiment))
-    file = NetcdfSink(path, replace=force, compression=loaded.record.compression)
     scene = build_scene(loaded)
+    refuse_unfinished(path, force=force)
+    given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
+    origin = {"experiment": given, "settings": list(settings)}
+    file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
     _warn(disk_warnings(path, scene), quiet)
-    drawn = not (quiet or as_json) and sys.stderr.isatty()
-    with asked_to_stop() as stopping, progress_bar(drawn) as show:
-        one = Run(scene, watch=Watch(stopping, show))
+    with _watched(path, quiet or as_json, file) as (stop, watch):
+        one = Run(scene, watch=watch)
         _warn(one.warnings, quiet)
         report = record(one, OverlappingSink(file))
-    _warn(report.warnings, quiet)
-    if as_json:
-        click.echo(json.dumps(_figures(report, file.written)))
-    elif not quiet and report.outcome.status in ("complete", "settled"):
-        _say(report, path, settling=loaded.stepping.settle is not None)
-    return _exit_code(report, path, file.written)
+    return _tell(one, report, file, path, stop, quiet, as_json)
+
+
+@click.command()
+@click.argument("output", metavar="OUT.nc", type=PATH)
+@click.option("--steps", type=click.IntRange(min=1), help="Continue a finished run to this step.")
+@click.option("--anyway", is_flag=True, help="Also where the experiment or a version changed.")
+@quiet_option
+@json_option
+def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:
+    """Go on with an interrupted run that was to write OUT.nc, to the same result bit for bit."""
+    from pbdkit.runs.resumption import resumption
+
+    with _watched(output, quiet or as_json) as (stop, watch):
+        found = resumption(output, watch, steps=steps, anyway=anyway)
+        if found is None:
+            if not quiet:
+                click.echo(f"{output}: was finished, and is whole")
+            return 0
+        _warn(found.run.warnings, quiet)
+        with _told_what_is_kept(output, found.sink):
+            report = found.record()
+    return _tell(found.run, report, found.sink, output, stop, quiet, as_json)
 
 
 @contextmanager
-def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether the process has been asked to stop.
+def _watched(
+    path: Path, silent: bool, file: NetcdfSink | None = None
+) -> Iterator[tuple[Stop, Watch]]:
+    """Progress on a terminal, and signals heard."""
+    from pbdkit.results.progress import Watch, progress_bar
 
-    A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
-    """
-    asked: list[int] = []
+    drawn = not silent and sys.stderr.isatty()
+    with asked_to_stop() as stop, progress_bar(drawn) as show:
+        watch = Watch(stop, show)
+        if file is None:
+            yield stop, watch
+            return
+        with _told_what_is_kept(path, file):
+            yield stop, watch
 
-    def note(number: int, frame: Any) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(number)
 
-    ours = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if ours else ()
-    before = {number: signal.signal(number, note) for number in numbers}
+@contextmanager
+def _told_what_is_kept(path: Path, file: NetcdfSink) -> Iterator[None]:
+    """Where a run fails that was kept, how to go on with it."""
     try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        yield
+    except BaseException:
+        if file.kept:
+            click.echo(_how_to_go_on(path), err=True)
+        raise
+
+
+def _how_to_go_on(path: Path) -> str:
+    return f"`pbdkit resume {path}` goes on from what was kept"
 
 
 def _warn(texts: Iterable[str], quiet: bool) -> None:
@@ -90,9 +122,37 @@ def _warn(texts: Iterable[str], quiet: bool) -> None:
         click.echo(f"warning: {text}", err=True)
 
 
+def _tell(
+    run: Run,
+    report: Report,
+    file: NetcdfSink,
+    path: Path,
+    stop: Stop,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """What there is to say of a run that ended; the exit status."""
+    _warn(report.warnings, quiet)
+    outcome = report.outcome
+    if as_json:
+        click.echo(json.dumps(_figures(report, file.written)))
+    elif not quiet and outcome.status in ("complete", "settled"):
+        _say(report, file.written, settling=run.scene.experiment.stepping.settle is not None)
+    if outcome.status in ("complete", "settled"):
+        return 0
+    what = f"pbdkit: {outcome.status}: {outcome.stop_reason}"
+    if outcome.status == "interrupted":
+        click.echo(f"{what}; {_how_to_go_on(path)}", err=True)
+        return stop.exit_status
+    left = "" if file.written == path else f"; {path} is left as it was"
+    click.echo(f"{what}; what was recorded until then is in {file.written}{left}", err=True)
+    return 4
+
+
 def _say(report: Report, path: Path, *, settling: bool) -> None:
     outcome = report.outcome
-    size = f"{report.particles} particles, {outcome.steps} steps in {report.wall_s:.2g} s"
+    made = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
+    size = f"{report.particles} particles, {made} steps in {report.wall_s:.2g} s"
     click.echo(f"{outcome.status}: {size}, written to {path}")
     if outcome.certificate:
         click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")
@@ -118,12 +178,3 @@ def _figures(report: Report, path: Path) -> dict[str, Any]:
         "threads": report.choice.threads,
         "output": str(path),
     }
-
-
-def _exit_code(report: Report, path: Path, written: Path) -> int:
-    if report.outcome.status in ("complete", "settled"):
-        return 0
-    left = "" if written == path else f"; {path} is left as it was"
-    what = f"{report.outcome.status}: {report.outcome.stop_reason}"
-    click.echo(f"pbdkit: {what}; what was recorded until then is in {written}{left}", err=True)
-    return 130 if report.outcome.status == "interrupted" else 4

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterator
+
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
@@ -21,8 +23,12 @@ MOST_SETTLINGS = 2000
 """So often bonds may change in an increment, one after the other or little by little."""
 
 
-def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
-    """Takes a scene, in place, from its initial state to the equilibrium of its last step.
+Way = Generator[State, None, Certificate]
+
+
+def increments(scene: Scene, state: State, watch: Watch) -> Way:
+    """Takes a scene, in place, from its initial state, or one given out on the way, to the
+    equilibrium of its last step. Gives out what decides all that follows.
 
     Until the roles change for the last time steps are made, so that leaders start, and parts that
     nothing holds remain, where stepping has them. Where bonds can break, the leaders' way is made
@@ -30,7 +36,6 @@ def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificat
     Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
     the watch says so: then the state is the last that had been reached.
     """
-    watch = watch or Watch()
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
     for n, leading in enumerate(scene.leading):
         if leading.group.leads(steps) and leading.group.motion.rests_after() is None:
@@ -39,13 +44,24 @@ def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificat
                 "{type: stepping}, or a motion that ends",
                 ("leaders", n, "motion"),
             )
-    scale = scale_of(scene, state)
+    scale = scale_of(scene, initial_state(scene) if state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture:
-        return _load(scene, state, finder, asked.increments)
-    if last := _last_change_of_roles(scene):
-        _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
+        return (yield from _load(scene, state, finder, asked.increments))
+    if (last := _last_change_of_roles(scene)) > state.step:
+        yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
+
+
+def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
+    """The same in one go."""
+    way = increments(scene, state, watch or Watch())
+    while True:
+        try:
+            next(way)
+        except StopIteration as end:
+            certificate: Certificate = end.value
+            return certificate
 
 
 def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
@@ -55,7 +71,7 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
-def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> None:
+def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[State]:
     """Steps, in calls short enough for interruptions to be heard."""
     watch.begin("stepping until the roles change")
     first = state.step
@@ -64,6 +80,7 @@ def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> None:
         reached = engine.advance(state, min(a_call, last - state.step))
         state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
         state.step = reached.step
+        yield state
         watch.look((state.step - first) / (last - first))
 
 
@@ -81,27 +98,36 @@ def _settle_at(scene: Scene, state: State, finder: Finder, step: int) -> Certifi
     return certificate
 
 
-def _load(scene: Scene, state: State, finder: Finder, increments: int) -> Certificate:
+def _load(scene: Scene, state: State, finder: Finder, most: int) -> Way:
     """In increments up to the last motion or change of roles, breaking bonds on the way."""
-    fracturing, steps = Fracturing(scene), scene.experiment.steps
-    last = last_event(scene)
-    count = min(increments, last)
+    steps, last = scene.experiment.steps, last_event(scene)
+    count = min(most, last)
     certificate: Certificate | None = None
-    for step in np.unique(np.linspace(1, last, count).round().astype(int)).tolist():
-        finder.watch.load = f"step {step} of {last}, "
-        for _ in range(MOST_SETTLINGS):
-            certificate = _settle_at(scene, state, finder, step)
-            if not _bonds_change(scene, fracturing, state, step):
-                break
-        else:
-            assert certificate is not None
-            raise UnconvergedError(
-                f"bonds still change after they settled {MOST_SETTLINGS} times in step {step}",
-                certificate,
-            )
+    planned = np.unique(np.linspace(1, last, count).round().astype(int))
+    for step in planned[planned > state.step].tolist():
+        finder.watch.load, before = f"step {step} of {last}, ", state.copy()
+        try:
+            certificate = _settle_bonds_at(scene, state, finder, step)
+        except StoppedError:
+            vars(state).update(vars(before))
+            raise
+        if step < last:
+            yield state
     state.step = steps
     assert certificate is not None
     return certificate
+
+
+def _settle_bonds_at(scene: Scene, state: State, finder: Finder, step: int) -> Certificate:
+    """Until no bond changes any more."""
+    fracturing = Fracturing(scene)
+    for _ in range(MOST_SETTLINGS):
+        certificate = _settle_at(scene, state, finder, step)
+        if not _bonds_change(scene, fracturing, state, step):
+            return certificate
+    raise UnconvergedError(
+        f"bonds still change after they settled {MOST_SETTLINGS} times in step {step}", certificate
+    )
 
 
 def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, Foresight, Outlook, scale_of
 from pbdkit.experiment.solvers import Settle
-from pbdkit.results.progress import Watch
+from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.prescription import is_cut_short, last_event
@@ -130,7 +130,15 @@ class Settling:
 
     def look(self, state: State) -> Certificate | None:
         """At the end of that step: the certificate where the run has settled. Raises StoppedError
-        where the watch says so."""
+        where the watch says so; then it has not looked."""
+        before = replace(self.pace)
+        try:
+            return self._look(state)
+        except StoppedError:
+            self.pace = before
+            raise
+
+    def _look(self, state: State) -> Certificate | None:
         with np.errstate(all="ignore"):
             way = (state.u - state.previous).ravel()
             longest, size = float(np.abs(way).max()), float(np.linalg.norm(way))

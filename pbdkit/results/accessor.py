@@ -14,7 +14,9 @@ from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageEr
 from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
-from pbdkit.results.seal import BrokenSealError, opened, seal_of
+from pbdkit.results.unfinished_dataset import unfinished_dataset
+from pbdkit.storage.seal import BrokenSealError, opened, seal_of
+from pbdkit.storage.unfinished import STORE, store_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +26,8 @@ UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
 
 
 def open(path: str | Path) -> xarray.Dataset:
-    """The dataset in a result file; its values are read, and checked, when they are used.
+    """The dataset in a result file; its values are read, and checked, when they are used. Of a run
+    that is not finished, what was kept of it last, with the status "interrupted".
 
     Raises ExperimentError for an experiment, and StorageError where there is no such file, where it
     is not as it was written, where it cannot be read as netCDF, where pbdkit did not make it, where
@@ -33,15 +36,16 @@ def open(path: str | Path) -> xarray.Dataset:
     file without a seal.
     """
     file = Path(path)
-    if not file.is_file():
+    left = _unfinished(file)
+    if not file.is_file() and not left:
         raise StorageError(f"{file}: there is no such file")
     if file.suffix in (".yaml", ".yml", ".json"):
         raise ExperimentError(
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
         )
     try:
-        dataset = _opened(file)
-    except StorageError:
+        dataset = _dataset(unfinished_dataset(left)) if left else _opened(file)
+    except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
         reason = getattr(error, "strerror", None) or error
@@ -60,9 +64,18 @@ def _opened(file: Path) -> xarray.Dataset:
         dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
         warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
         return dataset
-    manager = xarray.backends.CachingFileManager(opened, file.absolute(), mode="r")
-    store = xarray.backends.H5NetCDFStore(manager)
-    return xarray.open_dataset(store, decode_times=False)
+    return _dataset(xarray.backends.CachingFileManager(opened, file.absolute(), mode="r"))
+
+
+def _dataset(content: Any) -> xarray.Dataset:
+    return xarray.open_dataset(xarray.backends.H5NetCDFStore(content), decode_times=False)
+
+
+def _unfinished(file: Path) -> Path | None:
+    """The output of the unfinished run that is meant, by its own name or that of its store."""
+    if file.name.endswith(STORE) and file.is_file():
+        return file.with_name(file.name.removesuffix(STORE))
+    return None if file.exists() or not store_of(file).is_file() else file
 
 
 @contextmanager

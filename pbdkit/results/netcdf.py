@@ -1,229 +1,183 @@
-"""A sink that streams the dataset into a netCDF-4 file, which appears whole or not at all, and one
-that lets the run go on meanwhile."""
+"""A dataset in the making, in a netCDF-4 file: written chunk by whole chunk, each once."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections import deque
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from itertools import chain, count
-from pathlib import Path
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
-import netCDF4
 import numpy as np
+from numpy.typing import NDArray
 
-from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column, Values, When
-from pbdkit.results.recorder import Sink
-from pbdkit.results.seal import put_seal
+from pbdkit.storage.paged_file import PagedFile
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading
 the history of a particle touches one chunk a batch, reading a snapshot little more than itself."""
 OPEN_CHUNK = 1024
 """Entries a chunk along a dimension whose length is known at the end only."""
-FULL_BYTES = 2**20
-WHOLE = ("complete", "settled")
-"""The status of results that may replace others."""
-PARTIAL = "-partial"
-"""Added to the name of a result that may not, where its name is taken."""
-LARGE_BYTES = 2**20
-"""Below this, handing over costs as much as writing."""
-MOST_WAITING = 2
-"""So many large values may wait to be written; then the run waits for the disk."""
+LEVEL = 1
+"""Of zlib: the next levels cost much and gain little on positions."""
+FIRST_LENGTH = 1024
+"""Of a dimension that grows, until there is more."""
+
+Array = NDArray[Any]
+Waiting = dict[str, list[Array]]
+"""Entries by column that fill no chunk yet."""
 
 
-class NetcdfSink(Sink):
-    """Writes beside `path` under a temporary name; `finish` syncs it and renames it to `path`.
+class NetcdfFile:
+    """The columns of a dataset, put into a file as they come; `waiting` and `written`, how many
+    entries of a column are in the file, are what it remembers besides."""
 
-    With `replace` a whole result takes the place of what is there. What is left of a run that
-    diverged, did not converge or was interrupted takes nobody's place: beside `path`, as `written`
-    says.
-    """
+    def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
+        self.file, self._compress = file, compress
+        self._columns = {column.name: column for column in columns}
+        self.waiting: Waiting = {column.name: [] for column in columns if column.grows}
+        self.written = dict.fromkeys(self.waiting, 0)
 
-    def __init__(self, path: Path, *, replace: bool = False, compression: str = "none") -> None:
-        self._path = path
-        self.written = path
-        """Where the result is, once it is finished: beside `path` where that was taken."""
-        self._compression = {"zlib": {"compression": "zlib", "complevel": 1}}.get(compression, {})
-        self._replace = replace
-        name = f".{path.name[:100]}.{os.getpid()}.{id(self):x}.partial"
-        self._temporary = path.with_name(name).absolute()  # whoever changes the folder meanwhile
-        self._file: Any = None
-
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Opens the file, so that what cannot be written is known before the first step."""
-        self._columns = {c.name: c for c in columns}
-        self._waiting: dict[str, list[Any]] = {c.name: [] for c in columns if c.grows}
-        self._written = dict.fromkeys(self._waiting, 0)
+    def make(self, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
+        """Defines the variables in an empty file."""
+        self._open("w")
         self._batch: dict[str, int] = {}
-        if not self._temporary.parent.is_dir():
-            raise StorageError(f"{self._path}: there is no folder {self._path.parent}")
-        with self._storing():
-            self._file = netCDF4.Dataset(self._temporary, "w", format="NETCDF4")
-            self._file.set_fill_off()
-            for dim in dict.fromkeys(d for c in columns for d in c.dims):
-                self._file.createDimension(dim, sizes.get(dim))
-            for column in columns:
-                self._define(column, sizes, planned)
+        grow = dict.fromkeys(d for column in self._columns.values() for d in column.dims)
+        self._content.dimensions = {dim: sizes.get(dim) or None for dim in grow}
+        for column in self._columns.values():
+            self._define(column, sizes, planned)
+
+    def reopen(self, waiting: Waiting, written: Mapping[str, int]) -> None:
+        """Goes on with a file as it was committed."""
+        self.waiting |= waiting
+        self.written |= written
+        self._open("r+")
+        self._batch = {name: self._content[name].chunks[0] for name in self.written}
 
     def put(self, values: Values) -> None:
-        """Keeps growing columns until a batch is full."""
+        """Keeps growing columns until a chunk is full."""
         for name, value in values.items():
-            if not self._columns[name].grows:
-                self._store(name, slice(None), value)
-                continue
-            self._waiting[name].append(value)
-            if len(self._waiting[name]) >= self._batch[name]:
-                self._flush(name)
+            if self._columns[name].grows:
+                self.waiting[name].append(value)
+                if len(self.waiting[name]) >= self._batch[name]:
+                    self._append(name)
+            else:
+                self._store(self._columns[name], value)
 
-    def finish(self, attributes: dict[str, str]) -> None:
-        """Writes what waits, syncs, and gives the file its name."""
-        for name in self._waiting:
-            self._flush(name)
-        with self._storing():
-            self._file.setncatts(attributes)
-            self._file.close()
-            put_seal(self._temporary)
-            _sync(self._temporary)
-            self._give_name(attributes["status"] in WHOLE)
-        with suppress(OSError):  # the result is there; some file systems cannot sync a folder
-            _sync(self._temporary.parent)
-        if self.written != self._path and not self._replace:
-            raise StorageError(
-                f"{self._path}: appeared while this run was going on and is left as it is; "
-                f"this result is in {self.written}"
-            )
+    def flush(self) -> None:
+        """The file, with its pages, holds all but what waits."""
+        self._h5.flush()
 
-    def _give_name(self, whole: bool) -> None:
-        """Renames. Where it is asked for, a whole result replaces what is there; all else gets a
-        name that is free."""
-        folder, stem, suffix = self._temporary.parent, self._path.stem[:100], self._path.suffix
-        partial = "" if whole else PARTIAL
-        if whole and self._replace:
-            self._temporary.replace(folder / self._path.name)
-            return
-        more = chain([] if whole else [PARTIAL], (f"{partial}-{n}" for n in count(2)))
-        names = chain([self._path], (self._path.with_name(f"{stem}{m}{suffix}") for m in more))
-        self.written = next(name for name in names if self._take(folder / name.name))
+    def finish(self, attributes: Mapping[str, str]) -> None:
+        """Puts what waits, and closes. Nothing more comes."""
+        for name in self.waiting:
+            if self.waiting[name]:
+                self._append(name)
+        for dim, grown in self._content.dimensions.items():
+            along = [n for n in self.written if self._columns[n].dims[0] == dim]
+            if along and grown.size:
+                self._content.resize_dimension(dim, max(self.written[name] for name in along))
+        self._content.attrs.update(attributes)
+        self._content.close()
+        self._h5.close()
 
-    def _take(self, path: Path) -> bool:
-        """Whether the name was free; then it is taken."""
-        try:
-            os.link(self._temporary, path)
-        except FileExistsError:
-            return False
-        except OSError:  # no hard links on this file system
-            if os.path.lexists(path):
-                return False
-            self._temporary.rename(path)
-        else:
-            self._temporary.unlink()
-        return True
+    def add_group(self, name: str, facts: str, arrays: Mapping[str, Array]) -> None:
+        """Arrays, and what else there is to say of them, apart from the dataset."""
+        group = self._content.create_group(name)
+        group.attrs["facts"] = facts
+        for key, array in arrays.items():
+            dims = {f"{key}_{n}": length for n, length in enumerate(array.shape)}
+            group.dimensions.update(dims)
+            group.create_variable(key, tuple(dims), array.dtype, data=array)
 
-    def abandon(self) -> None:
-        """Removes the temporary file."""
-        with suppress(Exception):
-            self._file.close()
-        with suppress(OSError):
-            self._temporary.unlink(missing_ok=True)
+    def give_up(self) -> None:
+        """What was put is not wanted; nothing is raised."""
+        self.file.give_up()
+        for file in (self._content, self._h5):
+            with suppress(Exception):
+                file.close()
 
-    def _define(self, column: Column, sizes: dict[str, int], planned: dict[str, int]) -> None:
-        dtype: Any = str if column.dtype == "str" else column.dtype
-        chunks = None
+    def _open(self, mode: str) -> None:
+        h5py, h5netcdf = import_module("h5py"), import_module("h5netcdf")
+        self._h5 = h5py.File(self.file, mode, track_order=True)
+        self._content = h5netcdf.File(self._h5, mode)
+
+    def _define(self, column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
+        more: dict[str, Any] = {}
         if column.grows:
-            inner = [max(1, sizes[d]) for d in column.dims[1:]]
-            entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
-            self._batch[column.name] = max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]]))
-            if inner:  # parts of equal size, so that the last one wastes nothing
-                inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
-            chunks = (self._batch[column.name], *inner)
-        elif column.when is When.END and column.dims and column.dims[0] not in sizes:
-            chunks = (OPEN_CHUNK, *(sizes[d] for d in column.dims[1:]))
-        packed = self._compression if column.dtype != "str" else {}
-        variable = self._file.createVariable(
-            column.name, dtype, column.dims, chunksizes=chunks, fill_value=False, **packed
-        )
-        if column.grows:  # whole chunks go to the file as they are: a cache would only copy them
-            variable.set_var_chunk_cache(size=1024, nelems=1, preemption=0.0)
-        variable.setncatts(column.attributes)
+            more["chunks"] = _chunks(column, sizes, planned)
+            self._batch[column.name] = more["chunks"][0]
+        elif column.dims and column.dims[0] not in sizes:
+            more["chunks"] = (OPEN_CHUNK, *(sizes[d] for d in column.dims[1:]))
+        if self._compress and column.dtype != "str" and column.dims:
+            more |= {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
+        if column.grows:
+            dim = column.dims[0]
+            self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
+        dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
+        variable = self._content.create_variable(column.name, column.dims, dtype, **more)
+        variable.attrs.update(column.attributes)
         if "particle" in column.dims and not column.coordinate:
-            variable.coordinates = "number"
+            variable.attrs["coordinates"] = "number"
 
-    def _flush(self, name: str) -> None:
-        entries, begin = self._waiting[name], self._written[name]
-        if entries:
-            # A large one is stored as it is, not copied.
-            values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
-            self._store(name, slice(begin, begin + len(entries)), values)
-            self._written[name] += len(entries)
-            self._waiting[name] = []
+    def _lengthen(self, dim: str, length: int) -> None:
+        if self._content.dimensions[dim].size < length:
+            self._content.resize_dimension(dim, length)
 
-    def _store(self, name: str, where: slice, values: Any) -> None:
-        with self._storing():
-            self._file.variables[name][where] = values
+    def _append(self, name: str) -> None:
+        """What waits of a column, as one chunk along its first dimension."""
+        entries, begin = self.waiting[name], self.written[name]
+        variable, dim = self._content[name], self._columns[name].dims[0]
+        if (end := begin + len(entries)) > self._content.dimensions[dim].size:
+            self._lengthen(dim, 2 * end)
+        # A large one is stored as it is, not copied.
+        values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
+        dataset = variable._h5ds
+        values, across = values.astype(dataset.dtype, copy=False), (0,) * (values.ndim - 1)
+        for first in range(0, max(1, values.shape[1]), dataset.chunks[1]) if across else [0]:
+            part = values[:, first : first + dataset.chunks[1]] if across else values
+            place = (begin, first, *across[1:]) if across else (begin,)
+            self._write_chunk(dataset, place, _padded(part, dataset.chunks))
+        self.written[name], self.waiting[name] = end, []
 
-    @contextmanager
-    def _storing(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, RuntimeError) as error:
-            self.abandon()
-            raise StorageError(f"{self._path}: cannot be written: {self._reason(error)}") from None
+    def _write_chunk(self, dataset: Any, place: tuple[int, ...], chunk: Array) -> None:
+        data: Any = np.ascontiguousarray(chunk)
+        if dataset.compression:  # as HDF5's filters do it: bytes of like weight together
+            planes = data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T
+            data = np.frombuffer(zlib.compress(planes.tobytes(), LEVEL), np.uint8)
+        self.file.values_bytes = data.nbytes
+        dataset.id.write_direct_chunk(place, data.reshape(-1))
+        self.file.values_bytes = -1
 
-    def _reason(self, error: Exception) -> str:
-        """The library says little of a full disk."""
-        with suppress(OSError):
-            if shutil.disk_usage(self._path.parent).free < FULL_BYTES:
-                return "the disk is full; free some space, or record fewer steps"
-        return str(getattr(error, "strerror", None) or error)
-
-
-class OverlappingSink(Sink):
-    """Hands everything to another sink, from the first large value on in a second thread.
-
-    What goes wrong there is raised at the next call.
-    """
-
-    def __init__(self, inner: Sink) -> None:
-        self._inner = inner
-        self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
-        self._waiting: deque[Future[None]] = deque()
-
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """At once, so that what cannot be written is known before the first step."""
-        self._inner.begin(columns, sizes, planned)
-
-    def put(self, values: Values) -> None:
-        """Takes the values over: they must not be changed afterwards."""
-        if not self._waiting and sum(np.asarray(v).nbytes for v in values.values()) < LARGE_BYTES:
-            self._inner.put(values)
+    def _store(self, column: Column, value: Any) -> None:
+        """The whole of a column that does not grow."""
+        variable = self._content[column.name]
+        if column.dtype == "str":
+            variable[...] = np.asarray(value, dtype=object)
             return
-        while len(self._waiting) >= MOST_WAITING:
-            self._waiting.popleft().result()
-        self._waiting.append(self._thread.submit(self._inner.put, values))
-
-    def finish(self, attributes: dict[str, str]) -> None:
-        """When all is written."""
-        while self._waiting:
-            self._waiting.popleft().result()
-        self._thread.shutdown()
-        self._inner.finish(attributes)
-
-    def abandon(self) -> None:
-        """What waits is not written."""
-        self._thread.shutdown(cancel_futures=True)
-        self._waiting.clear()
-        self._inner.abandon()
+        values = np.asarray(value, variable.dtype)
+        if column.when is When.END and column.dims and variable.shape != values.shape:
+            for dim, length in zip(column.dims, values.shape, strict=True):
+                self._lengthen(dim, length)
+        if values.size:
+            variable[...] = values
 
 
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _chunks(
+    column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]
+) -> tuple[int, ...]:
+    inner = [max(1, sizes[dim]) for dim in column.dims[1:]]
+    entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
+    if inner:  # parts of equal size, so that the last one wastes nothing
+        inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
+    return max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]])), *inner
+
+
+def _padded(part: Array, shape: tuple[int, ...]) -> Array:
+    """The part of an array at the beginning of a whole chunk."""
+    if part.shape == shape:
+        return part
+    whole = np.zeros(shape, part.dtype)
+    whole[tuple(slice(n) for n in part.shape)] = part
+    return whole

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from importlib import import_module
 from importlib.metadata import version
 from itertools import chain, compress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,73 +16,11 @@ from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.results.measured import Measured
 from pbdkit.results.moment import StateMoment
+from pbdkit.results.sink import Sink
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
-
-if TYPE_CHECKING:
-    import xarray
-
-
-class Sink(ABC):
-    """Where a dataset goes while it is made. It may keep what it is given: nobody changes that
-    afterwards. `abandon` leaves nothing behind."""
-
-    @abstractmethod
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """The columns to come, the sizes of the dimensions that do not grow, and how many entries
-        are planned along those that do."""
-
-    @abstractmethod
-    def put(self, values: Values) -> None:
-        """One entry for each column that grows, or the whole of a column that does not."""
-
-    @abstractmethod
-    def finish(self, attributes: dict[str, str]) -> None:
-        """Nothing more comes."""
-
-    @abstractmethod
-    def abandon(self) -> None:
-        """The run failed: what was put is not wanted."""
-
-
-class MemorySink(Sink):
-    """Grows every column in memory."""
-
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Nothing is allocated before it comes."""
-        self._columns, self._sizes = columns, sizes
-        self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
-
-    def put(self, values: Values) -> None:
-        """Keeps what it is given."""
-        for name, value in values.items():
-            self._entries[name].append(value)
-
-    def finish(self, attributes: dict[str, str]) -> None:
-        """Keeps the attributes."""
-        self._attributes = attributes
-
-    def abandon(self) -> None:
-        """Forgets everything."""
-        self._entries = {}
-
-    def dataset(self) -> xarray.Dataset:
-        """The dataset as in the file."""
-        import xarray
-
-        import_module("pbdkit.results.accessor")  # gives every dataset its `pbd`
-        variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
-        coordinates = [c.name for c in self._columns if c.coordinate]
-        return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
-
-    def _values(self, column: Column) -> Any:
-        entries = self._entries[column.name]
-        if column.grows:
-            shape = (len(entries), *(self._sizes[d] for d in column.dims[1:]))
-            return np.array(entries, column.dtype).reshape(shape)
-        dtype = None if column.dtype == "str" else column.dtype
-        return np.asarray(entries[0] if entries else [], dtype)
+from pbdkit.storage.standing import Standing
 
 
 @dataclass(frozen=True)
@@ -97,21 +33,30 @@ class Outcome:
     certificate: dict[str, Any] | None = None
 
 
+@dataclass
+class Seen:
+    """The last steps of which anything was taken, and of which a record was made."""
+
+    step: int = -1
+    recorded: int = -1
+
+
 class Recorder:
-    """Records the run of one scene into a sink."""
+    """Records the run of one scene into a sink; `seen` decides how it goes on."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self._sink = scene, sink
         self._tables, self._measured = Tables(scene), Measured(scene)
-        self._last_recorded = -1
+        self.seen = Seen()
         self.warnings: tuple[str, ...] = ()
 
-    def begin(self) -> None:
-        """Hands over the columns and everything that is known before the first step."""
+    def begin(self, history: Iterable[Values] | None = None) -> None:
+        """Hands over the columns and everything that is known before the first step, or instead of
+        it the `history` of a run that is gone on with."""
         steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
         planned = {"time": recording.count(steps), "step": steps + 1}
-        self._sink.begin(self._columns(), self._measured.sizes, planned)
-        for values in self._known():
+        self._sink.begin(columns_of(self._scene), self._measured.sizes, planned)
+        for values in self._known() if history is None else history:
             self._sink.put(values)
 
     def _known(self) -> Iterator[Values]:
@@ -131,31 +76,39 @@ class Recorder:
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False) -> None:
         """Takes what is wanted of this step; positions too of the `last` of a run that stops before
-        its end, which may have come before without that. Raises FloatingPointError where a recorded
-        value has left the finite numbers; nothing of that step is kept."""
+        its end, which may have come before without that; else a step that was seen is left out.
+        Raises FloatingPointError where a recorded value has left the finite numbers; nothing of
+        that step is kept."""
+        if state.step <= self.seen.step and not last:
+            return
         moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
-        late = last and state.step > self._last_recorded
-        if late or (not last and experiment.records(state.step)):
+        late = last and state.step > self.seen.recorded
+        recorded = late or (not last and experiment.records(state.step))
+        if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
-            values |= self._measured.remembered(moment, first=self._last_recorded < 0)
+            values |= self._measured.remembered(moment, first=self.seen.recorded < 0)
             values |= self._measured.diagnosed(When.RECORD, moment)
-            self._last_recorded = state.step
-        if self._measured.every_step and not last:
+        stepped = recorded or experiment.solver.makes_steps
+        if self._measured.every_step and stepped and not last:
             values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
         if values:
             self._sink.put(values)
+        self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
 
-    def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
-        """Hands over what is known at the end, and the attributes, with what was predicted before
-        the first step; `warnings` says what the user should know of the last state."""
+    def finish(
+        self, state: State, outcome: Outcome, prediction: dict[str, Any], standing: Standing
+    ) -> None:
+        """Hands over what is known at the end, the attributes, with what was predicted before the
+        first step, and where the run stands; `warnings` says what the user should know of the last
+        state."""
         # Where a run diverged, what broke since the last record is no result.
         diverged = outcome.status == "diverged"
-        moment = StateMoment(state, self._tables, self._last_recorded if diverged else state.step)
+        moment = StateMoment(state, self._tables, self.seen.recorded if diverged else state.step)
         if not diverged and (warning := moment.cells.inside_out()):
             self.warnings = (warning,)
         if self._scene.has_fracture:
@@ -163,21 +116,7 @@ class Recorder:
             self._sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
             self._sink.put(self._measured.diagnosed(When.END, moment))
-        self._sink.finish(self._attributes(outcome, prediction))
-
-    def _columns(self) -> list[Column]:
-        scene, measured = self._scene, self._measured
-        wanted = (
-            scene.experiment.shows_bonds,
-            scene.has_fracture,
-            measured.every_step,
-            measured.shows_leaders,
-        )
-        some = chain(*compress(layout.optional_columns(), wanted))
-        columns = [*layout.base_columns(), *some, *measured.columns()]
-        if self._scene.experiment.record.dtype == "float64":
-            return columns
-        return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]
+        self._sink.finish(self._attributes(outcome, prediction), standing)
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment
@@ -193,3 +132,19 @@ class Recorder:
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         } | ({"certificate": json.dumps(outcome.certificate)} if outcome.certificate else {})
+
+
+def columns_of(scene: Scene) -> list[Column]:
+    """Those of the scene's dataset."""
+    measured = Measured(scene)
+    wanted = (
+        scene.experiment.shows_bonds,
+        scene.has_fracture,
+        measured.every_step,
+        measured.shows_leaders,
+    )
+    some = chain(*compress(layout.optional_columns(), wanted))
+    columns = [*layout.base_columns(), *some, *measured.columns()]
+    if scene.experiment.record.dtype == "float64":
+        return columns
+    return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

@@ -15,8 +15,10 @@ from pbdkit.analysis.forecast import prediction, quick_warnings
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.results.progress import Watch
-from pbdkit.results.recorder import MemorySink, Outcome, Recorder, Sink
+from pbdkit.results.recorder import Outcome, Recorder
+from pbdkit.results.sink import MemorySink, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
+from pbdkit.runs.standing import standing_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice
 from pbdkit.stepping.state import State, initial_state
@@ -80,11 +82,14 @@ class Report:
     wall_s: float
     choice: Choice
     warnings: tuple[str, ...] = ()
+    first: int = 0
+    """The step from which on it was run."""
 
     @property
     def ns_per_particle_step(self) -> float:
         """Wall time of stepping and recording together."""
-        return self.wall_s * 1e9 / (self.particles * max(1, self.outcome.steps))
+        made = max(1, self.outcome.steps - self.first)
+        return self.wall_s * 1e9 / (self.particles * made)
 
 
 def peak_memory() -> int:
@@ -103,27 +108,41 @@ def peak_memory() -> int:
     return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def record(run: Run, sink: Sink) -> Report:
-    """Takes a run to its end, and what the experiment records of it into the sink."""
-    begun, scene = time.perf_counter(), run.scene
-    recorder = Recorder(scene, sink)
+def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
+    """Takes a run to its end, and what the experiment records of it into the sink. A `recorder` of
+    the sink that has begun goes on with what it took before. A run that is asked to stop is left
+    where it stands, where the sink can keep that."""
+    begun, scene, first = time.perf_counter(), run.scene, run.state.step
+
+    def report(outcome: Outcome, warnings: tuple[str, ...] = ()) -> Report:
+        wall_s = time.perf_counter() - begun
+        return Report(outcome, scene.raster.count, wall_s, run.choice, warnings, first)
+
     try:
-        with _located(scene):
-            recorder.begin()
+        if recorder is None:
+            recorder = Recorder(scene, sink)
+            with _located(scene):
+                recorder.begin()
         for state in run:
+            if run.driver.stopped and sink.suspend(standing_of(run.driver, recorder)):
+                return report(run.driver.stopped)
             try:
                 with _located(scene):
                     recorder.observe(state, last=run.driver.ending)
             except FloatingPointError as error:
                 run.driver.rejection = error
+                continue
+            if sink.due():
+                rate = (state.step - first) / (time.perf_counter() - begun)
+                sink.keep(standing_of(run.driver, recorder, rate))
         assert run.outcome is not None
         with _located(scene):
-            recorder.finish(run.state, run.outcome, prediction(scene))
+            standing = standing_of(run.driver, recorder)
+            recorder.finish(run.state, run.outcome, prediction(scene), standing)
     except BaseException:
         sink.abandon()
         raise
-    wall_s = time.perf_counter() - begun
-    return Report(run.outcome, scene.raster.count, wall_s, run.choice, recorder.warnings)
+    return report(run.outcome, recorder.warnings)
 
 
 def rehearse(scene: Scene) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
 
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
@@ -23,7 +25,8 @@ class Driver(ABC):
     """Takes one scene from a state to its end, once.
 
     `state` is where it stands, `choice` what steps it. `ending` says of a state just given out that
-    it is the last of a run that ends before its last step, to be kept whatever the plan.
+    it is the last of a run that ends before its last step, to be kept whatever the plan; `stopped`
+    is how such a run ends that was asked to stop.
     """
 
     choice: Choice
@@ -31,6 +34,7 @@ class Driver(ABC):
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         self.scene, self.state, self.watch = scene, state, watch
         self.ending = False
+        self.stopped: Outcome | None = None
         self.rejection: FloatingPointError | None = None
         """Why whoever looked at the last state could not use it; its next move is up to the
         driver."""
@@ -40,22 +44,29 @@ class Driver(ABC):
         """The states on the way, the first included, each valid until the next is asked for; then
         how it ended. Raises ExperimentError where there is no way."""
 
+    @abstractmethod
+    def standing(self) -> dict[str, Any]:
+        """All that decides how it goes on from a state just given out."""
+
+    @abstractmethod
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """Goes on from there, before the first state was asked for."""
+
 
 LONGEST_CALL_S, SECONDS_A_VALUE = 0.2, 2e-9
 """An engine is called for so long at most, so that progress shows and interruptions are heard."""
+MOST_STEPS = 100_000
+"""A call."""
 
 
 class Stepwise(Driver):
     """The driver of the solver `stepping`: gives out a state at every step of which something is
-    wanted, and some between.
-
-    What decides how it goes on, besides the state: `guard`, `settling.pace` and `kept`.
-    """
+    wanted, and some between."""
 
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         super().__init__(scene, state, watch)
         self._engine, self.choice = make_engine(scene, choose(scene))
-        self._patience = max(1, int(LONGEST_CALL_S / (SECONDS_A_VALUE * scene.raster.count)))
+        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count)
         self.guard = Guard.of(scene, state)
         self.settling: Settling | None = None
         if asked := scene.experiment.stepping.settle:
@@ -64,6 +75,20 @@ class Stepwise(Driver):
             self.settling = Settling(scene, asked, state, watch)
         self.kept = -1
         """The last step that was given out to be recorded, and was not rejected."""
+
+    def standing(self) -> dict[str, Any]:
+        """The state, and what the guard and whoever looks whether it has settled remember."""
+        settling = self.settling
+        pace = {"pace": settling.pace, "obstacle": settling.obstacle} if settling else {}
+        return {"state": self.state, "guard": self.guard, "kept": self.kept, **pace}
+
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """What follows from the scene is its own: the size of the body, and, where the run has not
+        begun to settle, when to look."""
+        self.state, self.kept = standing["state"], standing["kept"]
+        self.guard = replace(standing["guard"], size=self.guard.size)
+        if self.settling and "pace" in standing and standing["pace"].seen:
+            self.settling.pace, self.settling.obstacle = standing["pace"], standing["obstacle"]
 
     def states(self) -> States:
         """A run that diverges gives out the last good state at its end, where that is later than
@@ -75,6 +100,7 @@ class Stepwise(Driver):
 
     def _stepped(self) -> States:
         steps = self.scene.experiment.steps
+        outcome: Outcome | None = None
         try:
             yield from self._given_out()
             while not (outcome := self._settled()) and (step := self.state.step) < steps:
@@ -82,10 +108,10 @@ class Stepwise(Driver):
                 self._advance()
                 yield from self._given_out()
         except StoppedError:
-            step = self.state.step
-            stopped = Outcome("interrupted", f"stopped after step {step}", step)
-            outcome = stopped if step < steps else None
-        if self.kept < self.state.step:
+            if (step := self.state.step) < steps:
+                outcome = Outcome("interrupted", f"stopped after step {step}", step)
+                self.stopped = outcome
+        if self.stopped or self.kept < self.state.step:
             self.ending = True
             yield from self._given_out()
         if outcome:
@@ -100,9 +126,15 @@ class Stepwise(Driver):
         stops += [self.settling.pace.next_look] if self.settling else []
         reached = min(*stops, state.step + self._patience)
         looks = reached == self.guard.next_look or experiment.records(reached)
-        self.state = self._engine.advance(state, reached - state.step)
+        begun, steps = perf_counter(), reached - state.step
+        self.state = self._engine.advance(state, steps)
+        self._patience = self._steps_in((perf_counter() - begun) / steps)
         if looks:
             self.guard.look(self.scene, self.state)
+
+    def _steps_in(self, seconds_a_step: float) -> int:
+        """How many steps a call takes, where a step takes so long."""
+        return max(1, min(MOST_STEPS, int(LONGEST_CALL_S / max(seconds_a_step, 1e-9))))
 
     def _given_out(self) -> Iterator[State]:
         """The state. Raises what whoever looked at it has against it."""
@@ -138,29 +170,39 @@ class Stepwise(Driver):
 
 
 class Straight(Driver):
-    """The driver of the solver `equilibrium`: gives out the start and the equilibrium."""
+    """The driver of the solver `equilibrium`: gives out the start, what it reaches on the way, and
+    the equilibrium."""
 
     choice = Choice("equilibrium", 1, "asked for")
+
+    def standing(self) -> dict[str, Any]:
+        """The state: each increment begins anew from it."""
+        return {"state": self.state}
+
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """From the last that was reached."""
+        self.state = standing["state"]
 
     def states(self) -> States:
         """Interrupted, it gives out how far it had come."""
         # Loaded by those who look for an equilibrium, and by nobody else.
-        from pbdkit.equilibrium.increments import settle
+        from pbdkit.equilibrium.increments import increments
         from pbdkit.equilibrium.newton import UnconvergedError
 
         state, steps = self.state, self.scene.experiment.steps
         yield state
         try:
-            certificate = settle(self.scene, state, self.watch)
+            certificate = yield from increments(self.scene, state, self.watch)
             outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
         except UnconvergedError as error:
             found = error.certificate
             outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
         except StoppedError:
+            reason = f"stopped on the way to equilibrium, after step {state.step}"
+            self.stopped = Outcome("interrupted", reason, state.step)
             self.ending = True
             yield state
-            reason = f"stopped on the way to equilibrium, after step {state.step}"
-            return Outcome("interrupted", reason, state.step)
+            return self.stopped
         state.step = steps
         yield state
         if self.rejection:

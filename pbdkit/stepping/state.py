@@ -69,6 +69,11 @@ class State:
             np.copyto(others, mine)
         return replace(over, step=self.step, starts=self.starts)
 
+    def fits(self, other: State) -> bool:
+        """Whether both can be of one scene, by the kinds and shapes of their arrays."""
+        layouts = [[(a.dtype, a.shape) for a in state._arrays()] for state in (self, other)]
+        return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
+
     def _arrays(self) -> list[Array]:
         """What steps are written into."""
         bonds = (self.broken_step, self.broken_length, *self.bond_values)

@@ -11,7 +11,8 @@ import numpy as np
 from pairing import Ratio, ratio
 from sheets import Running, moving, scene_of
 
-from pbdkit.results.netcdf import NetcdfSink, OverlappingSink
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.runs.course import Run, record
 
 

@@ -1,0 +1,86 @@
+"""A sink that lets the run go on while another one writes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from pbdkit.results.layout import Column, Values
+from pbdkit.results.sink import Sink
+from pbdkit.storage.standing import Standing
+
+LARGE_BYTES = 2**20
+"""Below this, handing over costs as much as writing."""
+MOST_WAITING, MOST_CALLS = 2, 100
+"""So many large values may wait to be written, and so many calls; then the run waits."""
+
+
+class OverlappingSink(Sink):
+    """Hands everything to another sink, in order, what is large and what comes while that is being
+    written in a second thread.
+
+    What goes wrong there is raised at the next call.
+    """
+
+    def __init__(self, inner: Sink) -> None:
+        self._inner = inner
+        self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
+        self._waiting: deque[tuple[bool, Future[None]]] = deque()
+        self._keeping: Future[None] | None = None
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """At once, so that what cannot be written is known before the first step."""
+        self._inner.begin(columns, sizes, planned)
+
+    def put(self, values: Values) -> None:
+        """Takes the values over: they must not be changed afterwards."""
+        large = sum(np.asarray(v).nbytes for v in values.values()) >= LARGE_BYTES
+        while self._waiting and self._waiting[0][1].done():
+            self._waiting.popleft()[1].result()
+        if self._waiting or large:
+            self._hand_over(large, self._inner.put, values)
+        else:
+            self._inner.put(values)
+
+    def due(self) -> bool:
+        """Not while the last one is being kept."""
+        return (self._keeping is None or self._keeping.done()) and self._inner.due()
+
+    def keep(self, standing: Standing) -> None:
+        """Beside the run, from a copy."""
+        self._keeping = self._hand_over(True, self._inner.keep, standing.copied())
+
+    def suspend(self, standing: Standing) -> bool:
+        """When all is written."""
+        self._wait()
+        return self._inner.suspend(standing)
+
+    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+        """When all is written."""
+        self._wait()
+        self._inner.finish(attributes, standing)
+
+    def abandon(self) -> None:
+        """What waits is not written."""
+        self._thread.shutdown(cancel_futures=True)
+        self._waiting.clear()
+        self._inner.abandon()
+
+    def _hand_over(self, large: bool, call: Callable[[Any], None], what: Any) -> Future[None]:
+        while len(self._waiting) >= MOST_CALLS or (large and self._large_ones() >= MOST_WAITING):
+            self._waiting.popleft()[1].result()
+        handed = self._thread.submit(call, what)
+        self._waiting.append((large, handed))
+        return handed
+
+    def _large_ones(self) -> int:
+        return sum(large for large, _ in self._waiting)
+
+    def _wait(self) -> None:
+        while self._waiting:
+            self._waiting.popleft()[1].result()
+        self._thread.shutdown()

@@ -1,0 +1,85 @@
+"""The dataset of a run that is not finished, as far as it was kept; nothing is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pbdkit.errors import StorageError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.source import Source
+from pbdkit.results.layout import Column, Values
+from pbdkit.results.netcdf import NetcdfFile
+from pbdkit.results.netcdf_sink import reopened
+from pbdkit.results.recorder import Outcome, Recorder, Seen, columns_of
+from pbdkit.results.sink import Sink
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.storage.seal import opened_in
+from pbdkit.storage.standing import Standing, put_together
+from pbdkit.storage.unfinished import UnfinishedRun
+
+
+class Overlay(Sink):
+    """Puts the end of a dataset over a file that stays as it is."""
+
+    def __init__(self, file: NetcdfFile) -> None:
+        self._file = file
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """It has begun."""
+
+    def put(self, values: Values) -> None:
+        """Over the file."""
+        self._file.put(values)
+
+    def due(self) -> bool:
+        """Never."""
+        return False
+
+    def keep(self, standing: Standing) -> None:
+        """Does not."""
+
+    def suspend(self, standing: Standing) -> bool:
+        """Does not."""
+        return False
+
+    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+        """Over the file."""
+        self._file.finish(attributes)
+
+    def abandon(self) -> None:
+        """Nothing was written."""
+
+
+def unfinished_dataset(output: Path) -> Any:
+    """The content as an h5netcdf.File, with status "interrupted", at the last commit: what was
+    recorded until then, and at its step what is known at the end of a run.
+
+    Raises StorageError, and what building the experiment's scene raises.
+    """
+    left = UnfinishedRun.open(output, writing=False)
+    facts, file = left.facts, left.file(read_only=True)
+    if "finished" in facts:
+        left.release()
+        return opened_in(file)
+    standing = left.standing()
+    left.release()
+    try:
+        parts = json.loads(standing.about["experiment"])
+        kinds: dict[str, type] = {"State": State, "Seen": Seen}
+        state = put_together(facts["run"]["state"], standing.arrays, kinds)
+        seen = put_together(facts["seen"], standing.arrays, kinds)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise StorageError(f"{output}: its store is damaged: {error}") from None
+    scene = build_scene(Experiment.build(Source(f"{output}, unfinished", parts)))
+    if not isinstance(state, State) or not state.fits(initial_state(scene)):
+        raise StorageError(f"{output}: its store holds a state of another experiment")
+    compress = scene.experiment.record.compression == "zlib"
+    making = reopened(file, columns_of(scene), standing, compress=compress)
+    recorder = Recorder(scene, Overlay(making))
+    recorder.seen = seen
+    reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
+    recorder.finish(state, Outcome("interrupted", reason, state.step), {}, standing)
+    return opened_in(file)

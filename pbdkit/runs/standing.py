@@ -1,0 +1,73 @@
+"""Where a run stands, between two steps: taken from a run, and given to another."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+from typing import Any
+
+from pbdkit.errors import StorageError
+from pbdkit.results.recorder import Recorder, Seen
+from pbdkit.runs.drivers import Driver
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.guard import Guard
+from pbdkit.stepping.state import State
+from pbdkit.storage.standing import Arrays, Standing, put_together, taken_apart
+
+KINDS: dict[str, type] = {"State": State, "Guard": Guard, "Seen": Seen}
+
+
+def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standing:
+    """All that decides how the run goes on, its arrays as they are, not copied; `rate` is told to
+    those who ask how far it is, in steps a second."""
+    arrays, experiment = Arrays(), driver.scene.experiment
+    facts = {
+        "run": taken_apart(driver.standing(), "run", arrays),
+        "seen": taken_apart(recorder.seen, "seen", arrays),
+        "step": driver.state.step,
+        "rate": rate,
+        "at": time.time(),
+    }
+    about = {
+        "name": experiment.name,
+        "steps": experiment.steps,
+        "experiment": experiment.model_dump_json(by_alias=True),
+        "plugins": experiment.distributions(),
+        "pbdkit": version("pbdkit"),
+    }
+    return Standing(about, facts, arrays)
+
+
+def take_up(
+    driver: Driver, recorder: Recorder, standing: Standing, recorded: int | None = None
+) -> None:
+    """Lets a run that has not begun go on from there; `recorded` is the last step recorded, where
+    that is another one than was kept. Raises StorageError for the standing of another scene."""
+    parts = _parts(driver.scene, standing)
+    state, seen = parts.get("state"), parts.get("seen")
+    if not isinstance(seen, Seen) or not isinstance(state, State) or not state.fits(driver.state):
+        raise StorageError("the state that was kept is not one of this experiment")
+    if recorded is not None:
+        parts["kept"] = seen.recorded = recorded
+    driver.take_up(parts)
+    recorder.seen = seen
+
+
+def state_of(scene: Scene, standing: Standing) -> tuple[State, Seen]:
+    """The state that was kept, and what had been recorded."""
+    parts = _parts(scene, standing)
+    return parts["state"], parts["seen"]
+
+
+def _parts(scene: Scene, standing: Standing) -> dict[str, Any]:
+    kinds = dict(KINDS)
+    if scene.experiment.stepping.settle:
+        from pbdkit.equilibrium.settlement import Pace
+
+        kinds["Pace"] = Pace
+    try:
+        facts = {**standing.facts["run"], "seen": standing.facts["seen"]}
+    except (KeyError, TypeError) as error:
+        raise StorageError(f"the state that was kept is damaged: {error}") from None
+    found: dict[str, Any] = put_together(facts, standing.arrays, kinds)
+    return found

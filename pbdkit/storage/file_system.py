@@ -1,0 +1,50 @@
+"""What a file system carries, and who else writes to a file on it."""
+
+from __future__ import annotations
+
+import io
+import os
+from contextlib import suppress
+from pathlib import Path
+
+LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "overlay"}
+LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
+"""File systems of one machine, where SQLite's write-ahead log can share memory."""
+
+
+def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
+    """Whether a file lies on a file system that is known to be local; False where nobody tells."""
+    kinds: dict[str, str] = {}
+    with suppress(OSError):
+        for line in Path(mounts).read_text().splitlines():
+            before, _, after = line.partition(" - ")
+            place = before.split()[4].encode().decode("unicode_escape")
+            kinds[place] = after.split()[0]
+    folders = (str(folder) for folder in (path.absolute(), *path.absolute().parents))
+    return next((kinds[folder] in LOCAL for folder in folders if folder in kinds), False)
+
+
+def lock(file: io.FileIO) -> bool:
+    """Locks an open file for as long as it is open. False where somebody else holds it; systems
+    and file systems without locks give it to everybody."""
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes names in a folder last, where the file system can."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,192 @@
+"""The file that the HDF5 library writes into: nothing that was committed is ever overwritten."""
+
+from __future__ import annotations
+
+import io
+import os
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pbdkit.storage.seal import BLOCK, BrokenSealError, Extent, digest, put_seal
+
+PAGE = 4096
+LARGE_BYTES = 2**16
+"""What is written in one go and is larger goes to the disk at once."""
+
+
+class PagedFile(io.RawIOBase):
+    """A file on the disk, and pages in memory that lie over it.
+
+    What is large goes to the disk as it comes, behind all that was there at the last `commit`, and
+    each extent of it once. All else, what the library notes of its variables, stays in memory until
+    `settle`. So the bytes on the disk, with the pages, extents and size of a commit, are the file
+    as it was then, whatever is written afterwards. With `read_only` everything stays in memory.
+
+    Extents that are handed over are checked before a byte of them is given out: BrokenSealError.
+    The library never hears of a failing write: it would try again when the process ends, and crash
+    it. `check` raises the first; after it nothing more is written.
+    """
+
+    def __init__(
+        self,
+        disk: io.FileIO,
+        size: int = 0,
+        pages: Mapping[int, bytes] | None = None,
+        extents: Sequence[Extent] = (),
+        *,
+        read_only: bool = False,
+    ) -> None:
+        self.disk, self.size = disk, size
+        self.pages = {number: bytearray(page) for number, page in (pages or {}).items()}
+        """By number."""
+        self.extents = list(extents)
+        """What lies on the disk, by place."""
+        self.changed: set[int] = set()
+        """The pages written since the last commit."""
+        self.values_bytes = -1
+        """So many bytes in one go are values, too, however few."""
+        self.noted = len(self.extents)
+        """So many of them were there at the last commit."""
+        self._unchecked = {extent.start for extent in extents}
+        self._append_from, self._place = (2**63 if read_only else size), 0
+        self._fault: OSError | None = None
+
+    @property
+    def added(self) -> list[Extent]:
+        """The extents written since the last commit."""
+        return self.extents[self.noted :]
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """As in any file."""
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
+        self._place = max(0, start + offset)
+        return self._place
+
+    def truncate(self, size: int | None = None) -> int:
+        """As in any file; the disk hears of it when all is settled."""
+        self.size = self._place if size is None else size
+        return self.size
+
+    def readinto(self, buffer: Any) -> int:
+        """From the pages, and from the disk where there is none."""
+        view = memoryview(buffer).cast("B")
+        view = view[: max(0, self.size - self._place)]
+        self.verify(self._place, self._place + len(view))
+        view[:] = self._on_disk(self._place, len(view))
+        for page, inside, outside in _overlaps(self._place, len(view)):
+            if page in self.pages:
+                view[outside] = self.pages[page][inside]
+        self._place += len(view)
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        """To the disk what is large and new, into pages what is not."""
+        view = memoryview(data).cast("B")
+        values = len(view) >= LARGE_BYTES or len(view) == self.values_bytes
+        to_disk = values and self._place >= self._append_from
+        if to_disk:
+            self._append(view)
+        for page, inside, outside in _overlaps(self._place, len(view)):
+            if page not in self.pages:
+                if to_disk:
+                    continue
+                self.pages[page] = bytearray(self._on_disk(page * PAGE, PAGE))
+            self.pages[page][inside] = view[outside]
+            self.changed.add(page)
+        self._place += len(view)
+        self.size = max(self.size, self._place)
+        return len(view)
+
+    def verify(self, start: int = 0, stop: int = 2**63) -> None:
+        """Checks the extents that were handed over and of which bytes lie between two places, once
+        each. Raises BrokenSealError."""
+        if not self._unchecked:
+            return
+        first = bisect_right(self.extents, start, key=lambda extent: extent.stop)
+        for extent in self.extents[first:]:
+            if extent.start >= stop:
+                return
+            if extent.start in self._unchecked:
+                if digest(self._on_disk(extent.start, extent.stop - extent.start)) != extent.digest:
+                    where = f"bytes {extent.start} to {extent.stop}"
+                    raise BrokenSealError(f"{self.disk.name}: {where} are not what was written")
+                self._unchecked.discard(extent.start)
+
+    def check(self) -> None:
+        """Raises the OSError that was met in writing, if one was."""
+        if self._fault:
+            raise self._fault
+
+    def give_up(self) -> None:
+        """Nothing more goes to the disk."""
+        self._fault = self._fault or OSError("given up")
+
+    def commit(self) -> None:
+        """What is there now stays: pages, extents and size were noted elsewhere."""
+        self._append_from = max(self._append_from, self.size)
+        self.noted, self.changed = len(self.extents), set()
+
+    def sync(self) -> None:
+        """Waits until what was written is on the disk. Raises OSError."""
+        self.check()
+        os.fsync(self.disk.fileno())
+
+    def settle(self) -> None:
+        """Puts the pages in their places, seals the file and syncs it. Raises OSError."""
+        self.check()
+        for number, page in sorted(self.pages.items()):
+            self.disk.seek(number * PAGE)
+            _write_all(self.disk, memoryview(page))
+        self.disk.truncate(self.size)
+        put_seal(self.disk, [extent for extent in self.extents if self._is_as_appended(extent)])
+        self.sync()
+
+    def _is_as_appended(self, extent: Extent) -> bool:
+        pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
+        return extent.stop <= self.size and not any(page in self.pages for page in pages)
+
+    def _append(self, view: memoryview) -> None:
+        if self._fault is None:
+            try:
+                self.disk.seek(self._place)
+                _write_all(self.disk, view)
+            except OSError as error:
+                self._fault = error
+        for start in range(0, len(view), BLOCK):
+            piece = view[start : start + BLOCK]
+            place = self._place + start
+            self.extents.append(Extent(place, place + len(piece), digest(piece)))
+        self._append_from = self.extents[-1].stop
+
+    def _on_disk(self, start: int, length: int) -> bytes:
+        """So many bytes; zero behind the end."""
+        self.disk.seek(start)
+        return self.disk.read(length).ljust(length, b"\0")
+
+
+def _overlaps(begin: int, length: int) -> Iterator[tuple[int, slice, slice]]:
+    """The pages that some bytes touch: number, part of the page, part of the bytes."""
+    end = begin + length
+    for page in range(begin // PAGE, -(-end // PAGE)):
+        first, last = max(begin, page * PAGE), min(end, (page + 1) * PAGE)
+        inside = slice(first - page * PAGE, last - page * PAGE)
+        yield page, inside, slice(first - begin, last - begin)
+
+
+def _write_all(disk: io.FileIO, view: memoryview) -> None:
+    """A write may take less than it is given, above all where the disk gets full."""
+    while view:
+        view = view[disk.write(view) :]

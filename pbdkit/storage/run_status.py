@@ -1,0 +1,37 @@
+"""How far an unfinished run is."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from pbdkit.errors import StorageError
+from pbdkit.storage.file_system import lock
+from pbdkit.storage.unfinished import UnfinishedRun, store_of
+
+
+def status_of(output: Path) -> dict[str, Any] | None:
+    """Of the unfinished run of an output: `step`, `steps`, `rate` in steps a second, `left_s`,
+    seconds to its end if it goes on so, `age_s`, seconds since it was kept, and `state`, running or
+    stopped; None where there is no such run."""
+    if not store_of(output).exists():
+        return None
+    running = False
+    left = UnfinishedRun.open(output, writing=False)
+    try:
+        about, facts = left.about, left.facts
+        running = not lock(left.disk)
+        steps = int(about["steps"])
+        step = steps if "finished" in facts else int(facts["step"])
+        rate = float(facts.get("rate", 0.0))
+        age = max(0.0, time.time() - float(facts.get("at", math.inf)))  # clocks are set back
+    except (KeyError, TypeError, ValueError) as error:
+        raise StorageError(f"{store_of(output)}: is damaged: {error}") from None
+    finally:
+        left.close()
+    remaining = max(0.0, (steps - step) / rate - age) if rate > 0.0 else None
+    state = "running" if running else "stopped"
+    found = {"step": step, "steps": steps, "rate": rate, "left_s": remaining, "age_s": age}
+    return found | {"state": state}

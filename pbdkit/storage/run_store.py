@@ -1,0 +1,174 @@
+"""The store of an unfinished run: pieces of bytes under keys, each with its digest, in SQLite."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from pbdkit.errors import StorageError
+from pbdkit.storage.file_system import is_local
+
+FORMAT = "1"
+"""Of the store; a newer one is refused."""
+TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, data BLOB NOT NULL, digest BLOB NOT NULL)"
+PART_BYTES = 2**20
+"""Bytes a piece of an array."""
+LONGEST = 2**26
+"""Bytes of anything in the file that this program believes."""
+PATIENCE_S = 60.0
+"""So long a commit waits for somebody who reads."""
+MARK = 0x70626472
+"""The application_id of the file: `pbdr`."""
+
+Pieces = Mapping[str, bytes | memoryview]
+
+
+class RunStore:
+    """Pieces by key in one SQLite file. A commit is there whole or not at all, whatever stops the
+    process or the machine; what it returns from is on the disk.
+
+    Raises StorageError, with the file's name, for whatever SQLite or a digest has against it.
+    """
+
+    def __init__(self, path: Path, *, mode: str = "ro") -> None:
+        """`mode` is ro, rw, or rwc to make it."""
+        self.path = path
+        self._digests: dict[str, bytes] = {}
+        with self._sqlite():
+            # Nobody but the process's own writer thread uses it, one call after the other.
+            self._file = sqlite3.connect(
+                f"{path.absolute().as_uri()}?mode={mode}",
+                timeout=PATIENCE_S,
+                isolation_level=None,
+                check_same_thread=False,
+                uri=True,
+            )
+            self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+            for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
+                self._file.execute(f"PRAGMA {setting}")
+            if mode == "rwc":
+                self._file.execute(f"PRAGMA journal_mode = {_journal(path)}")
+                self._file.execute(f"PRAGMA application_id = {MARK}")
+                self._file.execute(TABLE)
+            elif self._file.execute("SELECT sql FROM sqlite_master").fetchall() != [
+                (TABLE,),
+                (None,),  # the index of its keys
+            ]:
+                raise StorageError(f"{path}: is no store of a run")
+            if mode == "ro":  # all that is read is of one commit
+                self._file.execute("BEGIN")
+
+    def __enter__(self) -> RunStore:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def commit(self, pieces: Pieces, gone: Iterable[str] = ()) -> None:
+        """Puts pieces in the place of those of the same keys, and takes others away."""
+        new = {key: _digest(key, data) for key, data in pieces.items()}
+        changed = [key for key, found in new.items() if self._digests.get(key) != found]
+        with self._sqlite():
+            self._file.execute("BEGIN IMMEDIATE")
+            try:
+                self._file.executemany("DELETE FROM pieces WHERE key = ?", ((k,) for k in gone))
+                self._file.executemany(
+                    "REPLACE INTO pieces VALUES (?, ?, ?)",
+                    ((key, pieces[key], new[key]) for key in changed),
+                )
+                self._file.execute("COMMIT")
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    self._file.execute("ROLLBACK")
+                raise
+        self._digests |= new
+
+    def keys(self, begin: str) -> list[str]:
+        """The keys that begin so."""
+        with self._sqlite():
+            rows = self._file.execute(
+                "SELECT key FROM pieces WHERE substr(key, 1, ?) = ?", (len(begin), begin)
+            )
+            return [str(key) for (key,) in rows]
+
+    def piece(self, key: str) -> bytes:
+        """What was committed last under a key."""
+        with self._sqlite():
+            row = self._file.execute(
+                "SELECT data, digest FROM pieces WHERE key = ?", (key,)
+            ).fetchone()
+        if row is None:
+            raise StorageError(f"{self.path}: is damaged: '{key}' is missing")
+        data, found = row
+        if not isinstance(data, bytes) or _digest(key, data) != found:
+            raise StorageError(f"{self.path}: is damaged: '{key}' is not what was written")
+        self._digests[key] = found
+        return data
+
+    def facts(self, key: str) -> Any:
+        """What was committed there as JSON."""
+        try:
+            return json.loads(self.piece(key))
+        except (ValueError, RecursionError):
+            raise StorageError(f"{self.path}: is damaged: '{key}' is no JSON") from None
+
+    def close(self) -> None:
+        """Without an error, whatever the state of the disk."""
+        with suppress(sqlite3.Error):
+            self._file.close()
+
+    @contextmanager
+    def _sqlite(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise StorageError(f"{self.path}: {error}") from None
+
+
+def json_piece(facts: Any) -> bytes:
+    """Facts as a piece."""
+    return json.dumps(facts).encode()
+
+
+def parts_of(name: str, array: np.ndarray[Any, Any]) -> dict[str, memoryview]:
+    """An array as pieces of bounded size."""
+    data: memoryview = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+    starts = range(0, len(data), PART_BYTES)
+    return {f"{name}/{n}": data[at : at + PART_BYTES] for n, at in enumerate(starts)}
+
+
+def array_of(
+    store: RunStore, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> np.ndarray[Any, Any]:
+    """An array of such parts. Raises StorageError where they are not as many as it needs."""
+    whole = np.empty(shape, dtype)
+    data: memoryview = whole.reshape(-1).view(np.uint8).data
+    for n, at in enumerate(range(0, len(data), PART_BYTES)):
+        piece = store.piece(f"{name}/{n}")
+        if len(piece) != min(PART_BYTES, len(data) - at):
+            raise StorageError(f"{store.path}: is damaged: '{name}' has another size")
+        data[at : at + PART_BYTES] = piece
+    return whole
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files that SQLite keeps of a store."""
+    return [path.with_name(path.name + more) for more in ("", "-journal", "-wal", "-shm")]
+
+
+def _journal(path: Path) -> str:
+    """On a network the write-ahead log would need memory that machines share."""
+    return "WAL" if is_local(path) else "TRUNCATE"
+
+
+def _digest(key: str, data: bytes | memoryview) -> bytes:
+    own = xxhash.xxh3_128(key.encode())
+    own.update(data)
+    return own.digest()

@@ -1,0 +1,238 @@
+"""An unfinished run beside its output: what was committed of it, in a store and one more file."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.storage.file_system import lock, sync_folder
+from pbdkit.storage.paged_file import PagedFile
+from pbdkit.storage.run_store import (
+    FORMAT,
+    RunStore,
+    array_of,
+    files_of,
+    json_piece,
+    parts_of,
+)
+from pbdkit.storage.seal import Extent
+from pbdkit.storage.standing import Arrays, Standing
+
+STORE, RECORDS = ".run", ".run-records"
+"""Behind the name of the output: the store, and the file of large values."""
+EXTENT = np.dtype([("start", "<u8"), ("stop", "<u8"), ("digest", "<u8")])
+LARGEST_ARRAY = 2**40
+PAGES, EXTENTS, ARRAYS = "page/", "extents/", "array/"
+"""How the keys of pieces begin."""
+
+
+class UnfinishedRun:
+    """The store of a run, and the records it names.
+
+    Who writes it holds a lock on the records. A commit holds where the run stands and the file of
+    the result as far as it is: its pages, the extents of the records, and the entries that wait for
+    a chunk to be full. Raises StorageError.
+    """
+
+    def __init__(self, output: Path, disk: io.FileIO, store: RunStore) -> None:
+        self.output, self.disk, self._store = output, disk, store
+        self._arrays: set[str] = set()
+        self.records = records_of(output)
+        self.kept = False
+        """Whether anything was committed."""
+
+    @classmethod
+    def begin(cls, output: Path, temporary: Path, disk: io.FileIO) -> UnfinishedRun:
+        """Makes a store beside the output; the temporary file, open as `disk`, becomes its
+        records."""
+        store, records = store_of(output), records_of(output)
+        taken = StorageError(f"{output}: another run began to write it meanwhile")
+        try:
+            os.link(temporary, records)
+        except FileExistsError:
+            raise taken from None
+        except OSError:  # no hard links on this file system
+            if records.exists():
+                raise taken from None
+            temporary.rename(records)
+        else:
+            temporary.unlink()
+        return cls(output, disk, RunStore(store, mode="rwc"))
+
+    @classmethod
+    def open(cls, output: Path, *, writing: bool) -> UnfinishedRun:
+        """The one that is there. Raises ExperimentError where another process writes it."""
+        store, records = store_of(output), records_of(output)
+        try:
+            disk = io.FileIO(records, "r+b" if writing else "rb")
+        except OSError as error:
+            raise StorageError(f"{records}: cannot be read: {error.strerror}") from None
+        try:
+            if writing and not lock(disk):
+                raise ExperimentError(f"{output}: is being written; `pbdkit status` says how far")
+            opened = cls(output, disk, RunStore(store, mode="rw" if writing else "ro"))
+        except BaseException:
+            disk.close()
+            raise
+        opened._refuse_newer()
+        opened.kept = True
+        return opened
+
+    def keep(
+        self,
+        standing: Standing,
+        file: PagedFile,
+        waiting: Mapping[str, list[NDArray[Any]]],
+        written: Mapping[str, int],
+    ) -> None:
+        """Commits where the run stands, and its file, whose pages hold all but what waits."""
+        batches = {f"waiting.{n}": np.stack(v) for n, v in waiting.items() if v}
+        arrays = batches | standing.arrays
+        kinds = {n: [a.dtype.str, list(a.shape)] for n, a in arrays.items()}
+        facts = standing.facts | {"arrays": kinds, "written": dict(written)}
+        pieces = {k: v for n, a in arrays.items() for k, v in parts_of(ARRAYS + n, a).items()}
+        gone, self._arrays = self._arrays - {*pieces}, {*pieces}
+        about = {"about": json_piece(standing.about | {"format": FORMAT})}
+        self._commit(file, about | pieces | {"facts": json_piece(facts)}, gone)
+
+    def conclude(self, file: PagedFile, status: str) -> None:
+        """Commits the file of a finished run, whose pages hold all of it."""
+        self._commit(file, {"facts": json_piece({"finished": status})}, set())
+
+    def _commit(self, file: PagedFile, pieces: Mapping[str, Any], gone: set[str]) -> None:
+        file.sync()
+        numbers = file.changed if self.kept else file.pages
+        pages = {f"{PAGES}{n}": bytes(file.pages[n]) for n in numbers}
+        added = file.added if self.kept else file.extents
+        extents = {f"{EXTENTS}{len(file.extents)}": np.array(added, EXTENT).tobytes()}
+        layout = {"size": file.size, "pages": len(file.pages), "extents": len(file.extents)}
+        described = {"file": json_piece(layout)}
+        self._store.commit({**pieces, **pages, **(extents if added else {}), **described}, gone)
+        file.commit()
+        if not self.kept:
+            sync_folder(self.output.absolute().parent)
+        self.kept = True
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What was asked for, and by which versions."""
+        return self._dict("about")
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Where it stood, without the arrays."""
+        return self._dict("facts")
+
+    def standing(self) -> Standing:
+        """Where it stood at the last commit; its arrays are those of the run and those that wait,
+        ``waiting.NAME``."""
+        facts, arrays = self.facts, Arrays()
+        try:
+            for name, (dtype, shape) in facts["arrays"].items():
+                kind = np.dtype(dtype)
+                if kind.kind not in "fiub" or np.prod(shape, dtype=float) > LARGEST_ARRAY:
+                    raise ValueError(dtype)
+                arrays[name] = array_of(self._store, ARRAYS + name, kind, tuple(shape))
+        except (KeyError, TypeError, ValueError, MemoryError) as error:
+            raise StorageError(f"{self._store.path}: is damaged: {error}") from None
+        self._arrays = {*self._store.keys(ARRAYS)}
+        return Standing(self.about, facts, arrays)
+
+    def file(self, *, read_only: bool) -> PagedFile:
+        """The file of the result, as it was committed last."""
+        layout = self._dict("file")
+        pages = {}
+        for key in self._store.keys(PAGES):
+            pages[int(key.removeprefix(PAGES))] = self._store.piece(key)
+        rows = [self._store.piece(key) for key in self._store.keys(EXTENTS)]
+        table = np.frombuffer(b"".join(rows), EXTENT)
+        extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
+        if layout != {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}:
+            raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")
+        if extents and extents[-1].stop > os.fstat(self.disk.fileno()).st_size:
+            raise StorageError(f"{self.disk.name}: is shorter than it was written")
+        return PagedFile(self.disk, layout["size"], pages, extents, read_only=read_only)
+
+    def close(self) -> None:
+        """It stays to be gone on with, if anything was committed; else nothing of it does."""
+        self._store.close()
+        if not self.kept:
+            remove_unfinished(self.output)
+        self.disk.close()
+
+    def release(self) -> None:
+        """Whoever writes is no longer kept waiting; the records can still be read."""
+        self._store.close()
+
+    def remove(self) -> None:
+        """Once the result has its name: the store goes."""
+        self._store.close()
+        remove_unfinished(self.output)
+
+    def _dict(self, key: str) -> dict[str, Any]:
+        found = self._store.facts(key)
+        if not isinstance(found, dict):
+            raise StorageError(f"{self._store.path}: is damaged: '{key}' is no map of keys")
+        return found
+
+    def _refuse_newer(self) -> None:
+        found = self.about.get("format")
+        if found != FORMAT:
+            raise StorageError(
+                f"{self._store.path}: is of format {found}, and this pbdkit reads {FORMAT}; take "
+                "the pbdkit that wrote it"
+            )
+
+
+def store_of(output: Path) -> Path:
+    """The SQLite file of an unfinished run."""
+    return output.with_name(output.name + STORE)
+
+
+def records_of(output: Path) -> Path:
+    """The file of its large values."""
+    return output.with_name(output.name + RECORDS)
+
+
+def remove_unfinished(output: Path) -> None:
+    """Removes the files of a store; the records last, whose lock keeps others away."""
+    for path in (*reversed(files_of(store_of(output))), records_of(output)):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def is_unfinished(output: Path) -> bool:
+    """Whether there is a run to go on with. What one left behind that committed nothing is removed.
+    Raises ExperimentError where one is going on."""
+    records = records_of(output)
+    try:
+        with io.FileIO(records, "r+b") as disk:
+            if not lock(disk):
+                raise ExperimentError(
+                    f"{output}: is being written by another run; `pbdkit status {output}` says "
+                    "how far it is; -o names another file"
+                )
+            committed = _has_committed(output)
+            if not committed:
+                remove_unfinished(output)
+            return committed
+    except FileNotFoundError:
+        return store_of(output).exists() and _has_committed(output)
+    except OSError as error:
+        raise StorageError(f"{records}: {error.strerror}") from None
+
+
+def _has_committed(output: Path) -> bool:
+    store = store_of(output)
+    if not store.exists():
+        return False
+    with RunStore(store, mode="rw") as found:
+        return bool(found.keys("about"))
