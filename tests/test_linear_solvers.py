@@ -144,8 +144,8 @@ def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
     result = call("run", "s.json")
     assert result.code == 130
     assert result.err == (
-        "pbdkit: interrupted: stopped on the way to equilibrium, after step 0; what was recorded "
-        "until then is in sheet.nc\n"
+        "pbdkit: interrupted: stopped on the way to equilibrium, after step 0; `pbdkit resume "
+        "sheet.nc` goes on from what was kept\n"
     )
     ds = pbdkit.open("sheet.nc")
     assert ds.attrs["status"] == "interrupted"

@@ -15,7 +15,7 @@ from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.unfinished_dataset import unfinished_dataset
-from pbdkit.storage.seal import BrokenSealError, opened, seal_of
+from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
 from pbdkit.storage.unfinished import STORE, store_of
 
 if TYPE_CHECKING:
@@ -48,6 +48,9 @@ def open(path: str | Path) -> xarray.Dataset:
     except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
+        if not left:
+            with SealedFile(file) as content:
+                content.check()
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
     if fault := _fault(dataset):

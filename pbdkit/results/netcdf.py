@@ -35,6 +35,8 @@ class NetcdfFile:
 
     def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
         self.file, self._compress = file, compress
+        self._h5: Any = None
+        self._content: Any = None
         self._columns = {column.name: column for column in columns}
         self.waiting: Waiting = {column.name: [] for column in columns if column.grows}
         self.written = dict.fromkeys(self.waiting, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ class Overlay(Sink):
 
 def unfinished_dataset(output: Path) -> Any:
     """The content as an h5netcdf.File, with status "interrupted", at the last commit: what was
-    recorded until then, and at its step what is known at the end of a run.
+    recorded until then, its state and what is known at the end of a run.
 
     Raises StorageError, and what building the experiment's scene raises.
     """
@@ -81,5 +82,7 @@ def unfinished_dataset(output: Path) -> Any:
     recorder = Recorder(scene, Overlay(making))
     recorder.seen = seen
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
+    with suppress(FloatingPointError):  # a state that is not finite is not shown
+        recorder.observe(state, last=True)
     recorder.finish(state, Outcome("interrupted", reason, state.step), {}, standing)
     return opened_in(file)

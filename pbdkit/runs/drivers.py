@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -80,13 +79,16 @@ class Stepwise(Driver):
         """The state, and what the guard and whoever looks whether it has settled remember."""
         settling = self.settling
         pace = {"pace": settling.pace, "obstacle": settling.obstacle} if settling else {}
-        return {"state": self.state, "guard": self.guard, "kept": self.kept, **pace}
+        guard = {"good_step": self.guard.good_step, "next_look": self.guard.next_look}
+        return {"state": self.state, "guard": guard, "kept": self.kept, **pace}
 
     def take_up(self, standing: Mapping[str, Any]) -> None:
         """What follows from the scene is its own: the size of the body, and, where the run has not
         begun to settle, when to look."""
         self.state, self.kept = standing["state"], standing["kept"]
-        self.guard = replace(standing["guard"], size=self.guard.size)
+        is_good = standing["guard"]["good_step"] == self.state.step
+        kept = self.state.copy() if is_good else None
+        self.guard = Guard(self.guard.size, kept=kept, **standing["guard"])
         if self.settling and "pace" in standing and standing["pace"].seen:
             self.settling.pace, self.settling.obstacle = standing["pace"], standing["obstacle"]
 

@@ -10,11 +10,10 @@ from pbdkit.errors import StorageError
 from pbdkit.results.recorder import Recorder, Seen
 from pbdkit.runs.drivers import Driver
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State
 from pbdkit.storage.standing import Arrays, Standing, put_together, taken_apart
 
-KINDS: dict[str, type] = {"State": State, "Guard": Guard, "Seen": Seen}
+KINDS: dict[str, type] = {"State": State, "Seen": Seen}
 
 
 def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standing:
@@ -51,12 +50,6 @@ def take_up(
         parts["kept"] = seen.recorded = recorded
     driver.take_up(parts)
     recorder.seen = seen
-
-
-def state_of(scene: Scene, standing: Standing) -> tuple[State, Seen]:
-    """The state that was kept, and what had been recorded."""
-    parts = _parts(scene, standing)
-    return parts["state"], parts["seen"]
 
 
 def _parts(scene: Scene, standing: Standing) -> dict[str, Any]:

@@ -50,13 +50,15 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     """The sizes of a scene with so many particles."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
-    state = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + 1 + value)
+    state: float = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + value)
     state += planes * sum(_bytes_of(n.dtype, value) for n in bond_numbers(experiment))
     state += sum(_bytes_of(n.dtype, value) for n in particle_numbers(experiment))
-    table = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    table += experiment.fracture.can_break * planes
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
     memory = LEAST + math.ceil(particles * (state + table + made))
-    return Sizes(particles, memory, _output(experiment, particles, planes))
+    output = math.ceil(particles * state) + _output(experiment, particles, planes)
+    return Sizes(particles, memory, output)
 
 
 def _workspace(experiment: Experiment, each: int, planes: float) -> float:
@@ -80,7 +82,8 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
 
 
 def _output(experiment: Experiment, particles: int, planes: float) -> int:
-    """Bytes of the dataset, with `planes` bonds a particle, all of which may break."""
+    """Bytes of the dataset without its final state, with `planes` bonds a particle, all of which
+    may break."""
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     each_time, every_step = 2 * recorded + 1.0, 0

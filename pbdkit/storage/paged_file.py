@@ -125,6 +125,11 @@ class PagedFile(io.RawIOBase):
                     raise BrokenSealError(f"{self.disk.name}: {where} are not what was written")
                 self._unchecked.discard(extent.start)
 
+    def close(self) -> None:
+        """Closes the file on the disk, too."""
+        self.disk.close()
+        super().close()
+
     def check(self) -> None:
         """Raises the OSError that was met in writing, if one was."""
         if self._fault:
@@ -151,12 +156,16 @@ class PagedFile(io.RawIOBase):
             self.disk.seek(number * PAGE)
             _write_all(self.disk, memoryview(page))
         self.disk.truncate(self.size)
-        put_seal(self.disk, [extent for extent in self.extents if self._is_as_appended(extent)])
+        put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
         self.sync()
 
-    def _is_as_appended(self, extent: Extent) -> bool:
+    def _settled(self, extent: Extent) -> Extent:
+        """With the digest that it has now, should a page lie over it."""
         pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
-        return extent.stop <= self.size and not any(page in self.pages for page in pages)
+        if not any(page in self.pages for page in pages):
+            return extent
+        data = self._on_disk(extent.start, extent.stop - extent.start)
+        return extent._replace(digest=digest(data))
 
     def _append(self, view: memoryview) -> None:
         if self._fault is None:

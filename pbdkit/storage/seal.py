@@ -27,9 +27,9 @@ MARK = b"pbdkit seal 2\n\0\0"
 FOOT = struct.Struct("<QQ16s16s")
 """The end of the file: bytes of content, number of digests, digest of both and of the table before
 them, mark."""
-ROW = np.dtype([("stop", "<u8"), ("digest", "<u8")])
-"""A row of the table: where an extent ends, which begins where the one before ends, and its
-digest."""
+ROW = np.dtype([("stop", "<u8"), ("digest", "<u8"), ("values", "<u8")])
+"""A row of the table: where an extent ends, which begins where the one before ends, its digest, and
+whether it holds values alone, and nothing that HDF5 says of them."""
 
 
 class BrokenSealError(StorageError):
@@ -100,6 +100,12 @@ class SealedFile(io.RawIOBase):
         self._place += count
         return count
 
+    def check_structure(self) -> None:
+        """Checks all extents that are not of values alone: what the HDF5 library believes."""
+        table = self.seal.table if self.seal else np.empty(0, ROW)
+        for n in np.flatnonzero(table["values"] == 0).tolist():
+            self.check(int(table["stop"][n]) - 1, int(table["stop"][n]))
+
     def check(self, start: int = 0, stop: int | None = None) -> None:
         """Checks the extents of which bytes lie between two places, once each. Raises
         BrokenSealError."""
@@ -123,16 +129,17 @@ class SealedFile(io.RawIOBase):
 
 
 def put_seal(file: io.FileIO, known: Iterable[Extent] = ()) -> None:
-    """Seals a finished file, open for reading and writing; extents whose digests are `known`, in
-    their order, are not read. Raises OSError."""
-    size = file.seek(0, os.SEEK_END)
-    rows = [(e.stop, e.digest) for e in _gapless(file, size, known)]
+    """Seals a finished file, open for reading and writing. Extents of values whose digests are
+    `known`, in their order, are not read. Raises OSError."""
+    size, known = file.seek(0, os.SEEK_END), tuple(known)
+    values = {extent.start for extent in known}
+    rows = [(e.stop, e.digest, e.start in values) for e in _gapless(file, size, known)]
     seal = Seal(size, np.array(rows, ROW))
     file.seek(size)
     file.write(seal.table.tobytes() + seal.foot())
 
 
-def _gapless(file: io.FileIO, size: int, known: Iterable[Extent]) -> Iterator[Extent]:
+def _gapless(file: io.FileIO, size: int, known: tuple[Extent, ...]) -> Iterator[Extent]:
     """The known extents, and between them those that fill the file."""
     place = 0
     for extent in (*known, Extent(size, size, 0)):
@@ -168,7 +175,9 @@ def seal_of(file: io.FileIO) -> Seal | None:
 
 def opened(path: Path, mode: str = "r") -> Any:
     """The content of a sealed file as an h5netcdf.File."""
-    return opened_in(SealedFile(path))
+    file = SealedFile(path)
+    file.check_structure()
+    return opened_in(file)
 
 
 def opened_in(file: io.RawIOBase) -> Any:

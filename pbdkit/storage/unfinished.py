@@ -224,7 +224,7 @@ def is_unfinished(output: Path) -> bool:
             if not committed:
                 remove_unfinished(output)
             return committed
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return store_of(output).exists() and _has_committed(output)
     except OSError as error:
         raise StorageError(f"{records}: {error.strerror}") from None
