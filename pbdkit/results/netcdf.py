@@ -47,8 +47,10 @@ class NetcdfFile:
         self._batch: dict[str, int] = {}
         grow = dict.fromkeys(d for column in self._columns.values() for d in column.dims)
         self._content.dimensions = {dim: sizes.get(dim) or None for dim in grow}
-        for column in self._columns.values():
-            self._define(column, sizes, planned)
+        # A table named as its dimension comes last: to the library the dimension is fixed then.
+        tables = {name: len(c.dims) > 1 and name in c.dims for name, c in self._columns.items()}
+        for name in sorted(self._columns, key=tables.__getitem__):
+            self._define(self._columns[name], sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, int]) -> None:
         """Goes on with a file as it was committed."""
@@ -91,7 +93,9 @@ class NetcdfFile:
         for key, array in arrays.items():
             dims = {f"{key}_{n}": length for n, length in enumerate(array.shape)}
             group.dimensions.update(dims)
-            group.create_variable(key, tuple(dims), array.dtype, data=array)
+            # The library would give empty arrays chunks larger than they are.
+            heuristic = {"chunking_heuristic": "h5py"}
+            group.create_variable(key, tuple(dims), array.dtype, data=array, **heuristic)
 
     def give_up(self) -> None:
         """What was put is not wanted; nothing is raised."""
@@ -110,8 +114,8 @@ class NetcdfFile:
         if column.grows:
             more["chunks"] = _chunks(column, sizes, planned)
             self._batch[column.name] = more["chunks"][0]
-        elif column.dims and column.dims[0] not in sizes:
-            more["chunks"] = (OPEN_CHUNK, *(sizes[d] for d in column.dims[1:]))
+        elif not all(sizes.get(dim) for dim in column.dims):
+            more["chunks"] = tuple(sizes.get(dim) or OPEN_CHUNK for dim in column.dims)
         if self._compress and column.dtype != "str" and column.dims:
             more |= {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
         if column.grows:

@@ -158,7 +158,7 @@ def _map(about: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _refuse_versions(output: Path, made: Mapping[str, Any], experiment: Experiment) -> None:
-    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    here = experiment.distributions() | {"pbdkit": version("pbdkit")}
     before = {**made.get("plugins", {}), "pbdkit": made.get("pbdkit")}
     for name, now in here.items():
         if before.get(name) != now:

@@ -39,7 +39,7 @@ class RunStore:
 
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
         """`mode` is ro, rw, or rwc to make it."""
-        self.path = path
+        self.path, self._writes = path, mode != "ro"
         self._digests: dict[str, bytes] = {}
         with self._sqlite():
             # Nobody but the process's own writer thread uses it, one call after the other.
@@ -53,8 +53,9 @@ class RunStore:
             self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
             for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
                 self._file.execute(f"PRAGMA {setting}")
-            if mode == "rwc":
+            if self._writes:
                 self._file.execute(f"PRAGMA journal_mode = {_journal(path)}")
+            if mode == "rwc":
                 self._file.execute(f"PRAGMA application_id = {MARK}")
                 self._file.execute(TABLE)
             elif self._file.execute("SELECT sql FROM sqlite_master").fetchall() != [
@@ -120,7 +121,10 @@ class RunStore:
             raise StorageError(f"{self.path}: is damaged: '{key}' is no JSON") from None
 
     def close(self) -> None:
-        """Without an error, whatever the state of the disk."""
+        """Without an error, whatever the state of the disk; as one file, where it can be."""
+        with suppress(sqlite3.Error):
+            if self._writes:
+                self._file.execute("PRAGMA journal_mode = DELETE")
         with suppress(sqlite3.Error):
             self._file.close()
 

@@ -1,0 +1,233 @@
+"""A run that is left and gone on with is the uninterrupted one, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import h5netcdf
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from scene_strategies import experiments, samples
+
+import pbdkit
+from pbdkit.results import netcdf_sink
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.overlapping_sink import OverlappingSink
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import Run, record
+from pbdkit.runs.resumption import resumption
+from pbdkit.scene.scene import build_scene
+
+Call = Callable[..., Any]
+OUT = Path("tensile.nc")
+EVERYTHING = [{"type": "pe1"}, {"type": "displacement"}, {"type": "track", "numbers": [13]}]
+FRACTURE = {"type": "threshold", "thresholds": [1.6]}
+RUNS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "everything": {"diagnostics": EVERYTHING},
+    "memory": {"solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.4}},
+    "fracture": {"fracture": FRACTURE},
+    "float32": {"solver": {"type": "stepping", "precision": "float32"}},
+    "small records": {"record": {"every": 3, "dtype": "float32"}},
+    "zlib": {"record": {"every": 1, "compression": "zlib"}, "diagnostics": EVERYTHING},
+    "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
+    "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
+    "equilibrium": {"solver": {"type": "equilibrium"}},
+    "equilibrium, fracture": {"solver": {"type": "equilibrium"}, "fracture": FRACTURE},
+}
+
+
+def scene_of(given: dict[str, Any]) -> Any:
+    return build_scene(pbdkit.Experiment(**given))
+
+
+def stopping_after(looks: int) -> Watch:
+    asked = count()
+    return Watch(lambda: next(asked) >= looks)
+
+
+def run_in_parts(given: dict[str, Any], path: Path, looks: Iterator[int]) -> int:
+    """Stops the run after so many looks, and so on; how often it was gone on with."""
+    scene = scene_of(given)
+    sink = OverlappingSink(NetcdfSink(path, False, scene.experiment.record.compression))
+    report = record(Run(scene, watch=stopping_after(next(looks))), sink)
+    for resumed in count():
+        if report.outcome.status != "interrupted":
+            return resumed
+        found = resumption(path, stopping_after(next(looks)))
+        assert found is not None
+        report = found.record()
+    raise AssertionError
+
+
+def contents(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """All variables, those of the final state too, and attributes but when it was made."""
+    with h5netcdf.File(path, "r") as file:
+        groups = [file, *file.groups.values()]
+        values = {f"{g.name}{n}": v[...] for g in groups for n, v in g.variables.items()}
+        attributes = {f"{g.name}{n}": v for g in groups for n, v in g.attrs.items()}
+    facts = json.loads(attributes.pop("/final_statefacts"))
+    del attributes["/created"], facts["at"], facts["rate"]
+    return values, attributes | {"facts": facts}
+
+
+def assert_same(one: Path, other: Path) -> None:
+    (values, attributes), (values_2, attributes_2) = contents(one), contents(other)
+    assert attributes == attributes_2
+    assert values.keys() == values_2.keys()
+    for name, value in values.items():
+        assert value.dtype == values_2[name].dtype, name
+        np.testing.assert_array_equal(value, values_2[name], err_msg=name)
+
+
+@pytest.mark.parametrize("change", RUNS)
+def test_a_run_in_parts_is_the_whole_run(
+    change: str, tensile: dict[str, Any], tmp_path: Path
+) -> None:
+    given = tensile | RUNS[change]
+    whole, parts = tmp_path / "whole.nc", tmp_path / "parts.nc"
+    record(Run(scene_of(given)), NetcdfSink(whole))
+    random = np.random.default_rng(len(change))
+    looks = (int(random.integers(0, 2 + n)) for n in count())
+    assert run_in_parts(given, parts, looks) > 0
+    assert_same(whole, parts)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["parts.nc", "whole.nc"]
+
+
+@samples(6)
+@given(experiments())
+def test_any_run_in_parts_is_the_whole_run(tmp_path_factory: Any, given: dict[str, Any]) -> None:
+    folder = tmp_path_factory.mktemp("parts")
+    try:
+        record(Run(scene_of(given)), NetcdfSink(folder / "whole.nc"))
+    except pbdkit.ExperimentError:  # leaders that contradict each other, perhaps on the way
+        assume(False)
+    run_in_parts(given, folder / "parts.nc", iter([1, 2, 3, 10**9]))
+    assert_same(folder / "whole.nc", folder / "parts.nc")
+
+
+def test_a_run_is_gone_on_with_from_any_commit(
+    tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What lies in the folder after each commit, as a kill leaves it, is enough; what was written
+    behind it does no harm."""
+    given = tensile | RUNS["everything"] | {"fracture": FRACTURE, "steps": 12}
+    monkeypatch.setattr(netcdf_sink, "EVERY_S", 0.0)
+    monkeypatch.setattr(netcdf_sink, "SHARE", 0)
+    whole, live = tmp_path / "whole.nc", tmp_path / "live"
+    record(Run(scene_of(given)), NetcdfSink(whole))
+    live.mkdir()
+    sink = NetcdfSink(live / "out.nc", first_s=0.0)
+    keep = sink.keep
+
+    def keep_and_copy(standing: Any) -> None:
+        keep(standing)
+        shutil.copytree(live, tmp_path / f"kill-{standing.facts['step']}")
+
+    monkeypatch.setattr(sink, "keep", keep_and_copy)
+    record(Run(scene_of(given)), sink)
+    killed = sorted(tmp_path.glob("kill-*"))
+    assert len(killed) == 13
+    for folder in killed:
+        records = folder / "out.nc.run-records"
+        records.write_bytes(records.read_bytes() + b"what was not committed")
+        found = resumption(folder / "out.nc", Watch())
+        assert found is not None
+        found.record()
+        assert_same(whole, folder / "out.nc")
+        assert [path.name for path in folder.iterdir()] == ["out.nc"]
+
+
+@pytest.fixture
+def stopped(call: Call, tensile: dict[str, Any]) -> dict[str, Any]:
+    """An unfinished run of tensile.nc in the current folder."""
+    sink = NetcdfSink(OUT, origin={"experiment": "e.json", "settings": []})
+    given = tensile | {"steps": 40}
+    Path("e.json").write_text(json.dumps(given))
+    report = record(Run(scene_of(given), watch=stopping_after(20)), sink)
+    assert (report.outcome.status, OUT.exists()) == ("interrupted", False)
+    return given
+
+
+def test_an_unfinished_run_is_looked_at(stopped: dict[str, Any], call: Call) -> None:
+    before = {path: path.read_bytes() for path in Path().iterdir()}
+    result = call("status", str(OUT))
+    assert result.out.startswith("tensile.nc: step 20 of 40, stopped\n")
+    assert json.loads(call("status", str(OUT), "--json").out)["state"] == "stopped"
+    for name in (OUT, f"{OUT}.run"):
+        with pbdkit.open(name) as ds:
+            assert ds.attrs["status"] == "interrupted"
+            assert ds.time.values.tolist() == list(range(21))
+            ds.load()
+    assert call("plot", str(OUT), "-o", "p.png").code == 0
+    Path("p.png").unlink()
+    assert {path: path.read_bytes() for path in Path().iterdir()} == before
+
+
+def test_a_run_beside_an_unfinished_one_is_refused(stopped: dict[str, Any], call: Call) -> None:
+    refused = call("run", "e.json")
+    assert refused.code == 2
+    assert "`pbdkit resume tensile.nc` goes on with it" in refused.err
+    assert call("run", "e.json", "--force").code == 0
+    assert sorted(path.name for path in Path().iterdir()) == ["e.json", "tensile.nc"]
+
+
+def test_python_goes_on_with_it(stopped: dict[str, Any]) -> None:
+    whole = pbdkit.run(stopped, progress=False)
+    with pbdkit.resume(OUT, progress=False) as ds:
+        for name in whole.variables:
+            np.testing.assert_array_equal(ds[name], whole[name])
+    with pytest.raises(pbdkit.ExperimentError, match=r"is finished; --steps N continues it"):
+        pbdkit.resume(OUT)
+    with pytest.raises(pbdkit.ExperimentError, match="no unfinished run of it, and no result"):
+        pbdkit.resume("none.nc")
+
+
+def test_what_changed_since_is_refused(
+    stopped: dict[str, Any], call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("e.json").write_text(json.dumps(stopped | {"seed": 7}))
+    refused = call("resume", str(OUT))
+    assert (refused.code, "e.json has changed since the run began" in refused.err) == (2, True)
+    Path("e.json").write_text(json.dumps(stopped))
+    with monkeypatch.context() as other:
+        other.setattr("pbdkit.runs.resumption.version", lambda name: "99.0")
+        refused = call("resume", str(OUT))
+        assert (refused.code, "and 99.0 is installed" in refused.err) == (2, True)
+        assert call("resume", str(OUT), "--anyway").code == 0
+
+
+CONTINUED = ["plain", "everything", "memory", "fracture", "small records", "zlib", "settles"]
+
+
+@pytest.mark.parametrize("change", CONTINUED)
+def test_a_finished_run_is_continued_to_the_longer_one(
+    change: str, tensile: dict[str, Any], tmp_path: Path
+) -> None:
+    given = tensile | RUNS[change]
+    given |= {"steps": given.get("steps", 10) + 17}
+    whole, shorter = tmp_path / "whole.nc", tmp_path / "shorter.nc"
+    record(Run(scene_of(given)), NetcdfSink(whole))
+    record(Run(scene_of(given | {"steps": 10})), NetcdfSink(shorter))
+    with pbdkit.resume(shorter, steps=given["steps"], progress=False) as ds:
+        assert ds.time[-1] > 10
+    assert_same(whole, shorter)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["shorter.nc", "whole.nc"]
+
+
+def test_what_cannot_be_continued_is_refused(
+    tensile: dict[str, Any], call: Call, tmp_path: Path
+) -> None:
+    for status, change in (("diverged", "diverges"), ("an equilibrium", "equilibrium")):
+        record(Run(scene_of(tensile | RUNS[change])), NetcdfSink(tmp_path / "out.nc", True))
+        refused = call("resume", str(tmp_path / "out.nc"), "--steps", "5000")
+        assert (refused.code, status in refused.err) == (2, True), refused.err
+    record(Run(scene_of(tensile)), NetcdfSink(tmp_path / "short.nc"))
+    refused = call("resume", str(tmp_path / "short.nc"), "--steps", "3")
+    assert "steps are done; --steps takes a larger number" in refused.err
