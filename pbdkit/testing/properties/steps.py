@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 
 import numpy as np
@@ -17,11 +18,16 @@ from pbdkit.interfaces import (
     NeighbourMetric,
 )
 from pbdkit.results.moment import StateMoment
+from pbdkit.results.recorder import Recorder
+from pbdkit.results.sink import MemorySink
 from pbdkit.results.tables import Tables
+from pbdkit.runs.course import Run, record
+from pbdkit.runs.standing import standing_of, take_up
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
+from pbdkit.storage.standing import Standing
 from pbdkit.testing.properties.repetition import differing
 from pbdkit.testing.question import flat, measured_by
 from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
@@ -144,6 +150,35 @@ def continues_where_it_stopped(subject: Subject) -> None:
             other = measured_by(component, StateMoment(whole, Tables(scene)))
             for name in differing(other, one):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
+
+
+@asked_of(is_needed=True)
+def resumes(subject: Subject) -> None:
+    """A run that is stopped, kept as the run store keeps it, and gone on with by a component made
+    anew from its JSON records what one does that was never interrupted, to the last bit."""
+    component, scene = subject.component, subject.scene
+    anew = type(component).model_validate_json(component.model_dump_json(by_alias=True))
+    again = Subject(anew, subject.parts).scene
+    start, whole, parts = (
+        state_with(scene, displacements(scene, 5, share=0.4)),
+        MemorySink(),
+        MemorySink(),
+    )
+    record(Run(scene, start=start.copy()), whole)
+    left, recorder = Run(scene, start=start), Recorder(scene, parts)
+    recorder.begin()
+    for state in left:
+        recorder.observe(state)
+        if state.step >= STEPS - 1:
+            break
+    kept = standing_of(left.driver, recorder)
+    facts = json.loads(json.dumps(kept.facts))
+    rest, recorder = Run(again), Recorder(again, parts)
+    take_up(rest.driver, recorder, Standing(kept.about, facts, kept.copied().arrays))
+    record(rest, parts, recorder=recorder)
+    found, needed = (sink.dataset().variables for sink in (parts, whole))
+    for name in differing(dict(needed), dict(found)):
+        raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
 
 
 @asked_of(*STEPPED)
