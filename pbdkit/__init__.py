@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         load as load,
         rerun as rerun,
         run as run,
+        sweep as sweep,
     )
     from pbdkit.errors import (
         DivergedError as DivergedError,
@@ -89,7 +90,7 @@ _HOME = {
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",
-    "pbdkit.api": "analyse identify load rerun run",
+    "pbdkit.api": "analyse identify load rerun run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 

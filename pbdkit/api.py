@@ -24,6 +24,7 @@ from pbdkit.scene.scene import build_scene
 
 if TYPE_CHECKING:
     import xarray
+    from distributed import Client
 
     from pbdkit.identity.identity import Identity
 
@@ -113,6 +114,33 @@ def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
             whose = f"{name} {before}" if before else f"an unknown version of {name}"
             text = f"made by {whose}, run again by {now}: the result may differ"
             warnings.warn(text, PbdkitWarning, stacklevel=3)
+
+
+def sweep(
+    experiment: Given,
+    vary: Mapping[str, Any] | None = None,
+    together: Mapping[str, Any] | None = None,
+    replicates: int = 1,
+    keep: Mapping[str, Any] | None = None,
+    folder: str | Path | None = None,
+    workers: int | None = None,
+    client: Client | None = None,
+    progress: bool = True,
+) -> xarray.Dataset:
+    """Runs an experiment over the product of the values in `vary`, the lists in `together`, and
+    replicates with seeds of their own; returns one dataset with the parameters as dimensions.
+
+    The arguments are those of a sweep file, and so is what `pbdkit sweep` would write. `folder`
+    keeps what is finished: the same call again runs the rest. `workers` are processes of this
+    machine, as many as it has processors if None, this process alone if 1; `client` takes a dask
+    cluster instead. A member that fails is NaN in the dataset, which says why in `message`; warns
+    of it with pbdkit.PbdkitWarning. Raises ExperimentError and PluginError before anything runs.
+    """
+    from pbdkit.sweeps.calling import called
+
+    given = _experiment(experiment, ())
+    parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
+    return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
 
 
 def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:

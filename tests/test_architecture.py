@@ -20,6 +20,7 @@ ORDER = [
     "identity",
     "equilibrium",
     "runs",
+    "sweeps",
     "api",
     "bench",
     "testing",

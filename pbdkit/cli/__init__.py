@@ -16,6 +16,7 @@ from pbdkit.cli.options import with_no_plugins
 
 MODULES = {
     "run": "run",
+    "sweep": "sweep",
     "experiments": "check identify experiments init schema bench",
     "result": "plot explain verify",
     "plugins": "plugins",
@@ -72,7 +73,7 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
-    broken plugin, 4 diverged, 6 storage failed, 130 interrupted."""
+    broken plugin, 4 diverged, 5 part of a sweep failed, 6 storage failed, 130 interrupted."""
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]
