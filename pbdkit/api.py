@@ -24,7 +24,6 @@ from pbdkit.scene.scene import build_scene
 
 if TYPE_CHECKING:
     import xarray
-    from distributed import Client
 
     from pbdkit.identity.identity import Identity
 
@@ -124,7 +123,7 @@ def sweep(
     keep: Mapping[str, Any] | None = None,
     folder: str | Path | None = None,
     workers: int | None = None,
-    client: Client | None = None,
+    client: Any = None,
     progress: bool = True,
 ) -> xarray.Dataset:
     """Runs an experiment over the product of the values in `vary`, the lists in `together`, and

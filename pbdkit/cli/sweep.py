@@ -6,16 +6,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from distributed import Client
-
     from pbdkit.sweeps.course import Summary
 
 PATH = click.Path(path_type=Path)
+CONNECT_S = 10.0
 SHOWN = 20
 """So many failures are shown; `message` in the dataset has all."""
 
@@ -62,7 +61,7 @@ def _refuse_folder(folder: Path) -> None:
 
 
 @contextmanager
-def _client(address: str | None) -> Iterator[Client | None]:
+def _client(address: str | None) -> Iterator[Any]:
     """The cluster at that address, if there is to be one. Raises ExperimentError."""
     from pbdkit.errors import ExperimentError
 
@@ -71,11 +70,13 @@ def _client(address: str | None) -> Iterator[Client | None]:
         return
     try:
         from distributed import Client
+
+        connect: Any = Client
     except ImportError:
         what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
     try:
-        client = Client(address)
+        client = connect(address, timeout=CONNECT_S)
     except (OSError, ValueError, ImportError) as error:
         raise ExperimentError(f"--dask {address}: no scheduler answers: {error}") from None
     with client:
@@ -87,9 +88,7 @@ def _told(summary: Summary, folder: Path, quiet: bool) -> int:
     count, missing = len(summary.members), len(summary.members) - len(summary.ends)
     failures = summary.failures
     if summary.path is None:
-        what = (
-            f"interrupted: {count - missing} of {count} members are finished and kept in {folder}"
-        )
+        what = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
         click.echo(f"pbdkit: {what}; the same command goes on with the others", err=True)
         return 130
     if not quiet:
@@ -106,11 +105,14 @@ def _show(summary: Summary) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from pbdkit.cli.output import UNLIMITED
+
     failures = summary.failures
     table = Table("member", "status", "message", title=f"{len(failures)} members have no values")
     for member, status, message in failures[:SHOWN]:
         table.add_row(*map(Text, (member.words, status, message.splitlines()[0])))
-    Console(stderr=True, highlight=False).print(table)
+    width = None if sys.stderr.isatty() else UNLIMITED
+    Console(stderr=True, width=width, highlight=False).print(table)
     if len(failures) > SHOWN:
         more = f"and {len(failures) - SHOWN} more: `status` and `message` in {summary.path}"
         click.echo(more, err=True)

@@ -71,8 +71,8 @@ def _opened(file: Path) -> xarray.Dataset:
 def reading(path: str | Path) -> Iterator[xarray.Dataset]:
     """The dataset of a run in a result file, to be read from in the block.
 
-    Raises ExperimentError for that of a sweep, what `open` does, and StorageError for whatever reading and using its values raises:
-    files are sound when written.
+    Raises ExperimentError for that of a sweep, what `open` does, and StorageError for whatever
+    reading and using its values raises: files are sound when written.
     """
     with open(path) as dataset:
         if SWEEP in dataset.attrs:

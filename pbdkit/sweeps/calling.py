@@ -24,7 +24,6 @@ from pbdkit.sweeps.specification import checked
 
 if TYPE_CHECKING:
     import xarray
-    from distributed import Client
 
 
 def called(
@@ -32,7 +31,7 @@ def called(
     parts: dict[str, Any],
     folder: str | Path | None,
     workers: int | None,
-    client: Client | None,
+    client: Any,
     progress: bool,
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
@@ -44,9 +43,8 @@ def called(
             "have none; leave it out, or make a plugin of them (`pbdkit plugins new`)"
         )
     crew = crew_of(workers, client, given)
-    asked = Asked(
-        checked(parts | {"experiment": data}, Source()), Source(data=data), Source(), given
-    )
+    sweep = checked(parts | {"experiment": data}, Source())
+    asked = Asked(sweep, Source(data=data), Source(), given)
     with ExitStack() as ending:
         kept = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
         with progress_bar(progress) as show:
@@ -65,9 +63,7 @@ def called(
         return dataset
 
 
-def crew_of(
-    workers: int | None, client: Client | None, components: tuple[type[Component], ...] = ()
-) -> Crew:
+def crew_of(workers: int | None, client: Any, components: tuple[type[Component], ...] = ()) -> Crew:
     """Who runs the members. Raises ExperimentError where that cannot be."""
     if workers is not None and (type(workers) is not int or workers < 1):
         raise ExperimentError(f"workers: should be a number from 1, got {workers!r}")

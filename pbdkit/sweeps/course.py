@@ -6,7 +6,7 @@ import json
 import os
 import socket
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,7 +24,7 @@ from pbdkit.sweeps.joining import joined
 from pbdkit.sweeps.member import Asked, Member
 from pbdkit.sweeps.outlook import Outlook
 from pbdkit.sweeps.store import Store
-from pbdkit.sweeps.worker import WHOLE, Report
+from pbdkit.sweeps.worker import INTERRUPTED, WHOLE, Report
 
 if TYPE_CHECKING:
     import xarray
@@ -35,8 +35,8 @@ Show = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Summary:
-    """How a sweep went: the members by how they ended, how many were run now, what was found
-    damaged, and whether it came to its end; only then is there a dataset."""
+    """How a sweep went: its members, how those ended that did (status and message by key), how many
+    were run now, what was found damaged, and where the dataset is; None where it was stopped."""
 
     members: list[Member]
     ends: dict[str, tuple[str, str]]
@@ -46,10 +46,10 @@ class Summary:
 
     @property
     def failures(self) -> list[tuple[Member, str, str]]:
-        """The members whose values are missing, with status and message."""
-        every = ((member, *self.ends[member.job.key]) for member in self.members
-                 if member.job.key in self.ends)  # fmt: skip
-        return [(member, status, text) for member, status, text in every if status not in WHOLE]
+        """The members that ended without values, with status and message."""
+        ended = [member for member in self.members if member.job.key in self.ends]
+        every = [(member, *self.ends[member.job.key]) for member in ended]
+        return [entry for entry in every if entry[1] not in WHOLE]
 
 
 def carry_out(
@@ -63,41 +63,48 @@ def carry_out(
     grid, members, versions = _validated(asked, show)
     jobs = {member.job.key: member.job for member in members}
     with Store(folder) as store:
-        held, faults = store.held()
-        todo = [job for key, job in jobs.items() if key not in held]
+        ends, faults = store.held()
+        todo = [job for key, job in jobs.items() if key not in ends]
         passing: dict[str, Report] = {}
-        count = failed = 0
-        for report in crew.work(todo, stopping):
+        run = 0
+        for report in _heard(crew.work(todo, stopping), len(jobs), len(todo), show):
             store.commit_if_due()
-            if report is not None and report.status != "interrupted":
-                if report.lasting:
-                    store.put(report)
-                passing[report.key] = report._replace(content=b"")
-                count, failed = count + 1, failed + (report.status not in WHOLE)
-            what = f"{len(jobs) - len(todo) + count} of {len(jobs)} members"
-            show(what + f", {failed} failed" * bool(failed), count / max(1, len(todo)))
+            if report is None:
+                continue
+            if report.lasting:
+                store.put(report)
+            else:
+                passing[report.key] = report
+            ends[report.key], run = (report.status, report.message), run + 1
         store.commit()
+        if run < len(todo):
+            return Summary(members, ends, run, faults, None)
+        dataset = joined(grid, members, lambda key: passing.get(key) or store.report(key))
+        dataset.attrs = _attributes(asked, versions)
+        _write(dataset, folder / RESULT)
+    return Summary(members, ends, run, faults, folder / RESULT)
 
-        def report_of(key: str) -> Report:
-            report = passing.get(key)
-            return report if report and not report.lasting else store.report(key)
 
-        path = None
-        if count == len(todo):
-            dataset = joined(grid, members, report_of)
-            dataset.attrs = _attributes(asked, versions)
-            path = folder / RESULT
-            _write(dataset, path)
-        ends = {key: (r.status, r.message) for key in jobs if key in held or key in passing
-                for r in [passing.get(key) or store.report(key)]}  # fmt: skip
-        return Summary(members, ends, count, faults, path)
+def _heard(
+    reports: Iterator[Report | None], members: int, todo: int, show: Show
+) -> Iterator[Report | None]:
+    """The reports of all but interrupted members, with what whoever waits is told meanwhile."""
+    run = failed = 0
+    for report in reports:
+        if report is not None and report.status == INTERRUPTED:
+            continue
+        run, failed = run + bool(report), failed + bool(report and report.status not in WHOLE)
+        told = f"{members - todo + run} of {members} members"
+        show(told + (f", {failed} failed" if failed else ""), run / todo)
+        yield report
 
 
 def _validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
     """The grid, the members on it, and the versions of what they use."""
     experiment = asked.experiment()
     grid, outlook = asked.grid(experiment), Outlook(asked.sweep.keep, asked.sweep.count)
-    members, versions = [], {}
+    members: list[Member] = []
+    versions: dict[str, str] = {}
     try:
         for member, one in asked.members(grid, lambda share: show("validating", share)):
             outlook.look(one, member.words)

@@ -6,15 +6,12 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Component
 from pbdkit.sweeps.member import Job
 from pbdkit.sweeps.worker import LOST, Report, report_of, run_member, run_members
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 HANDED_OUT_S = 0.25
 """Members are handed out in chunks that take about so long."""
@@ -97,14 +94,15 @@ class Alone(Crew):
 class Cluster(Crew):
     """The workers of a dask cluster. Who can reach it can run code on it."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Any) -> None:
         self._client = client
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
         """Chunks as tasks, a few more than there are threads; those still out are cancelled where
         the work ends early. Raises ExperimentError where no worker is there."""
-        from distributed import wait
+        from distributed import wait as wait_for
 
+        wait: Any = wait_for
         try:
             self._client.wait_for_workers(1, timeout=WAIT_FOR_WORKERS_S)
         except TimeoutError:

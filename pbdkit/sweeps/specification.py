@@ -115,10 +115,10 @@ class Sweep(Strict):
     experiment: Annotated[
         Any, AfterValidator(_an_experiment), Field(json_schema_extra={"type": ["string", "object"]})
     ]
-    vary: dict[str, Values] = {}
-    together: dict[str, Values] = {}
+    vary: dict[str, Values] = Field(default_factory=dict)
+    together: dict[str, Values] = Field(default_factory=dict)
     replicates: Annotated[int, Field(ge=1, le=MOST_MEMBERS)] = 1
-    keep: Keep = Keep()
+    keep: Keep = Field(default_factory=Keep)
 
     @model_validator(mode="after")
     def _together(self) -> Self:

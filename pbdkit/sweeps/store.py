@@ -4,6 +4,7 @@ it. Nobody writes here but the process of the sweep."""
 from __future__ import annotations
 
 import os
+import re
 import socket
 import sqlite3
 import sys
@@ -11,9 +12,9 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from pbdkit.errors import StorageError
 from pbdkit.sweeps.worker import Report, digest_of
@@ -46,7 +47,7 @@ class Store:
     def __enter__(self) -> Self:
         """Creates the folder, locks it, and opens the database."""
         with self._storing():
-            (self._folder / LARGE).mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(parents=True, exist_ok=True)
             self._closing.callback(os.close, _locked(self._folder / LOCK))
         try:
             with self._storing():
@@ -56,20 +57,15 @@ class Store:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         """Keeps what was put, whatever ended the sweep."""
         with self._closing, self._storing():
             self._database.commit()
 
-    def held(self) -> tuple[set[str], list[str]]:
-        """The keys of all members that are held and sound; and what is said of those that are not,
-        which are removed."""
-        faults = []
+    def held(self) -> tuple[dict[str, tuple[str, str]], list[str]]:
+        """Status and message of all members that are held and sound, by key; and what is said of
+        those that are not, which are removed."""
+        faults, found = [], {}
         for row, report in self._all():
             if isinstance(report, str):
                 faults.append(f"{self._folder / DATABASE}: row {row} {report}; it runs again")
@@ -77,8 +73,9 @@ class Store:
                     self._database.execute("DELETE FROM member WHERE rowid = ?", (row,))
             else:
                 self._rows[report.key] = row
+                found[report.key] = (report.status, report.message)
         self.commit()
-        return set(self._rows), faults
+        return found, faults
 
     def put(self, report: Report) -> None:
         """Keeps a report; it is on the disk with the next commit."""
@@ -109,11 +106,7 @@ class Store:
     def report(self, key: str) -> Report:
         """What is held of a member; StorageError where it is not what was written."""
         row = self._rows[key]
-        with self._storing():
-            found = self._database.execute(
-                "SELECT * FROM member WHERE rowid = ?", (row,)
-            ).fetchone()
-            report = self._checked(found)
+        report = self._read(row)
         if isinstance(report, str):
             where = f"{self._folder / DATABASE}: row {row}"
             raise StorageError(f"{where} {report}; the same command runs that member again")
@@ -124,16 +117,18 @@ class Store:
         with self._storing():
             rows = [row for (row,) in self._database.execute("SELECT rowid FROM member")]
         for row in rows:
-            with self._storing():
-                query = "SELECT * FROM member WHERE rowid = ?"
-                found = self._database.execute(query, (row,)).fetchone()
-                report = self._checked(found)
-            yield row, report
+            yield row, self._read(row)
 
-    def _checked(self, row: tuple[str, str, str, int, bytes | None, bytes]) -> Report | str:
+    def _read(self, row: int) -> Report | str:
+        with self._storing():
+            query = "SELECT * FROM member WHERE rowid = ?"
+            return self._checked(self._database.execute(query, (row,)).fetchone())
+
+    def _checked(self, row: tuple[Any, ...] | None) -> Report | str:
+        """Whatever may stand in the row."""
         changed = "is not what was written"
-        key, status, message, large, content, digest = row
-        if not all(isinstance(text, str) for text in (key, status, message)):
+        key, status, message, large, content, digest = row or (None,) * 6
+        if not re.fullmatch("[0-9a-f]{32}", str(key)):
             return changed
         if large:
             try:
@@ -145,11 +140,12 @@ class Store:
         return Report(key, status, message, content, digest)
 
     def _file(self, key: str) -> Path:
-        return self._folder / LARGE / f"{key[:32]}.member"
+        return self._folder / LARGE / f"{key}.member"
 
     def _write(self, report: Report) -> None:
         """Under a name that no process on any machine has, then under its own."""
         path = self._file(report.key)
+        path.parent.mkdir(exist_ok=True)
         temporary = path.with_name(f".{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex}")
         try:
             with temporary.open("xb") as file:
@@ -166,6 +162,7 @@ class Store:
         new = not path.exists() or path.stat().st_size == 0
         self._database = database = sqlite3.connect(path)
         self._closing.callback(database.close)
+        database.text_factory = partial(str, encoding="utf-8", errors="replace")
         (owner,) = database.execute("PRAGMA application_id").fetchone()
         (form,) = database.execute("PRAGMA user_version").fetchone()
         if not new and (owner, form) != (APPLICATION, FORMAT):
