@@ -40,6 +40,7 @@ class Queue:
 
     jobs: deque[Job]
     workers: int
+    false_starts: int = 0
     _seconds: float = 0.0
     _count: int = 0
     _losses: dict[str, int] = field(default_factory=dict)

@@ -22,8 +22,8 @@ from pbdkit.sweeps.worker import Report, run_members
 
 GRACE_S = 2.0
 """Who is stopped waits so long for what is nearly done."""
-MOST_STARTS = 5
-"""Workers that end before they have begun, one after the other, are no chance."""
+MOST_STARTS = 10
+"""So many workers that end before they have begun, with nothing reported between, are no chance."""
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
@@ -73,7 +73,6 @@ class _Worker:
     def __init__(self) -> None:
         self.chunks: dict[Future[list[Report]], list[Job]] = {}
         self._pool: ProcessPoolExecutor | None = None
-        self._starts = 0
 
     def take(self, queue: Queue) -> bool:
         """Whether it could take the next chunk: not where it was killed and has still to say so."""
@@ -100,7 +99,7 @@ class _Worker:
             except BrokenProcessPool:
                 yield from self._killed(chunk, queue)
                 return
-            self._starts = 0
+            queue.false_starts = 0
             yield from queue.reported(reports)
 
     def end(self) -> None:
@@ -122,8 +121,8 @@ class _Worker:
             yield from queue.lost(chunk, "its process was killed, as where memory runs out,")
             return
         queue.jobs.extendleft(reversed(chunk))
-        self._starts += 1
-        if self._starts >= MOST_STARTS:
+        queue.false_starts += 1
+        if queue.false_starts >= MOST_STARTS:
             raise PbdkitError(
                 f"{MOST_STARTS} worker processes ended while they were starting; --workers 1 runs "
                 "the members in this process, and shows why"
