@@ -379,3 +379,25 @@ def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, mo
             (found,) = store._database.execute("PRAGMA journal_mode").fetchone()
             (synchronous,) = store._database.execute("PRAGMA synchronous").fetchone()
         assert (found, synchronous) == (journal, 2)
+
+
+def test_members_that_record_in_different_precision_lose_no_digits(small):
+    found = swept(small, vary={"record.dtype": ["float32", "float64"]})
+    alone = pbdkit.run(small, progress=False)
+    np.testing.assert_array_equal(found.position.isel(dtype=1), alone.position)
+    assert found.position.dtype == np.float64
+
+
+def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
+    small["diagnostics"] = [{"type": "track", "numbers": [9]}, {"type": "broken"}]
+    small["fracture"] = {"type": "threshold", "thresholds": [1.05]}
+    found = swept(small, vary={"body.columns": [4, 5], "steps": [4, 6]})
+    assert found.status.values.tolist() == [["complete"] * 2] * 2
+    assert found.track.dims == ("columns", "steps", "step", "tracked", "axis")
+    assert found.track.sel(steps=4, step=6).isnull().all()
+    for n in (4, 5):
+        small["body"]["columns"] = n
+        alone = pbdkit.run(small | {"steps": 6}, progress=False)
+        member = found.sel(columns=n, steps=6).isel(bond=slice(alone.sizes["bond"]))
+        np.testing.assert_array_equal(member.broken_step, alone.broken_step)
+        np.testing.assert_array_equal(member.broken_bonds, alone.broken_bonds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from math import prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,28 +62,33 @@ class _Frame:
 
     def __init__(self) -> None:
         self._first: dict[str, Variable] = {}
-        self._labels: dict[str, dict[Any, None]] = {}
+        self._dtypes: dict[str, np.dtype[Any]] = {}
+        self._labels: dict[str, dict[Any, int]] = {}
         self._sizes: dict[str, int] = {}
-        self._digests: dict[str, set[bytes]] = {}
-        self._holders: dict[str, int] = {}
+        self._seen: dict[str, list[bytes]] = {}
         self._members = 0
         self.described: list[tuple[str, tuple[str, ...], dict[str, Any]]] = []
 
     def look(self, variables: dict[str, Variable]) -> None:
-        """At the variables of one more member."""
+        """At the variables of one more member. Raises ExperimentError where one of them has other
+        dimensions than in another member."""
         self._members += 1
         for name, variable in variables.items():
-            self._first.setdefault(name, variable)
-            self._holders[name] = self._holders.get(name, 0) + 1
+            first, kind = self._first.setdefault(name, variable), variable.values.dtype
+            if variable.dims != first.dims:
+                raise ExperimentError(
+                    f"'{name}' has the dimensions {variable.dims} in some members and {first.dims} "
+                    "in others, and cannot be joined; list others in keep.variables"
+                )
+            self._dtypes[name] = np.promote_types(kind, self._dtypes.get(name, kind))
             for dim, size in zip(variable.dims, variable.values.shape, strict=True):
                 self._sizes[dim] = max(size, self._sizes.get(dim, 0))
             if variable.dims == (name,):
-                labels = self._labels.setdefault(name, {})
-                labels |= dict.fromkeys(variable.values.tolist())
+                self._labels.setdefault(name, {}).update(dict.fromkeys(variable.values.tolist(), 0))
             if variable.fixed:
-                digest = xxhash.xxh3_128_digest(np.ascontiguousarray(variable.values).tobytes())
-                own = [digest, *(_digest(variables[d]) for d in variable.dims if d in variables)]
-                self._digests.setdefault(name, set()).add(b"".join(own))
+                along = (variables[dim] for dim in variable.dims if dim in variables)
+                said = b"".join(map(_digest, (variable, *along)))
+                self._seen.setdefault(name, []).append(said)
 
     @property
     def coordinates(self) -> list[str]:
@@ -90,65 +96,54 @@ class _Frame:
         return [name for name, variable in self._first.items() if variable.coordinate]
 
     def arrays(self, shape: tuple[int, ...], dims: tuple[str, ...]) -> dict[str, Array]:
-        """Empty ones of each variable. Raises ExperimentError where they do not fit into memory."""
-        for name, labels in self._labels.items():
-            ordered = sorted(labels) if self._first[name].values.dtype.kind in "iuf" else labels
-            self._labels[name] = dict.fromkeys(ordered)
-            self._sizes[name] = len(labels)
-        shapes = {}
+        """Empty ones of each variable, and the labels. Raises ExperimentError where they do not fit
+        into memory."""
+        for name, found in self._labels.items():
+            ordered = sorted(found) if self._dtypes[name].kind in "iuf" else found
+            self._labels[name] = {label: n for n, label in enumerate(ordered)}
+            self._sizes[name] = len(found)
+        shapes: dict[str, tuple[int, ...]] = {}
         for name, variable in self._first.items():
+            varies, kind = self._varies(name), self._dtypes[name]
             own = tuple(self._sizes[dim] for dim in variable.dims)
-            varies = self._varies(name)
             shapes[name] = (*shape, *own) if varies else own
-            filled = {FILL: _empty(variable.values.dtype)} if varies and _whole(variable) else {}
-            all_dims = (*dims, *variable.dims) if varies else variable.dims
-            self.described.append((name, all_dims, variable.attributes | filled))
-        items = (int(np.prod(s, dtype=object)) * self._first[n].values.dtype.itemsize
-                 for n, s in shapes.items())  # fmt: skip
-        if (size := sum(items)) > machine_memory():
+            filled = {FILL: _empty(kind)} if varies and kind.kind in "iu" else {}
+            named = (*dims, *variable.dims) if varies else variable.dims
+            self.described.append((name, named, variable.attributes | filled))
+        size = sum(prod(one) * self._dtypes[name].itemsize for name, one in shapes.items())
+        if size > machine_memory():
             raise ExperimentError(
                 f"the dataset of all members takes {size / 2**30:.3g} GiB, more than this machine "
                 "has; keep fewer variables or times, with which members run again"
             )
-        arrays = {
-            name: np.full(s, _empty(self._first[name].values.dtype), self._first[name].values.dtype)
-            for name, s in shapes.items()
-        }
-        return arrays | {n: np.array(list(labels)) for n, labels in self._labels.items()}
+        kinds = self._dtypes
+        arrays = {n: np.full(one, _empty(kinds[n]), kinds[n]) for n, one in shapes.items()}
+        return arrays | {name: np.array(list(found)) for name, found in self._labels.items()}
 
     def place(
         self, variables: dict[str, Variable], where: tuple[int, ...], arrays: dict[str, Array]
     ) -> None:
         """Puts the variables of one member to where they belong."""
-        along = {name: self._positions(name, variables) for name in self._labels}
+        along = {
+            name: np.array([found[label] for label in variables[name].values.tolist()], int)
+            for name, found in self._labels.items()
+            if name in variables
+        }
         for name, (dims, values, *_) in variables.items():
-            if name in self._labels:
-                continue
-            rows = [along.get(d, np.arange(n)) for d, n in zip(dims, values.shape, strict=True)]
-            target = arrays[name][where] if self._varies(name) else arrays[name]
-            if dims:
-                target[np.ix_(*rows)] = values
-            else:
-                arrays[name][where if self._varies(name) else ()] = values
-
-    def _positions(self, name: str, variables: dict[str, Variable]) -> Array:
-        if name not in variables:
-            return np.zeros(0, int)
-        place = {label: n for n, label in enumerate(self._labels[name])}
-        return np.array([place[label] for label in variables[name].values.tolist()], int)
+            if name not in self._labels:
+                before = where if self._varies(name) else ()
+                rows = [along.get(d, np.arange(n)) for d, n in zip(dims, values.shape, strict=True)]
+                arrays[name][(*before, ...)][np.ix_(*rows) if dims else ...] = values
 
     def _varies(self, name: str) -> bool:
         """Whether each member has values of its own; labels of a dimension are joined instead."""
-        alike = len(self._digests.get(name, ())) == 1 and self._holders[name] == self._members
+        seen = self._seen.get(name, [])
+        alike = len(set(seen)) == 1 and len(seen) == self._members
         return name not in self._labels and not alike
 
 
 def _digest(variable: Variable) -> bytes:
     return xxhash.xxh3_128_digest(np.ascontiguousarray(variable.values).tobytes())
-
-
-def _whole(variable: Variable) -> bool:
-    return variable.values.dtype.kind in "iu"
 
 
 def _empty(dtype: np.dtype[Any]) -> Any:
