@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import xarray
+from reliability.sweep_under_fire import under_fire
 
 import pbdkit
 from pbdkit.sweeps import store as stores
@@ -401,3 +402,8 @@ def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
         member = found.sel(columns=n, steps=6).isel(bond=slice(alone.sizes["bond"]))
         np.testing.assert_array_equal(member.broken_step, alone.broken_step)
         np.testing.assert_array_equal(member.broken_bonds, alone.broken_bonds)
+
+
+def test_under_fire(tmp_path):
+    found = under_fire(tmp_path, members=24, kills=1, workers=2)
+    assert found == {"exit": 0, "killed": 1, "right": 24, "wrong": 0, "run again": 0}

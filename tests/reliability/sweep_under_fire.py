@@ -61,14 +61,14 @@ def held(folder: Path) -> int:
         return 0
 
 
-def under_fire(folder: Path, members: int, kills: int, seed: int = 0) -> dict[str, Any]:
+def under_fire(folder: Path, members: int, kills: int, workers: int) -> dict[str, Any]:
     """Sweeps twice, disturbed and not; what came of it."""
-    chance, vary = random.Random(seed), {"seed": list(range(members))}
+    chance, vary = random.Random(0), {"seed": list(range(members))}
     sweep = {"version": 1, "experiment": SHEET, "vary": vary, "keep": KEEP}
     path = folder / "sweep.json"
     path.write_text(json.dumps(sweep))
     line = [sys.executable, "-m", "pbdkit", "sweep", str(path), "-o", str(folder / "fire")]
-    running = subprocess.Popen([*line, "--workers", str(WORKERS), "--quiet"])
+    running = subprocess.Popen([*line, "--workers", str(workers), "--quiet"])
     killed, due = 0, sorted(chance.sample(range(int(0.9 * members)), kills))
     while running.poll() is None and killed < kills:
         time.sleep(chance.uniform(0, 2 * PATIENCE_S))
@@ -92,7 +92,7 @@ def under_fire(folder: Path, members: int, kills: int, seed: int = 0) -> dict[st
 def main() -> None:
     """Prints goal and measured."""
     with tempfile.TemporaryDirectory() as folder:
-        found = under_fire(Path(folder), members=1000, kills=20)
+        found = under_fire(Path(folder), members=1000, kills=20, workers=WORKERS)
     goal = {"exit": 0, "killed": 20, "right": 1000, "wrong": 0, "run again": 0}
     for what, wanted in goal.items():
         print(f"{what:<10} goal {wanted:>5}  measured {found[what]:>5}")
