@@ -131,9 +131,9 @@ class _Frame:
         }
         for name, (dims, values, *_) in variables.items():
             if name not in self._labels:
-                before = where if self._varies(name) else ()
+                at: Any = (*where, ...) if self._varies(name) else ...  # a view, in any case
                 rows = [along.get(d, np.arange(n)) for d, n in zip(dims, values.shape, strict=True)]
-                arrays[name][(*before, ...)][np.ix_(*rows) if dims else ...] = values
+                arrays[name][at][np.ix_(*rows) if dims else ...] = values
 
     def _varies(self, name: str) -> bool:
         """Whether each member has values of its own; labels of a dimension are joined instead."""
