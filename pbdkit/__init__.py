@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         rerun as rerun,
         resume as resume,
         run as run,
+        sweep as sweep,
     )
     from pbdkit.errors import (
         DivergedError as DivergedError,
@@ -90,7 +91,7 @@ _HOME = {
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",
-    "pbdkit.api": "analyse identify load rerun resume run",
+    "pbdkit.api": "analyse identify load rerun resume run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 

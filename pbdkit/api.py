@@ -142,6 +142,33 @@ def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
             warnings.warn(text, PbdkitWarning, stacklevel=3)
 
 
+def sweep(
+    experiment: Given,
+    vary: Mapping[str, Any] | None = None,
+    together: Mapping[str, Any] | None = None,
+    replicates: int = 1,
+    keep: Mapping[str, Any] | None = None,
+    folder: str | Path | None = None,
+    workers: int | None = None,
+    client: Any = None,
+    progress: bool = True,
+) -> xarray.Dataset:
+    """Runs an experiment over the product of the values in `vary`, the lists in `together`, and
+    replicates with seeds of their own; returns one dataset with the parameters as dimensions.
+
+    The arguments are those of a sweep file, and so is what `pbdkit sweep` would write. `folder`
+    keeps what is finished: the same call again runs the rest. `workers` are processes of this
+    machine, as many as it has processors if None, this process alone if 1; `client` takes a dask
+    cluster instead. A member that fails is NaN in the dataset, which says why in `message`; warns
+    of it with pbdkit.PbdkitWarning. Raises ExperimentError and PluginError before anything runs.
+    """
+    from pbdkit.sweeps.calling import called
+
+    given = _experiment(experiment, ())
+    parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
+    return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
+
+
 def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
     """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
     it wants components that are not there."""

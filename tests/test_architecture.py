@@ -21,6 +21,7 @@ ORDER = [
     "identity",
     "equilibrium",
     "runs",
+    "sweeps",
     "api",
     "bench",
     "testing",

@@ -27,10 +27,15 @@ def blocks(language):
     ]
 
 
+def is_sweep(code):
+    return re.search("^experiment:", code, re.M) is not None
+
+
 def save_experiments(page):
-    """The page's own experiments, each as NAME.yaml in the current folder."""
+    """The page's own experiments, each as NAME.yaml in the current folder, and its sweeps, which
+    say in their first line what they are called."""
     for code in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S):
-        (name,) = re.findall(r"^name: (\S+)", code, re.M)
+        (name,) = re.findall(r"\A# (\S+)\.yaml" if is_sweep(code) else r"(?m)^name: (\S+)", code)
         Path(f"{name}.yaml").write_text(code)
 
 
@@ -47,6 +52,9 @@ def test_python_runs(page, code, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
 def test_experiments_run(page, code):
+    if is_sweep(code):
+        assert f"$ pbdkit sweep {code.split()[1]}" in page.read_text()
+        return
     experiment = pbdkit.Experiment.build(read_text(code, page.name))
     assert pbdkit.run(experiment, progress=False).attrs["status"] in ("complete", "settled")
 

@@ -1,8 +1,11 @@
 """Kernels that are kept: what lies damaged or is not ours alone is never run, and never a fault of
 the rule."""
 
+import json
 import os
 import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -154,3 +157,24 @@ def test_what_a_rule_raises_while_kernels_are_made_is_the_rules(initial):
     scene = build_scene(pbdkit.Experiment(**SHEET | {"rule": Raises(), "initial": start}))
     with pytest.raises(pbdkit.PluginError, match=r"FollowerRule 'raises' failed .*too much"):
         CompiledStepper(scene)
+
+
+def test_of_those_who_want_the_same_kernel_one_makes_it(cache, monkeypatch):
+    made = []
+
+    def make(source, folder, names, arguments):
+        made.append(folder)
+        time.sleep(0.2)
+        folder.mkdir()
+        (folder / kernel_cache.SOURCE).write_text(source)
+        digests = json.dumps(kernel_cache._digests(folder))
+        (folder / kernel_cache.DIGESTS).write_text(digests)
+        return "kernel"
+
+    monkeypatch.setattr(kernel_cache, "_made", make)
+    monkeypatch.setattr(kernel_cache, "_ready", lambda *given: "kernel")
+    with ThreadPoolExecutor(4) as several:  # each opens the lock by itself, as processes do
+        found = [several.submit(kernel_cache._kept, "x = 1", "key", {}, ()) for _ in range(4)]
+    assert [future.result() for future in found] == ["kernel"] * 4
+    assert len(made) == 1
+    assert [path.name for path in cache.iterdir()] == ["kernel_key"]

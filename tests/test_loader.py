@@ -24,6 +24,7 @@ HEALTHY = "--set=rule={type: zz-healthy}"
 TEARING = "--set=fracture={type: strain, failure: 0.05}"
 EVERY_COMMAND = {
     "run": ["run", "e.json", HEALTHY, TEARING, "-o", "torn.nc"],
+    "sweep": ["sweep", "s.json", "--workers", "1"],
     "check": ["check", "e.json", HEALTHY],
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
@@ -56,6 +57,7 @@ def test_all_broken_plugins_together_stop_no_command(
     install: Install, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = ("numpy", "float64", 1)
+    Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
     monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [one])  # is enough
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
@@ -78,6 +80,7 @@ def test_no_broken_plugin_stops_a_command(
     install: Install, call: Call, source: str, reason: str
 ) -> None:
     install("pbdkit-broken", source, "0.3")
+    Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
     assert {name: r for name in CHEAP if (r := call(*EVERY_COMMAND[name])).code} == {}
     table = " ".join(call("plugins", "list").out.split())
     assert f"pbdkit-broken 0.3 broken {reason}" in table

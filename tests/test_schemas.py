@@ -9,15 +9,20 @@ import pytest
 import pbdkit
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.shipped import read_experiment, shipped_names
+from pbdkit.experiment.source import read_file
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
+from pbdkit.sweeps.specification import sweep_schema
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 EXPERIMENT = experiment_schema(Registry(), installed=False)
 DATASET = dataset_schema(Registry(), installed=False)
+SWEEP = sweep_schema()
 
 
-@pytest.mark.parametrize(("name", "schema"), [("experiment", EXPERIMENT), ("dataset", DATASET)])
+@pytest.mark.parametrize(
+    ("name", "schema"), [("experiment", EXPERIMENT), ("dataset", DATASET), ("sweep", SWEEP)]
+)
 def test_committed_schema_is_current(name, schema):
     committed = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
     assert committed == json.loads(json.dumps(schema)), "make it anew, see CONTRIBUTING.md"
@@ -55,3 +60,12 @@ def test_the_schema_refuses_what_the_program_refuses(path, value):
         jsonschema.validate(data, EXPERIMENT)
     with pytest.raises(pbdkit.ExperimentError):
         pbdkit.Experiment(**data)
+
+
+def test_the_schema_of_sweeps_describes_what_is_taken():
+    shipped = SCHEMAS.parent / "docs" / "stability-map.yaml"
+    sweep = read_file(shipped).data
+    jsonschema.validate(sweep, SWEEP)
+    for wrong in ({"varry": {}}, {"keep": {"times": "lost"}}, {"replicates": 0}, {"experiment": 3}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(sweep | wrong, SWEEP)

@@ -16,6 +16,7 @@ from pbdkit.cli.options import with_no_plugins
 
 MODULES = {
     "run": "run resume",
+    "sweep": "sweep",
     "experiments": "check identify experiments init schema bench",
     "result": "plot explain status verify",
     "plugins": "plugins",
@@ -72,8 +73,8 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
-    broken plugin, 4 diverged, 6 storage failed, 130 interrupted, 128 and the number of another
-    signal."""
+    broken plugin, 4 diverged, 5 part of a sweep failed, 6 storage failed, 130 interrupted, 128
+    and the number of another signal."""
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]

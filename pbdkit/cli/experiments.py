@@ -40,16 +40,21 @@ def init(file: Path) -> None:
 
 
 @click.command()
-@click.argument("what", type=click.Choice(["experiment", "dataset"]), default="experiment")
+@click.argument("what", type=click.Choice(["experiment", "dataset", "sweep"]), default="experiment")
 @click.option("--builtin", is_flag=True, help="Leave third-party components out.")
 def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments or datasets, closed over what is installed."""
+    """Print the JSON Schema of experiments, datasets or sweeps, closed over what is installed."""
     from pbdkit.experiment.schema import experiment_schema
     from pbdkit.registry.registry import Registry
     from pbdkit.results.layout import dataset_schema
+    from pbdkit.sweeps.specification import sweep_schema
 
-    make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
-    click.echo(json.dumps(make(Registry(), installed=not builtin), indent=2))
+    if what == "sweep":
+        made = sweep_schema()
+    else:
+        make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
+        made = make(Registry(), installed=not builtin)
+    click.echo(json.dumps(made, indent=2))
 
 
 @click.command()

@@ -199,12 +199,19 @@ def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> S
     path, equals, value = setting.partition("=")
     if not equals or not path:
         raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
+    return with_value(source, path, _read(value, Source(label)), label, defaults)
+
+
+def with_value(
+    source: Source, path: str, value: Any, label: str, defaults: Mapping[str, Any]
+) -> Source:
+    """The same of a value that is none of YAML; `label` is what messages call its place."""
     where = tuple(
         int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in path.split(".")
     )
     places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
     changed = Source(source.name, copy.deepcopy(source.data), places)
-    _place(changed.data, where, _read(value, Source(label)), label, defaults)
+    _place(changed.data, where, value, label, defaults)
     for depth in range(1, len(where) + 1):
         changed.places.setdefault(where[:depth], label)
     return changed

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import EntryPoint, distribution, distributions
+from importlib.metadata import Distribution, EntryPoint, distribution, distributions
 from pathlib import PurePath
+from typing import Any
 
 import pluggy
 
@@ -108,19 +110,28 @@ def installed_plugins() -> list[Plugin]:
     for each in distributions():
         try:
             if f"[{GROUP}]" in (each.read_text("entry_points.txt") or ""):
-                names.add(canonical(each.metadata["Name"] or ""))
+                names.add(canonical(_field(each, "Name")))
         except Exception as error:
             folder = PurePath(str(getattr(each, "_path", "(no name)"))).name
             found.append(_torn(folder, error))
     for name in sorted(names - {BUILTIN}):
         try:
             own = distribution(name)
-            what = own.metadata["Name"], own.metadata["Version"] or ""
+            what = _field(own, "Name"), _field(own, "Version")
             points = own.entry_points.select(group=GROUP)
             found += [_wanted(Plugin(point.name, *what, point)) for point in points]
         except Exception as error:
             found.append(_torn(name or "(no name)", error))
     return sorted(found, key=lambda plugin: (plugin.distribution, plugin.name))
+
+
+def _field(own: Distribution, name: str) -> str:
+    """Of the metadata; empty where it is missing, whether Python reads them or the backport
+    importlib_metadata, which takes its place once anybody imports it, and then raises."""
+    metadata: Any = None
+    with suppress(FileNotFoundError):
+        metadata = own.metadata
+    return (metadata and metadata.get(name)) or ""
 
 
 def _torn(distribution: str, error: Exception) -> Plugin:

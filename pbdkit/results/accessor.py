@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SWEEP = "sweep"
+"""The attribute that only datasets of sweeps have."""
 UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
 
 
@@ -83,12 +85,17 @@ def _unfinished(file: Path) -> Path | None:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[xarray.Dataset]:
-    """The dataset in a result file, to be read from in the block.
+    """The dataset of a run in a result file, to be read from in the block.
 
-    Raises what `open` does, and StorageError for whatever reading and using its values raises:
-    files are sound when written.
+    Raises ExperimentError for that of a sweep, what `open` does, and StorageError for whatever
+    reading and using its values raises: files are sound when written.
     """
     with open(path) as dataset:
+        if SWEEP in dataset.attrs:
+            raise ExperimentError(
+                f"{path}: holds all members of a sweep, and this looks at one run; in Python, "
+                "pbdkit.open(...) and isel pick what is to be drawn"
+            )
         try:
             yield dataset
         except BrokenSealError:
@@ -116,6 +123,9 @@ def _fault(dataset: xarray.Dataset) -> str | None:
             f"has schema_version {version}, and this pbdkit reads up to {SCHEMA_VERSION}; "
             "install a newer pbdkit"
         )
+    if SWEEP in dataset.attrs:
+        missing = [name for name in ("status", "message") if name not in dataset.variables]
+        return f"has no variable '{missing[0]}': it is damaged, or was changed" if missing else None
     for column in base_columns():
         dims = dataset[column.name].dims if column.name in dataset.variables else None
         if dims != column.dims:

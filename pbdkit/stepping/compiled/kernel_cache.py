@@ -15,7 +15,8 @@ import shutil
 import sys
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -79,24 +80,51 @@ def _kept(source: str, key: str, names: dict[str, Any], arguments: tuple[Any, ..
     if (cache := cache_folder()) is None:
         return None
     folder = cache / f"kernel_{key}"
-    if _is_whole(folder):
-        try:
-            return _ready(source, names, arguments, folder)
-        except Exception:  # what lies there is of no use, whatever it says: it is made anew
-            pass
     try:
-        with tempfile.TemporaryDirectory(dir=cache, prefix=".making-") as name:
-            made = Path(name) / folder.name
-            made.mkdir()
-            (made / SOURCE).write_text(source, encoding="utf-8")
-            run = _ready(source, names, arguments, made)
-            (made / DIGESTS).write_text(json.dumps(_digests(made)), encoding="utf-8")
-            if not _is_whole(folder):  # nobody else has been quicker
-                shutil.rmtree(folder, ignore_errors=True)
-                made.replace(folder)
-            return run
+        if found := _found(source, folder, names, arguments):
+            return found
+        with _alone(cache / f".{key}"):  # whoever wants the same meanwhile finds it then
+            found = _found(source, folder, names, arguments)
+            return found or _made(source, folder, names, arguments)
     except (OSError, pickle.PicklingError):
         return None
+
+
+def _found(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
+    """The kernel in a folder; None where what lies there is of no use, whatever it says."""
+    if _is_whole(folder):
+        with suppress(Exception):
+            return _ready(source, names, arguments, folder)
+    return None
+
+
+def _made(source: str, folder: Path, names: dict[str, Any], arguments: tuple[Any, ...]) -> Any:
+    """A new one, laid into the folder."""
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".making-") as name:
+        made = Path(name) / folder.name
+        made.mkdir()
+        (made / SOURCE).write_text(source, encoding="utf-8")
+        run = _ready(source, names, arguments, made)
+        (made / DIGESTS).write_text(json.dumps(_digests(made)), encoding="utf-8")
+        if not _is_whole(folder):  # nobody else has been quicker
+            shutil.rmtree(folder, ignore_errors=True)
+            made.replace(folder)
+        return run
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """One process at a time, of those of one machine, so that none makes a kernel
+    that another is making; where files cannot be locked, all at once."""
+    with path.open("w") as file:
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def _is_whole(folder: Path) -> bool:

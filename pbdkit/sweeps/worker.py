@@ -1,0 +1,170 @@
+"""Runs one member wherever it is asked to, and reports what came of it: never an exception."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import numpy as np
+import xxhash
+from threadpoolctl import threadpool_limits
+
+from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import Component
+from pbdkit.registry.blame import worded
+from pbdkit.results.layout import Column, Values, When
+from pbdkit.results.progress import Watch
+from pbdkit.results.sink import Sink
+from pbdkit.runs.course import Run, record
+from pbdkit.scene.scene import build_scene
+from pbdkit.sweeps.content import Variable, packed, variable_of
+from pbdkit.sweeps.member import Job
+
+WHOLE = ("complete", "settled")
+"""The status of members whose values are in the dataset."""
+FAILED, INTERRUPTED, LOST = "failed", "interrupted", "lost"
+"""The status of one that could not be run, and of those that the machine did not let end."""
+_one_at_a_time = threading.Lock()
+"""Threads of one process, as a dask worker may have, take turns: warnings and the threads of linear
+algebra belong to the process."""
+
+
+class Report(NamedTuple):
+    """What came of a member: `message` says why it failed, or what its run warned of. `digest` is
+    that of all the rest; `lasting` whether another attempt would come to the same."""
+
+    key: str
+    status: str
+    message: str
+    content: bytes
+    digest: bytes
+    lasting: bool = True
+    seconds: float = 0.0
+
+
+def report_of(
+    key: str, status: str, message: str, content: bytes = b"", lasting: bool = True, **more: Any
+) -> Report:
+    """The report with its digest."""
+    whole = digest_of(key, status, message, content)
+    return Report(key, status, message, content, whole, lasting, **more)
+
+
+def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
+    """Of a whole report."""
+    found = xxhash.xxh3_128(json.dumps([key, status, message]).encode())
+    found.update(content)
+    return found.digest()
+
+
+class KeptSink(Sink):
+    """Takes of a run what is kept of it."""
+
+    def __init__(self, variables: Iterable[str] | None, times: str | tuple[int, ...]) -> None:
+        self._wanted = None if variables is None else set(variables)
+        self._times = times
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """Coordinates come along with the variables whose dimensions they describe."""
+        self.columns, self.sizes = kept_columns(columns, self._wanted), sizes
+        self._entries: dict[str, list[Any]] = {name: [] for name in self.columns}
+
+    def put(self, values: Values) -> None:
+        """Keeps what is wanted of it."""
+        for name in values.keys() & self._entries.keys():
+            self._entries[name].append(values[name])
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """There is no more."""
+
+    def abandon(self) -> None:
+        """Forgets everything."""
+        self._entries = {}
+
+    def content(self) -> bytes:
+        """What is kept, as bytes."""
+        return packed({name: self._variable(column) for name, column in self.columns.items()})
+
+    def _variable(self, column: Column) -> Variable:
+        entries = self._entries[column.name]
+        if not column.grows:
+            dtype = None if column.dtype == "str" else column.dtype
+            values = np.asarray(entries[0] if entries else [], dtype)
+            return variable_of(column, values, column.when is When.START)
+        if column.dims[0] == "time" and self._times != "all":
+            last = self._times == "last"
+            steps = self._entries["time"]
+            entries = (
+                entries[-1:]
+                if last
+                else [
+                    entry for step, entry in zip(steps, entries, strict=True) if step in self._times
+                ]
+            )
+        shape = (len(entries), *(self.sizes[d] for d in column.dims[1:]))
+        return variable_of(column, np.array(entries, column.dtype).reshape(shape), False)
+
+
+def kept_columns(columns: list[Column], wanted: set[str] | None) -> dict[str, Column]:
+    """The columns of that name, and the coordinates of their dimensions."""
+    chosen = [c for c in columns if wanted is None or c.name in wanted]
+    dims = {dim for column in chosen for dim in column.dims}
+    return {c.name: c for c in columns if c in chosen or (c.coordinate and {*c.dims} <= dims)}
+
+
+def run_members(jobs: list[Job]) -> list[Report]:
+    """One after the other."""
+    return [run_member(job) for job in jobs]
+
+
+def run_member(
+    job: Job,
+    components: Iterable[type[Component]] = (),
+    stopping: Callable[[], bool] = lambda: False,
+) -> Report:
+    """Runs a member on one thread; what it raises becomes a report of the status `failed`."""
+    begun, sink = time.perf_counter(), KeptSink(job.variables, job.times)
+    content, lasting = b"", False
+    with _one_at_a_time, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what a run warns of is in its message
+        try:
+            experiment = Experiment.build(Source(data=json.loads(job.experiment)), components)
+            _refuse_other_versions(job, experiment)
+            if not experiment.solver.makes_steps:
+                import scipy.linalg  # noqa: F401  # so that its threads are known, and limited
+            with threadpool_limits(1):
+                status, message = _ran(experiment, sink, stopping)
+            lasting = status != INTERRUPTED
+            content = sink.content() if status in WHOLE else b""
+        except ExperimentError as error:
+            status, message, lasting = FAILED, str(error), True
+        except PbdkitError as error:
+            status, message = FAILED, str(error)
+        except (Exception, SystemExit) as error:
+            status, message = FAILED, worded(error)
+    seconds = time.perf_counter() - begun
+    return report_of(job.key, status, message, content, lasting, seconds=seconds)
+
+
+def _ran(experiment: Experiment, sink: KeptSink, stopping: Callable[[], bool]) -> tuple[str, str]:
+    """Status and message of the run."""
+    run = Run(build_scene(experiment), watch=Watch(stopping))
+    said = run.warnings
+    report = record(run, sink)
+    status, reason = report.outcome.status, report.outcome.stop_reason
+    return status, "; ".join((*said, *report.warnings)) if status in WHOLE else reason
+
+
+def _refuse_other_versions(job: Job, experiment: Experiment) -> None:
+    """Raises PluginError: a machine of a cluster may have other versions than the sweep's own."""
+    here = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    if here != job.versions:
+        told = [f"{k} {here.get(k)}, not {v}" for k, v in job.versions.items() if here.get(k) != v]
+        raise PluginError(f"the worker has {', '.join(told)}; install the same versions there")

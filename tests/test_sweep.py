@@ -1,0 +1,409 @@
+"""Sweeps: the same numbers whoever runs the members, each once, and nobody stopped by another."""
+
+import json
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import xarray
+from reliability.sweep_under_fire import under_fire
+
+import pbdkit
+from pbdkit.sweeps import store as stores
+from pbdkit.sweeps.crew import Alone
+from pbdkit.sweeps.grid import replicate_seeds
+from pbdkit.sweeps.processes import Processes
+
+VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
+
+
+@pytest.fixture
+def small(tensile):
+    """The tensile experiment with noise at the start, so that seeds matter."""
+    noise = {"type": "noise", "amplitude": 0.1}
+    return tensile | {"diagnostics": [{"type": "pe1"}], "initial": noise}
+
+
+@pytest.fixture
+def run_only(monkeypatch):
+    """The keys of the members that are run, in this process or by workers."""
+    seen = []
+    for crew in (Alone, Processes):
+        original = crew.work
+
+        def work(self, jobs, stopping, original=original):
+            for report in original(self, jobs, stopping):
+                seen.extend([report.key] if report else [])
+                yield report
+
+        monkeypatch.setattr(crew, "work", work)
+    return seen
+
+
+def swept(experiment, **more):
+    return pbdkit.sweep(experiment, progress=False, **({"workers": 1} | more))
+
+
+def same(one, other):
+    """Bit for bit, NaN too, but for the time of day."""
+    xarray.testing.assert_identical(*(ds.drop_attrs(deep=False) for ds in (one, other)))
+    for name in one.variables:
+        if one[name].dtype.kind == "f":
+            assert one[name].values.tobytes() == other[name].values.tobytes()
+
+
+def test_serial_processes_and_dask_give_the_same_bits(small):
+    from distributed import Client
+
+    asked = {"vary": VARY, "replicates": 2}
+    serial = swept(small, **asked)
+    same(serial, swept(small, **asked, workers=2))
+    with Client(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as client:
+        same(serial, pbdkit.sweep(small, **asked, client=client, progress=False))
+
+
+def test_members_are_the_runs_of_their_experiments(small):
+    found = swept(small, vary=VARY)
+    assert found.position.dims == ("relaxation", "columns", "time", "particle", "axis")
+    for w in (0.5, 1.0):
+        for n in (4, 5):
+            small["solver"] = {"type": "stepping", "relaxation": w}
+            small["body"]["columns"] = n
+            alone = pbdkit.run(small, progress=False)
+            member = found.sel(relaxation=w, columns=n)
+            count = alone.sizes["particle"]
+            for name in ("position", "pe1", "kind", "reference"):
+                np.testing.assert_array_equal(member[name].isel(particle=slice(count)), alone[name])
+                beyond = member[name].isel(particle=slice(count, None)).values
+                missing = member[name].attrs.get("fill_value", np.nan)
+                np.testing.assert_array_equal(beyond, np.full_like(beyond, missing))
+
+
+def test_members_are_joined_by_time(small):
+    found = swept(small, together={"steps": [6, 8], "record": [{"every": 3}, {"every": 4}]})
+    assert found.time.values.tolist() == [0, 3, 4, 6, 8]
+    assert found.steps.dims == ("case",)
+    has = found.position.notnull().any(["particle", "axis"]).values
+    assert has.tolist() == [[True, True, False, True, False], [True, False, True, False, True]]
+
+
+def test_dimensions_and_their_names(small):
+    asked = {
+        "vary": {"leaders.0.until": [3], "leaders.1.until": [4],
+                 "rule": [{"type": "barycentre"}, {"type": "mean-displacement"}],
+                 "initial.amplitude": {"from": 0.1, "to": 0.3, "count": 3}},
+        "together": {"solver.memory": [0.0, 0.1], "solver.engine": ["numpy", "auto"]},
+        "replicates": 2, "keep": {"variables": ["pe1"], "times": "last"},
+    }  # fmt: skip
+    found = swept(small, **asked)
+    dims = ("leaders_0_until", "leaders_1_until", "rule", "amplitude", "case", "replicate")
+    assert found.pe1.dims == (*dims, "time", "particle")
+    assert found.status.dims == dims
+    assert {*found.data_vars} == {"pe1", "status", "message"}
+    assert found.rule.values.tolist() == [0, 1]
+    assert found.rule_text.values.tolist() == [json.dumps(value) for value in asked["vary"]["rule"]]
+    assert found.amplitude.values.tolist() == [0.1, 0.2, 0.3]
+    assert found.engine.dims == found.memory.dims == ("case",)
+    assert found.engine.values.tolist() == ["numpy", "auto"]
+    assert found.time.values.tolist() == [10]
+
+
+def test_a_range_by_equal_factors_and_one_of_whole_numbers(small):
+    vary = {"solver.relaxation": {"from": 0.1, "to": 1.0, "count": 3, "scale": "log"},
+            "steps": {"from": 4, "to": 8, "count": 3}}  # fmt: skip
+    found = swept(small, vary=vary, keep={"variables": ["position"], "times": [0, 6]})
+    np.testing.assert_allclose(found.relaxation, [0.1, 0.1**0.5, 1.0], rtol=1e-14)
+    assert found.steps.values.tolist() == [4, 6, 8]
+    assert found.time.values.tolist() == [0, 6]
+    assert found.position.sel(steps=4, time=6).isnull().all()
+
+
+def test_replicates_have_the_seeds_that_are_promised(small):
+    found = swept(small | {"seed": 7}, replicates=3, keep={"variables": ["position"]})
+    spawned = np.random.SeedSequence(7).spawn(3)
+    assert found.seed.values.tolist() == [int(s.generate_state(1)[0]) for s in spawned]
+    for k, seed in enumerate(replicate_seeds(7, 3)):
+        alone = pbdkit.run(small | {"seed": seed}, progress=False)
+        np.testing.assert_array_equal(found.position.isel(replicate=k), alone.position)
+    assert "replicate" not in swept(small, vary={"steps": [2]}).dims
+
+
+def test_repeating_runs_nothing_again_and_more_runs_the_rest(small, tmp_path, run_only):
+    vary = {"solver.relaxation": [0.5, 1.0]}
+    first = swept(small, vary=vary, folder=tmp_path)
+    assert len(run_only) == 2
+    same(first, swept(small, vary=vary, folder=tmp_path))
+    assert len(run_only) == 2
+    swept(small, vary={"solver.relaxation": [0.5, 0.7, 1.0]}, folder=tmp_path)
+    assert len(run_only) == len(set(run_only)) == 3
+
+
+def test_failures_stop_nobody_and_are_told(call, small):
+    sweep = {"experiment": small | {"steps": 3000},
+             "vary": {"solver.relaxation": [0.5, 5.0, 1.0]}, "keep": {"times": "last"}}  # fmt: skip
+    Path("s.json").write_text(json.dumps(sweep))
+    done = call("sweep", "s.json", "--workers", "1")
+    assert done.code == 5
+    assert "2 of 3 members complete" in done.out
+    told = " ".join(done.err.split())
+    assert "1 members have no values" in told
+    assert "relaxation=5.0" in told
+    assert "diverged" in told
+    assert "left all bounds" in told
+    with pbdkit.open("s/sweep.nc") as found:
+        assert found.status.values.tolist() == ["complete", "diverged", "complete"]
+        assert found.position.isnull().all(["time", "particle", "axis"]).values[1]
+        assert "left all bounds" in str(found.message.values[1])
+    again = call("sweep", "s.json", "--workers", "1")
+    assert again.code == 5
+    assert "0 run now, 3 held before" in again.out
+    assert call("verify", "s/sweep.nc").code == 0
+    assert "holds all members of a sweep" in call("plot", "s/sweep.nc").err
+
+
+def test_what_a_member_raises_is_its_own_fault(small, probing):
+    probing("raise ValueError('no luck')")
+    small["diagnostics"] = [{"type": "probe"}]
+    with pytest.warns(pbdkit.PbdkitWarning, match="1 of 2 members have no values, as failed"):
+        found = swept(small, vary={"steps": [2, 5]})
+    assert found.status.values.tolist() == ["complete", "failed"]
+    assert "no luck" in str(found.message.values[1])
+
+
+def test_who_kills_its_worker_is_given_up_and_the_others_run(small, probing):
+    probing("os.kill(os.getpid(), signal.SIGKILL)")
+    small["diagnostics"] = [{"type": "probe"}]
+    with pytest.warns(pbdkit.PbdkitWarning, match="steps=5: its process was killed"):
+        found = swept(small, vary={"steps": [5, 2, 1]}, workers=2)
+    assert found.status.values.tolist() == ["lost", "complete", "complete"]
+
+
+def test_a_second_sweep_into_the_same_folder_is_refused(small, tmp_path):
+    running = pytest.raises(pbdkit.StorageError, match="another sweep is running into this folder")
+    with stores.Store(tmp_path), running:
+        swept(small, vary={"steps": [2]}, folder=tmp_path)
+    swept(small, vary={"steps": [2]}, folder=tmp_path)
+
+
+def test_a_flipped_bit_is_named_and_that_member_runs_again(small, tmp_path, run_only):
+    asked = {"vary": {"steps": [5, 6, 7]}, "folder": tmp_path}
+    first = swept(small, **asked)
+    for column in ("content", "message", "status", "key", "digest"):
+        flip(tmp_path / stores.DATABASE, column)
+        run_only.clear()
+        with pytest.warns(pbdkit.PbdkitWarning, match=r"sweep\.sqlite: row \d+ is not what was"):
+            same(first, swept(small, **asked))
+        assert len(run_only) == 1
+
+
+def flip(path, column):
+    """One bit of the second row, behind SQLite's back as far as it knows."""
+    with sqlite3.connect(path) as database:
+        query = f"SELECT rowid, CAST({column} AS BLOB) FROM member ORDER BY rowid"
+        row, value = database.execute(query).fetchall()[1]
+        changed = bytearray(value or b"\0")
+        changed[len(changed) // 2] ^= 128
+        kind = "CAST(? AS TEXT)" if column in ("message", "status", "key") else "?"
+        update = f"UPDATE member SET {column} = {kind} WHERE rowid = ?"
+        database.execute(update, (bytes(changed), row))
+    database.close()
+
+
+def test_large_members_are_files_and_a_flipped_bit_in_one_is_named(
+    small, tmp_path, run_only, monkeypatch
+):
+    monkeypatch.setattr(stores, "LARGE_BYTES", 1000)
+    asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
+    first = swept(small, **asked)
+    one, other = (tmp_path / stores.LARGE).iterdir()
+    content = bytearray(one.read_bytes())
+    content[-1] ^= 1
+    one.write_bytes(content)
+    with pytest.warns(pbdkit.PbdkitWarning, match="is not what was written; it runs again"):
+        same(first, swept(small, **asked))
+    other.unlink()
+    with pytest.warns(pbdkit.PbdkitWarning, match="cannot be read"):
+        same(first, swept(small, **asked))
+    assert len(run_only) == 4
+
+
+def test_the_store_of_somebody_else_is_left_alone(small, tmp_path):
+    path = tmp_path / stores.DATABASE
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE ours (x)")
+    database.close()
+    before = path.read_bytes()
+    with pytest.raises(pbdkit.StorageError, match="is no store of a sweep"):
+        swept(small, vary={"steps": [2]}, folder=tmp_path)
+    assert path.read_bytes() == before
+    path.write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 20)
+    with pytest.raises(pbdkit.StorageError, match=r"sweep\.sqlite: .*remove it"):
+        swept(small, vary={"steps": [2]}, folder=tmp_path)
+
+
+WRONG = [
+    ({"vary": {"solver.relaxtion": [1.0]}}, "s.json: member solver.relaxtion=1.0: s.json:1:.* "
+     "unknown key; did you mean 'relaxation'"),
+    ({"varry": {"steps": [1]}}, "varry: unknown key; did you mean 'vary'"),
+    ({"vary": {"steps": [2, 0]}}, "member steps=0: .*steps: should be greater than or equal to 1"),
+    ({"vary": {"steps": []}}, "vary.steps: expected a list of values"),
+    ({"vary": {"steps": 5}}, "vary.steps: expected a list of values"),
+    ({"vary": {"steps": [2, 2]}}, "vary.steps: 2 is given twice"),
+    ({"vary": {"steps": {"from": 1, "to": 2}}}, "vary.steps.count: is missing"),
+    ({"vary": {"steps": {"from": 1, "til": 2, "count": 2}}}, "did you mean 'to'|unknown key"),
+    ({"vary": {"solver.relaxation": {"from": 0, "to": 2, "count": 2, "scale": "log"}}}, "above 0"),
+    ({"vary": {"rule": [{"type": "barycentre"}], "rule.K": [1]}}, "'rule' is varied twice"),
+    ({"vary": {"seed": [1]}, "replicates": 2}, "'seed' is varied twice: replicates vary it"),
+    ({"together": {"steps": [1, 2], "seed": [1]}}, "lists of one length .*steps has 2, seed has 1"),
+    ({"vary": {"leaders.7.until": [1]}}, "member leaders.7.until=1: .*'7' is no position"),
+    ({"vary": {"steps": {"from": 1, "to": 10**6, "count": 10**5}}, "replicates": 9},
+     "900000 members; at most 100000"),
+    ({"vary": {"steps": [10**9]}}, "come to a dataset of .* GiB"),
+    ({"keep": {"variables": ["pe3"]}}, "no variable 'pe3'; did you mean 'pe1'"),
+    ({"keep": {"times": [50]}}, "keep.times: 50 is beyond the last step of all, 10"),
+    ({"keep": {"times": "lost"}}, "keep.times"),
+    ({"vary": {"body.columns": [10**5], "body.rows": [10**6]}}, "member body.columns=1.*GiB"),
+    ({"experiment": "paper/x"}, "experiment: 'paper/x' is neither; did you mean 'paper/"),
+    ({"experiment": "../e.json"}, "leads elsewhere; give a shipped name, or a file in the folder"),
+    ({"experiment": "/etc/passwd"}, "leads elsewhere"),
+    ({"experiment": "link.json"}, "is a link that leads elsewhere"),
+    ({"experiment": 3}, "experiment: expected a shipped name, a file beside this one"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG, ids=[str(n) for n in range(len(WRONG))])
+def test_what_is_wrong_is_one_message_before_anything_runs(call, small, run_only, change, message):
+    Path("../e.json").write_text(json.dumps(small))
+    Path("link.json").symlink_to("../e.json")
+    Path("s.json").write_text(json.dumps({"experiment": small} | change))
+    done = call("sweep", "s.json")
+    assert done.code == 2
+    told = " ".join(done.err.split())
+    assert re.search(message, told), told
+    assert len(told) < 2000
+    assert run_only == []
+    assert not Path("s").exists()
+
+
+def test_the_experiment_is_a_file_beside_the_sweep_or_a_shipped_one(call, tmp_path):
+    Path("inner").mkdir()
+    Path("inner/e.json").write_bytes(Path("e.json").read_bytes())
+    for n, name in enumerate(("e.json", "inner/e.json", "paper/a")):
+        Path("s.json").write_text(json.dumps({"experiment": name, "vary": {"steps": [10]}}))
+        assert call("sweep", "s.json", "-o", f"out{n}", "--workers", "1").code == 0
+
+
+def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
+    """Ctrl-C reaches the program and its workers, as from a terminal."""
+    path = tmp_path / "s.json"
+    sweep = {"experiment": small | {"steps": 4000}, "vary": {"seed": [*range(30)]},
+             "keep": {"variables": ["pe1"], "times": "last"}}  # fmt: skip
+    path.write_text(json.dumps(sweep))
+    line = [sys.executable, "-m", "pbdkit", "sweep", str(path), "-o", str(tmp_path / "out")]
+    line += ["--workers", "2"]
+    running = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for(lambda: rows(tmp_path / "out"))
+    os.killpg(running.pid, signal.SIGINT)
+    _, told = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "the same command goes on" in told
+    assert "Traceback" not in told
+    held = rows(tmp_path / "out")
+    assert 0 < held < 30
+    assert not (tmp_path / "out" / "sweep.nc").exists()
+
+
+def rows(folder):
+    """How many members a store holds."""
+    try:
+        with sqlite3.connect(f"file:{folder / stores.DATABASE}?mode=ro", uri=True) as database:
+            (count,) = database.execute("SELECT COUNT(*) FROM member").fetchone()
+        database.close()
+    except sqlite3.OperationalError:
+        return 0
+    return count
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+class Lazy(pbdkit.FollowerRule):
+    type: Literal["lazy"] = "lazy"
+    share: float = 0.5
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return p.share * total[0] / total[1]
+
+
+def test_a_class_from_python_is_swept_in_this_process(small, tmp_path):
+    from pbdkit.experiment.source import Source
+
+    given = pbdkit.Experiment.build(Source(data=small | {"rule": {"type": "lazy"}}), [Lazy])
+    found = pbdkit.sweep(given, vary={"rule.share": [0.3, 0.6]}, progress=False)
+    assert found.status.values.tolist() == ["complete"] * 2
+    for wrong in ({"workers": 2}, {"folder": tmp_path}):
+        with pytest.raises(pbdkit.ExperimentError, match="make a plugin of them"):
+            pbdkit.sweep(given, vary={"rule.share": [0.3]}, progress=False, **wrong)
+
+
+def test_a_cluster_that_does_not_answer_is_one_message(call, small, monkeypatch):
+    monkeypatch.setattr("pbdkit.cli.sweep.CONNECT_S", 0.5)
+    Path("s.json").write_text(json.dumps({"experiment": small}))
+    done = call("sweep", "s.json", "--dask", "tcp://127.0.0.1:1")
+    assert done.code == 2
+    assert "no scheduler answers" in done.err
+
+
+def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, monkeypatch):
+    for kind, journal in (("ext4", "wal"), ("nfs4", "truncate"), ("", "truncate")):
+        monkeypatch.setattr(stores, "file_system", lambda folder, kind=kind: kind)
+        with stores.Store(tmp_path / kind) as store:
+            (found,) = store._database.execute("PRAGMA journal_mode").fetchone()
+            (synchronous,) = store._database.execute("PRAGMA synchronous").fetchone()
+        assert (found, synchronous) == (journal, 2)
+
+
+def test_members_that_record_in_different_precision_lose_no_digits(small):
+    found = swept(small, vary={"record.dtype": ["float32", "float64"]})
+    alone = pbdkit.run(small, progress=False)
+    np.testing.assert_array_equal(found.position.isel(dtype=1), alone.position)
+    assert found.position.dtype == np.float64
+
+
+def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
+    small["diagnostics"] = [{"type": "track", "numbers": [9]}, {"type": "broken"}]
+    small["fracture"] = {"type": "threshold", "thresholds": [1.05]}
+    found = swept(small, vary={"body.columns": [4, 5], "steps": [4, 6]})
+    assert found.status.values.tolist() == [["complete"] * 2] * 2
+    assert found.track.dims == ("columns", "steps", "step", "tracked", "axis")
+    assert found.track.sel(steps=4, step=6).isnull().all()
+    for n in (4, 5):
+        small["body"]["columns"] = n
+        alone = pbdkit.run(small | {"steps": 6}, progress=False)
+        member = found.sel(columns=n, steps=6).isel(bond=slice(alone.sizes["bond"]))
+        np.testing.assert_array_equal(member.broken_step, alone.broken_step)
+        np.testing.assert_array_equal(member.broken_bonds, alone.broken_bonds)
+
+
+def test_under_fire(tmp_path):
+    found = under_fire(tmp_path, members=24, kills=1, workers=2)
+    assert found == {"exit": 0, "killed": 1, "right": 24, "wrong": 0, "run again": 0}
