@@ -79,21 +79,13 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 def refuse_unfinished(path: Path, *, force: bool) -> None:
     """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
     process is writing it."""
-    from pbdkit.storage.unfinished import is_unfinished, remove_unfinished
+    from pbdkit.storage.unfinished import is_unfinished
 
-    try:
-        found = is_unfinished(path)
-    except StorageError:
-        if not force:
-            raise
-        found = True
-    if found and not force:
+    if is_unfinished(path, discard=force):
         raise ExperimentError(
             f"{path}: an unfinished run of it is here; `pbdkit resume {path}` goes on with it, "
             "--force discards it, -o names another file"
         )
-    if found:
-        remove_unfinished(path)
 
 
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:

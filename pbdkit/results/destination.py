@@ -40,9 +40,11 @@ class Destination:
             with suppress(OSError), io.FileIO(left, "r+b") as file:
                 if lock(file):
                     left.unlink()
-        file = io.FileIO(self._folder / f"{begin}{secrets.token_hex(8)}{TEMPORARY}", "x+b")
-        lock(file)
-        return file
+        while True:
+            file = io.FileIO(self._folder / f"{begin}{secrets.token_hex(8)}{TEMPORARY}", "x+b")
+            if lock(file) and os.fstat(file.fileno()).st_nlink:
+                return file
+            file.close()  # another run took it for one that was left behind
 
     def take(self, temporary: Path, status: str) -> None:
         """Gives a file its name. Raises OSError, and StorageError where the name was taken
@@ -50,6 +52,7 @@ class Destination:
         whole = status in WHOLE
         if whole and self.replace:
             temporary.replace(self._folder / self.path.name)
+            temporary.unlink(missing_ok=True)  # two names of one file are left as they are
         else:
             names = (p for p in self._free(whole) if _rename(temporary, self._folder / p.name))
             self.written = next(names)
@@ -69,11 +72,13 @@ class Destination:
 
 
 def _rename(file: Path, name: Path) -> bool:
-    """Whether the name was free; then the file has it."""
+    """Whether the name was free, or the file's from before it was killed; then it has no other."""
     try:
         os.link(file, name)
     except FileExistsError:
-        return False
+        if not name.samefile(file):
+            return False
+        file.unlink()
     except OSError:  # no hard links on this file system
         if os.path.lexists(name):
             return False

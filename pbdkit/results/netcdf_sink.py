@@ -20,7 +20,7 @@ from pbdkit.results.layout import Column, Values
 from pbdkit.results.netcdf import NetcdfFile
 from pbdkit.results.sink import Sink
 from pbdkit.storage.paged_file import PagedFile
-from pbdkit.storage.seal import SealedFile
+from pbdkit.storage.seal import BrokenSealError, SealedFile
 from pbdkit.storage.standing import Standing
 from pbdkit.storage.unfinished import UnfinishedRun
 
@@ -85,14 +85,16 @@ class NetcdfSink(Sink):
         file = unfinished.file(read_only=False)
         file.verify()
         with self._storing():
+            file.forget()
             self._file = reopened(file, columns, standing, compress=compression == "zlib")
         self._next = time.perf_counter() + EVERY_S
 
     def conclude(self, unfinished: UnfinishedRun) -> None:
         """Takes up a run that is finished but for its name."""
         self.unfinished, self._temporary = unfinished, unfinished.records
+        file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():
-            self._complete(unfinished.file(read_only=False), unfinished.facts["finished"])
+            self._complete(file, status, settled=_is_whole(unfinished.records))
 
     def put(self, values: Values) -> None:
         """Into the file, by whole chunks."""
@@ -125,8 +127,8 @@ class NetcdfSink(Sink):
         return True
 
     def finish(self, attributes: dict[str, str], standing: Standing) -> None:
-        """Completes the file, seals and syncs it, gives it its name and, where there was a store,
-        checks it; then the store goes."""
+        """Completes the file, seals and syncs it, checks it where there was a store, and gives it
+        its name; then the store goes."""
         with self._storing() as file:
             facts = json.dumps(standing.facts)
             file.add_group(FINAL_STATE, facts, standing.arrays)
@@ -136,17 +138,19 @@ class NetcdfSink(Sink):
                 self.unfinished.conclude(file.file, attributes["status"])
             self._complete(file.file, attributes["status"])
 
-    def _complete(self, file: PagedFile, status: str) -> None:
+    def _complete(self, file: PagedFile, status: str, *, settled: bool = False) -> None:
         """The last steps, from a file that is whole with its pages. Raises OSError."""
-        file.settle()
+        if not settled:
+            file.verify()
+            file.settle()
+        if self.unfinished and not settled and not _is_whole(self._temporary):
+            raise StorageError(f"{self._temporary}: the disk gives back what was not written")
         try:
             self._destination.take(self._temporary, status)
         finally:
-            file.disk.close()
             if self.unfinished and not self._temporary.exists():
-                with SealedFile(self.written) as result:
-                    result.check()
                 self.unfinished.remove()
+            file.disk.close()
 
     def abandon(self) -> None:
         """Removes the file; if it was kept, only what came after."""
@@ -187,6 +191,16 @@ class NetcdfSink(Sink):
             if full or getattr(error, "errno", None) == errno.ENOSPC:
                 return "the disk is full; free some space, or record fewer steps"
         return str(getattr(error, "strerror", None) or error)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file is sealed, and all in it is as it was written. Raises OSError."""
+    try:
+        with SealedFile(path) as result:
+            result.check()
+            return result.seal is not None
+    except BrokenSealError:
+        return False
 
 
 def reopened(

@@ -45,7 +45,7 @@ class Recorder:
     """Records the run of one scene into a sink; `seen` decides how it goes on."""
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
-        self._scene, self._sink = scene, sink
+        self._scene, self.sink = scene, sink
         self._tables, self._measured = Tables(scene), Measured(scene)
         self.seen = Seen()
         self.warnings: tuple[str, ...] = ()
@@ -55,9 +55,9 @@ class Recorder:
         it the `history` of a run that is gone on with."""
         steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
         planned = {"time": recording.count(steps), "step": steps + 1}
-        self._sink.begin(columns_of(self._scene), self._measured.sizes, planned)
+        self.sink.begin(columns_of(self._scene), self._measured.sizes, planned)
         for values in self._known() if history is None else history:
-            self._sink.put(values)
+            self.sink.put(values)
 
     def _known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
@@ -97,7 +97,7 @@ class Recorder:
         if self._measured.every_step and stepped and not last:
             values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
         if values:
-            self._sink.put(values)
+            self.sink.put(values)
         self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
 
     def finish(
@@ -113,10 +113,10 @@ class Recorder:
             self.warnings = (warning,)
         if self._scene.has_fracture:
             steps, strains = moment.broken_step(), moment.broken_strain()
-            self._sink.put({"broken_step": steps, "broken_strain": strains})
+            self.sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
-            self._sink.put(self._measured.diagnosed(When.END, moment))
-        self._sink.finish(self._attributes(outcome, prediction), standing)
+            self.sink.put(self._measured.diagnosed(When.END, moment))
+        self.sink.finish(self._attributes(outcome, prediction), standing)
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment

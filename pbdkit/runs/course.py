@@ -132,7 +132,8 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
             except FloatingPointError as error:
                 run.driver.rejection = error
                 continue
-            if sink.due():
+            # At its end there is nothing to go on to: what follows from the last state is its end.
+            if state.step < scene.experiment.steps and not run.driver.ending and sink.due():
                 rate = (state.step - first) / (time.perf_counter() - begun)
                 sink.keep(standing_of(run.driver, recorder, rate))
         assert run.outcome is not None

@@ -40,7 +40,7 @@ class Resumption:
 
     def record(self) -> Report:
         """To its end. Raises what any run does."""
-        return record(self.run, OverlappingSink(self.sink), recorder=self.recorder)
+        return record(self.run, self.recorder.sink, recorder=self.recorder)
 
 
 def resumption(
@@ -77,7 +77,7 @@ def _unfinished(output: Path, watch: Watch, steps: int | None, anyway: bool) -> 
             _refuse_versions(output, about, experiment)
             _refuse_changed_file(output, about, origin)
         scene, standing = build_scene(experiment), left.standing()
-        run, recorder = Run(scene, watch=watch), Recorder(scene, sink)
+        run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
         take_up(run.driver, recorder, standing)
         sink.go_on(left, standing, columns_of(scene), experiment.record.compression)
     except BaseException:
@@ -105,10 +105,14 @@ def _continued(output: Path, watch: Watch, steps: int, anyway: bool) -> Resumpti
         scene = build_scene(experiment)
         compression = experiment.record.compression
         run, sink = Run(scene, watch=watch), NetcdfSink(output, True, compression)
-        recorder = Recorder(scene, sink)
-        recorder.begin(_history(dataset, columns_of(scene), experiment))
-        recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)]
-        take_up(run.driver, recorder, standing, recorded[-1])
+        recorder = Recorder(scene, OverlappingSink(sink))
+        try:
+            recorder.begin(_history(dataset, columns_of(scene), experiment))
+            recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)]
+            take_up(run.driver, recorder, standing, recorded[-1])
+        except BaseException:
+            recorder.sink.abandon()
+            raise
     return Resumption(run, sink, recorder)
 
 

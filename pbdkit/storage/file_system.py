@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 
 LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "overlay"}
 LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
 """File systems of one machine, where SQLite's write-ahead log can share memory."""
+TRIES, PAUSE_S = 10, 0.02
 
 
 def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
@@ -38,6 +40,19 @@ def lock(file: io.FileIO) -> bool:
     except OSError:
         return True
     return True
+
+
+def opened_alone(path: Path) -> io.FileIO | None:
+    """An existing file, open and locked; None where somebody else writes it. Who only asks holds
+    the lock for a moment, and is waited for. Raises OSError."""
+    for _ in range(TRIES):
+        file = io.FileIO(path, "r+b")
+        with suppress(FileNotFoundError):  # it may be another one by now, or none
+            if lock(file) and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        file.close()
+        time.sleep(PAUSE_S)
+    return None
 
 
 def sync_folder(folder: Path) -> None:

@@ -139,6 +139,10 @@ class PagedFile(io.RawIOBase):
         """Nothing more goes to the disk."""
         self._fault = self._fault or OSError("given up")
 
+    def forget(self) -> None:
+        """What was written after the last commit, by a process that was killed. Raises OSError."""
+        self.disk.truncate(max((extent.stop for extent in self.extents), default=0))
+
     def commit(self) -> None:
         """What is there now stays: pages, extents and size were noted elsewhere."""
         self._append_from = max(self._append_from, self.size)

@@ -9,18 +9,20 @@ from typing import Any
 
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import lock
-from pbdkit.storage.unfinished import UnfinishedRun, store_of
+from pbdkit.storage.unfinished import UnfinishedRun, has_committed, store_of
 
 
 def status_of(output: Path) -> dict[str, Any] | None:
     """Of the unfinished run of an output: `step`, `steps`, `rate` in steps a second, `left_s`,
     seconds to its end if it goes on so, `age_s`, seconds since it was kept, and `state`, running or
     stopped; None where there is no such run."""
-    if not store_of(output).exists():
+    if not has_committed(output):
         return None
     running = False
     left = UnfinishedRun.open(output, writing=False)
     try:
+        if not left.kept:
+            return None
         about, facts = left.about, left.facts
         running = not lock(left.disk)
         steps = int(about["steps"])

@@ -18,6 +18,8 @@ from pbdkit.storage.file_system import is_local
 FORMAT = "1"
 """Of the store; a newer one is refused."""
 TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, data BLOB NOT NULL, digest BLOB NOT NULL)"
+SCHEMA = [(TABLE,), (None,)]
+"""The table, and the index of its keys."""
 PART_BYTES = 2**20
 """Bytes a piece of an array."""
 LONGEST = 2**26
@@ -38,13 +40,14 @@ class RunStore:
     """
 
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
-        """`mode` is ro, rw, or rwc to make it."""
+        """`mode` is ro, rw, or rwc to make it. To read what a killed process was writing, SQLite
+        may have to write, so that nobody opens it but for both."""
         self.path, self._writes = path, mode != "ro"
         self._digests: dict[str, bytes] = {}
         with self._sqlite():
             # Nobody but the process's own writer thread uses it, one call after the other.
             self._file = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={mode}",
+                f"{path.absolute().as_uri()}?mode={'rwc' if mode == 'rwc' else 'rw'}",
                 timeout=PATIENCE_S,
                 isolation_level=None,
                 check_same_thread=False,
@@ -53,17 +56,18 @@ class RunStore:
             self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
             for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
                 self._file.execute(f"PRAGMA {setting}")
+            schema = self._file.execute("SELECT sql FROM sqlite_master").fetchall()
+            self.made = mode == "rwc" or schema != []
+            """False where it was left while it was made."""
             if self._writes:
                 self._file.execute(f"PRAGMA journal_mode = {_journal(path)}")
             if mode == "rwc":
                 self._file.execute(f"PRAGMA application_id = {MARK}")
                 self._file.execute(TABLE)
-            elif self._file.execute("SELECT sql FROM sqlite_master").fetchall() != [
-                (TABLE,),
-                (None,),  # the index of its keys
-            ]:
+            elif schema not in ([], SCHEMA):
                 raise StorageError(f"{path}: is no store of a run")
             if mode == "ro":  # all that is read is of one commit
+                self._file.execute("PRAGMA query_only = ON")
                 self._file.execute("BEGIN")
 
     def __enter__(self) -> RunStore:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, StorageError
-from pbdkit.storage.file_system import lock, sync_folder
+from pbdkit.storage.file_system import opened_alone, sync_folder
 from pbdkit.storage.paged_file import PagedFile
 from pbdkit.storage.run_store import (
     FORMAT,
@@ -65,24 +65,31 @@ class UnfinishedRun:
             temporary.rename(records)
         else:
             temporary.unlink()
-        return cls(output, disk, RunStore(store, mode="rwc"))
+        if store.exists():  # one that is just being finished
+            records.unlink()
+            raise taken
+        try:
+            return cls(output, disk, RunStore(store, mode="rwc"))
+        except BaseException:
+            remove_unfinished(output)
+            raise
 
     @classmethod
     def open(cls, output: Path, *, writing: bool) -> UnfinishedRun:
         """The one that is there. Raises ExperimentError where another process writes it."""
         store, records = store_of(output), records_of(output)
         try:
-            disk = io.FileIO(records, "r+b" if writing else "rb")
+            disk = opened_alone(records) if writing else io.FileIO(records, "rb")
         except OSError as error:
             raise StorageError(f"{records}: cannot be read: {error.strerror}") from None
+        if disk is None:
+            raise _written(output)
         try:
-            if writing and not lock(disk):
-                raise ExperimentError(f"{output}: is being written; `pbdkit status` says how far")
             opened = cls(output, disk, RunStore(store, mode="rw" if writing else "ro"))
+            opened._refuse_newer()
         except BaseException:
             disk.close()
             raise
-        opened._refuse_newer()
         opened.kept = True
         return opened
 
@@ -157,14 +164,15 @@ class UnfinishedRun:
         extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
         if layout != {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}:
             raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")
-        if extents and extents[-1].stop > os.fstat(self.disk.fileno()).st_size:
+        end = extents[-1].stop if extents else 0
+        if end > os.fstat(self.disk.fileno()).st_size:
             raise StorageError(f"{self.disk.name}: is shorter than it was written")
         return PagedFile(self.disk, layout["size"], pages, extents, read_only=read_only)
 
     def close(self) -> None:
         """It stays to be gone on with, if anything was committed; else nothing of it does."""
         self._store.close()
-        if not self.kept:
+        if not self.kept and not self.disk.closed:
             remove_unfinished(self.output)
         self.disk.close()
 
@@ -173,9 +181,10 @@ class UnfinishedRun:
         self._store.close()
 
     def remove(self) -> None:
-        """Once the result has its name: the store goes."""
+        """Once the records have the name of the result: the store goes, and then the lock."""
         self._store.close()
-        remove_unfinished(self.output)
+        _remove_store(self.output)
+        self.disk.close()
 
     def _dict(self, key: str) -> dict[str, Any]:
         found = self._store.facts(key)
@@ -204,35 +213,56 @@ def records_of(output: Path) -> Path:
 
 def remove_unfinished(output: Path) -> None:
     """Removes the files of a store; the records last, whose lock keeps others away."""
-    for path in (*reversed(files_of(store_of(output))), records_of(output)):
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+    _remove_store(output)
+    with suppress(OSError):
+        records_of(output).unlink(missing_ok=True)
 
 
-def is_unfinished(output: Path) -> bool:
-    """Whether there is a run to go on with. What one left behind that committed nothing is removed.
-    Raises ExperimentError where one is going on."""
-    records = records_of(output)
-    try:
-        with io.FileIO(records, "r+b") as disk:
-            if not lock(disk):
-                raise ExperimentError(
-                    f"{output}: is being written by another run; `pbdkit status {output}` says "
-                    "how far it is; -o names another file"
-                )
-            committed = _has_committed(output)
-            if not committed:
-                remove_unfinished(output)
-            return committed
-    except (FileNotFoundError, NotADirectoryError):
-        return store_of(output).exists() and _has_committed(output)
-    except OSError as error:
-        raise StorageError(f"{records}: {error.strerror}") from None
+def is_unfinished(output: Path, *, discard: bool = False) -> bool:
+    """Whether there is a run to go on with. What one left behind that committed nothing is removed,
+    and, to `discard` it, any. Raises ExperimentError where one is going on."""
+    with _alone(output):
+        committed = not discard and has_committed(output)
+        if not committed:
+            remove_unfinished(output)
+        return committed
 
 
-def _has_committed(output: Path) -> bool:
+@contextmanager
+def _alone(output: Path) -> Iterator[None]:
+    """Nobody else writes the run meanwhile. At its end its records have the name of the result."""
+    for path in (records_of(output), output) if store_of(output).exists() else [records_of(output)]:
+        try:
+            file = opened_alone(path)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            raise StorageError(f"{path}: {error.strerror}") from None
+        if file is None:
+            raise _written(output)
+        with file:
+            yield
+        return
+    yield
+
+
+def _written(output: Path) -> ExperimentError:
+    return ExperimentError(
+        f"{output}: is being written by another run; `pbdkit status {output}` says how far it is; "
+        "-o names another file"
+    )
+
+
+def has_committed(output: Path) -> bool:
+    """Whether anything of a run was kept. Raises StorageError."""
     store = store_of(output)
     if not store.exists():
         return False
-    with RunStore(store, mode="rw") as found:
-        return bool(found.keys("about"))
+    with RunStore(store) as found:
+        return found.made and bool(found.keys("about"))
+
+
+def _remove_store(output: Path) -> None:
+    for path in files_of(store_of(output)):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)

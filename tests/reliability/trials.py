@@ -1,0 +1,211 @@
+"""What the trials of runs share: small experiments, calls of the program in processes of their own
+that can be killed, and the comparison of two results, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent)]
+
+import h5netcdf  # noqa: E402, F401  # the children find all that is heavy loaded
+import h5py  # noqa: E402, F401
+import numpy as np  # noqa: E402
+import xarray  # noqa: E402, F401
+
+import pbdkit  # noqa: E402
+import pbdkit.analysis.forecast  # noqa: E402
+import pbdkit.results.accessor  # noqa: E402
+import pbdkit.runs.resumption  # noqa: E402, F401
+from pbdkit.cli import main  # noqa: E402
+from pbdkit.results import netcdf_sink  # noqa: E402
+from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink  # noqa: E402
+from pbdkit.storage.seal import SealedFile, opened  # noqa: E402
+
+OUTPUT = "out.nc"
+BASE: dict[str, Any] = {
+    "name": "trial",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 24, "rows": 20},
+    "rule": {"type": "barycentre"},
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+        {
+            "select": {"edge": "right"},
+            "motion": {"type": "velocity", "velocity": [0.07, 0.01], "steps": 20},
+        },
+    ],
+    "steps": 30,
+    "solver": {"type": "stepping", "engine": "numpy"},
+}
+BREAKING = {
+    "fracture": {"type": "damage", "onset": 0.1, "failure": 0.4},
+    "diagnostics": [{"type": "displacement"}, {"type": "broken"}],
+}
+LARGE = {  # records of more than a chunk of one entry
+    "body": {"type": "grid", "columns": 330, "rows": 220},
+    "steps": 8,
+    "diagnostics": [{"type": "pe1"}],
+}
+COMPRESSED = LARGE | {"record": {"dtype": "float32", "compression": "zlib"}}
+SETTLING = {
+    "body": {"type": "grid", "columns": 6, "rows": 5},
+    "steps": 400,
+    "record": {"every": 7},
+    "solver": {"type": "stepping", "engine": "numpy", "settle": {"tolerance": 1e-4}},
+}
+INCREMENTS = {
+    "body": {"type": "grid", "columns": 8, "rows": 6},
+    "fracture": {"type": "strain", "failure": 0.3, "scatter": 0.1},
+    "solver": {"type": "equilibrium"},
+}
+EXPERIMENTS = {
+    "breaking": BASE | BREAKING,
+    "large": BASE | LARGE,
+    "compressed": BASE | COMPRESSED,
+    "settling": BASE | SETTLING,
+    "increments": BASE | INCREMENTS,
+}
+
+
+def often(first_s: float = 0.0) -> None:
+    """From now on this process commits whenever it can."""
+    kinds = NetcdfSink.__init__.__kwdefaults__
+    assert kinds is not None
+    kinds["first_s"] = first_s
+    netcdf_sink.EVERY_S, netcdf_sink.SHARE = 0.0, 0
+
+
+def started(work: Callable[[], object], log: Path) -> int:
+    """A process that does the work and exits as it does; what it says goes to the log."""
+    if pid := os.fork():
+        return pid
+    code = 70
+    try:
+        descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(descriptor, 1)
+        os.dup2(descriptor, 2)
+        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
+        work()
+        code = 0
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 71
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def ended(pid: int, patience_s: float = 60.0) -> int:
+    """How it ended: its exit status, or minus the signal; one that hangs is killed: -1000."""
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        found, status = os.waitpid(pid, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.002)
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    return -1000
+
+
+def called(*arguments: str, log: Path, before: Callable[[], object] = often) -> int:
+    """The process id of a call of the program, in the current folder."""
+
+    def work() -> None:
+        before()
+        main([*arguments])
+
+    return started(work, log)
+
+
+def done(*arguments: str, log: Path, before: Callable[[], object] = often) -> tuple[int, str]:
+    """How such a call ended, and what it said."""
+    code = ended(called(*arguments, log=log, before=before))
+    return code, log.read_text(errors="replace")
+
+
+def write_experiment(parts: dict[str, Any], folder: Path) -> str:
+    """Its name in the folder."""
+    (folder / "e.json").write_text(json.dumps(parts))
+    return "e.json"
+
+
+def reference(parts: dict[str, Any], folder: Path) -> tuple[Path, float]:
+    """The result of the uninterrupted run, and how long a run that commits often takes."""
+    folder.mkdir()
+    os.chdir(folder)
+    name = write_experiment(parts, folder)
+    code, said = done("run", name, "-o", "plain.nc", log=Path("log"), before=lambda: often(1e9))
+    assert code == 0, said
+    begun = time.perf_counter()
+    code, said = done("run", name, "-o", "kept.nc", log=Path("log"))
+    assert code == 0, said
+    assert differences(Path("plain.nc"), Path("kept.nc")) == []
+    return folder / "plain.nc", time.perf_counter() - begun
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """In what two results differ, to the bit, but for when they were made."""
+    for path in (one, other):
+        with SealedFile(path) as file:
+            file.check()
+    with opened(one) as first, opened(other) as second:
+        return list(_different(first, second))
+
+
+def _different(first: Any, second: Any) -> Iterator[str]:
+    if list(first.variables) != list(second.variables):
+        yield f"variables {list(first.variables)}, {list(second.variables)}"
+        return
+    for name in first.variables:
+        one, two = first[name], second[name]
+        if one.dimensions != two.dimensions or one.dtype != two.dtype or one.shape != two.shape:
+            yield f"{name}: {one.shape} {one.dtype}, {two.shape} {two.dtype}"
+        elif _bytes(one[...]) != _bytes(two[...]):
+            yield f"{name}: other values"
+        elif _attributes(one) != _attributes(two):
+            yield f"{name}: other attributes"
+    if (mine := _attributes(first)) != (others := _attributes(second)):
+        yield f"attributes {[k for k in mine | others if mine.get(k) != others.get(k)]}"
+    ends = [json.loads(f.groups[FINAL_STATE].attrs["facts"])["run"] for f in (first, second)]
+    if ends[0] != ends[1]:
+        yield f"final states {ends}"
+    for name, one in first.groups[FINAL_STATE].variables.items():
+        if _bytes(one[...]) != _bytes(second.groups[FINAL_STATE][name][...]):
+            yield f"final state, {name}"
+
+
+def _attributes(of: Any) -> dict[str, Any]:
+    return {k: np.asarray(v).tolist() for k, v in of.attrs.items() if k != "created"}
+
+
+def _bytes(values: Any) -> bytes:
+    array = np.asarray(values)
+    return json.dumps(array.tolist()).encode() if array.dtype == object else array.tobytes()
+
+
+def recorded(path: Path) -> Any:
+    """Steps and positions of a result, or of what was kept of a run; the last as it is forced."""
+    with pbdkit.open(path) as dataset:
+        return dataset["time"].values.copy(), dataset["position"].values.copy()
+
+
+def debris(folder: Path, *known: str) -> list[str]:
+    """What lies in a folder that should not."""
+    return sorted({p.name for p in folder.iterdir()} - {*known, "e.json", "log"})
+
+
+def row(goal: str, measured: str) -> None:
+    """A row of the table."""
+    print(f"{goal} | {measured}", flush=True)
