@@ -116,7 +116,7 @@ def test_verify_says_a_line_a_file(sound, call, tmp_path):
         f"{bad}: bytes {BLOCK} to {2 * BLOCK} of {len(content) - seal_bytes(content)} are not what "
         "was written",
         f"{bare}: carries no seal: nobody can tell whether it is as it was written",
-        f"{tmp_path / 'none.nc'}: No such file or directory",
+        f"{tmp_path / 'none.nc'}: there is no such file",
     ]
 
 

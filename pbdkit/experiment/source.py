@@ -27,6 +27,7 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.scanner import Scanner
 
 from pbdkit.errors import ExperimentError, dotted
 
@@ -89,6 +90,7 @@ def read_text(text: str, name: str) -> Source:
 
 def _read(text: str, source: Source) -> Any:
     yaml = YAML(typ="safe", pure=True)
+    yaml.Scanner = _Scanner
     try:
         return _Reading(yaml, text, source).document()
     except ReaderError as error:
@@ -101,6 +103,15 @@ def _read(text: str, source: Source) -> Any:
         place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ExperimentError(f"{source.name}{place}: not valid YAML: {what}") from None
+
+
+class _Scanner(Scanner):
+    """Notes no keys where nothing is taken: at each character it goes through all that it noted."""
+
+    def save_possible_simple_key(self) -> None:
+        """As ruamel's, down to the depth that is taken."""
+        if self.flow_level <= MAX_DEPTH:
+            super().save_possible_simple_key()
 
 
 class _Reading:

@@ -15,6 +15,7 @@ from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.seal import BrokenSealError, opened, seal_of
+from pbdkit.results.trial import opened_unsealed, try_reading
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,11 +31,10 @@ def open(path: str | Path) -> xarray.Dataset:
     is not as it was written, where it cannot be read as netCDF, where pbdkit did not make it, where
     variables are missing, or where a newer pbdkit made it than this one can read. A change that is
     met later, as values are read, raises StorageError too. Warns, with pbdkit.PbdkitWarning, of a
-    file without a seal.
+    file without a seal, which is first read once in another process.
     """
     file = Path(path)
-    if not file.is_file():
-        raise StorageError(f"{file}: there is no such file")
+    refuse_no_file(file)
     if file.suffix in (".yaml", ".yml", ".json"):
         raise ExperimentError(
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
@@ -52,16 +52,30 @@ def open(path: str | Path) -> xarray.Dataset:
     return dataset
 
 
+def refuse_no_file(file: Path) -> None:
+    """Raises StorageError where there is no plain file of that name."""
+    if file.is_dir():
+        raise StorageError(f"{file}: is a folder, no result of pbdkit")
+    if not file.is_file():
+        what = (
+            "is no plain file, and no result of pbdkit"
+            if file.exists()
+            else "there is no such file"
+        )
+        raise StorageError(f"{file}: {what}")
+
+
 def _opened(file: Path) -> xarray.Dataset:
-    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
     with file.open("rb", buffering=0) as start:
         sealed = seal_of(start) is not None
     if not sealed:
-        dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
+        try_reading(file)
+        dataset = opened_unsealed(file)
         warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
         return dataset
     manager = xarray.backends.CachingFileManager(opened, file.absolute(), mode="r")
     store = xarray.backends.H5NetCDFStore(manager)
+    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
     return xarray.open_dataset(store, decode_times=False)
 
 
