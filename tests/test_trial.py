@@ -9,7 +9,7 @@ import pytest
 import xarray
 
 import pbdkit
-from pbdkit.results.trial import BEGINNINGS, ENGINE, MODULE, try_reading
+from pbdkit.results.trial import BEGINNINGS, MODULE, opened_unsealed, try_reading
 
 sys.path.append(str(Path(__file__).parent / "reliability"))
 import fuzz_experiments
@@ -84,7 +84,7 @@ def test_sound_files_pass(bare):
     assert try_reading(bare) is None
     with pytest.warns(pbdkit.PbdkitWarning, match="carries no seal"):
         dataset = pbdkit.open(bare)
-    with dataset, xarray.open_dataset(bare, engine=ENGINE, decode_times=False) as plain:
+    with dataset, opened_unsealed(bare) as plain:
         xarray.testing.assert_identical(dataset.load(), plain.load())
 
 
@@ -104,7 +104,7 @@ def test_a_large_file_is_read_in_pieces(tmp_path):
     import numpy as np
 
     path, values = tmp_path / "large.nc", np.zeros((300, 2**17))
-    xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path, engine=ENGINE)
+    xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path)
     code = (
         "import sys; from pathlib import Path; from pbdkit.results import trial\n"
         "trial._read(Path(sys.argv[1])); from pbdkit.runs.course import peak_memory\n"

@@ -78,6 +78,8 @@ def main(arguments: list[str] | None = None) -> None:
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]
+    # pydantic would look for plugins of its own, and stop at any torn distribution.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", errors.PbdkitWarning)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import xarray
+from xarray.backends import StoreBackendEntrypoint
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
@@ -76,7 +77,7 @@ def _opened(file: Path) -> xarray.Dataset:
     manager = xarray.backends.CachingFileManager(opened, file.absolute(), mode="r")
     store = xarray.backends.H5NetCDFStore(manager)
     # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
-    return xarray.open_dataset(store, decode_times=False)
+    return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)
 
 
 @contextmanager
