@@ -114,7 +114,7 @@ def test_torn_metadata_stop_nobody(
     row = listed(call)[name]
     assert row["state"] == "broken"
     assert row["reason"] != ""
-    # pydantic goes through all distributions when it first builds a model, unless it is kept from it.
+    # Where it builds its first model, pydantic would go through all distributions.
     command = [sys.executable, "-m", "pbdkit", "run", "e.json", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-SHARE = 1000
+SHARE = 500
 """So many cases a process tries, unless it ends before."""
 Outcome = dict[str, Any]
 
@@ -34,7 +34,8 @@ def outcomes(
 ) -> list[tuple[int, Outcome]]:
     """The outcome of every case, `command` with the word "serve" being the child; where there is
     none, "hang" or "crash" stands under "how"."""
-    shares = [numbers[n : n + SHARE] for n in range(0, len(numbers), SHARE)]
+    share = min(SHARE, -(-len(numbers) // workers))
+    shares = [numbers[n : n + share] for n in range(0, len(numbers), share)]
     with ThreadPoolExecutor(workers) as pool:
         found = pool.map(lambda share: list(_of_share(command, share, patience_s)), shares)
         return [outcome for share in found for outcome in share]

@@ -16,6 +16,7 @@ import tempfile
 import time
 import warnings
 from contextlib import redirect_stdout
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,14 @@ def read_subject(path: Path) -> dict[str, Any]:
         seen |= {f"attribute {name}": str(value) for name, value in dataset.attrs.items()}
         seen["snapshot"] = repr(take_snapshots(dataset, [None], "pe1", False))
     return seen
+
+
+@cache
+def seen_of_sound(path: Path) -> dict[str, Any]:
+    """The same of a sound file, read once."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read_subject(path)
 
 
 def verified(path: Path) -> bool:
@@ -136,9 +145,7 @@ def tried(seed: int, number: int, folder: Path) -> Outcome:
     passes = verified(path)
     told = any(issubclass(w.category, pbdkit.PbdkitWarning) for w in caught)
     if how == "read":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            same = seen == read_subject(sound)
+        same = seen == seen_of_sound(sound)
         how = (
             f"read, {'the same' if same else 'differs'}, {'with a warning' if told else 'silently'}"
         )
