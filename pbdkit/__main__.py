@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 
 
 def main() -> None:
     """As `pbdkit.cli.main`; who interrupts it while it is being loaded sees no traceback either."""
+    # An exception can be lost in what libraries do as they are imported; nothing is to be undone.
+    before = signal.signal(signal.SIGINT, _end)
     try:
         from pbdkit.cli import main as program
 
+        signal.signal(signal.SIGINT, before)
         program()
     except KeyboardInterrupt:
-        sys.stderr.write("pbdkit: interrupted\n")
-        sys.exit(130)
+        _end()
+
+
+def _end(*_: object) -> None:
+    sys.stderr.write("pbdkit: interrupted\n")
+    sys.stderr.flush()
+    os._exit(130)
 
 
 if __name__ == "__main__":

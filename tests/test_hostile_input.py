@@ -12,12 +12,13 @@ from typing import Any, ClassVar, Literal
 
 import pytest
 from hostile_input import mutant
+from ruamel.yaml.scanner import Scanner
 
 import pbdkit
 from pbdkit import Experiment
 from pbdkit.analysis.forecast import forecast
 from pbdkit.errors import LONGEST, PbdkitError, printable
-from pbdkit.experiment.source import Source, read_text
+from pbdkit.experiment.source import MAX_DEPTH, Source, read_text
 from pbdkit.runs.course import rehearse
 from pbdkit.scene.scene import build_scene
 
@@ -87,6 +88,21 @@ def test_a_file_as_large_as_may_be_is_read_soon(text: str) -> None:
     with pytest.raises(pbdkit.ExperimentError):
         Experiment.build(read_text(text, "e"))
     assert time.process_time() - begun < SOON_S
+
+
+@pytest.mark.parametrize("opening", ["[", "{a: ", "[ {x: "])
+def test_deep_brackets_cost_no_more_the_deeper_they_are(opening: str, monkeypatch: Any) -> None:
+    """At each character ruamel goes through the keys that may have begun."""
+    noted, original = [0], Scanner.stale_possible_simple_keys
+
+    def stale(scanner: Any) -> None:
+        noted.append(len(scanner.possible_simple_keys))
+        original(scanner)
+
+    monkeypatch.setattr(Scanner, "stale_possible_simple_keys", stale)
+    with pytest.raises(pbdkit.ExperimentError, match="nested more than 32 levels deep"):
+        read_text("a: " + opening * 1000, "e")
+    assert 10 < max(noted) <= MAX_DEPTH + 1
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,10 @@ def test_torn_metadata_stop_nobody(
     row = listed(call)[name]
     assert row["state"] == "broken"
     assert row["reason"] != ""
+    # Where it builds its first model, pydantic would go through all distributions.
+    command = [sys.executable, "-m", "pbdkit", "run", "e.json", "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_another_api_version_is_incompatible(install: Install, call: Call) -> None:

@@ -204,3 +204,93 @@ def test_an_interruption_while_the_program_is_loaded_shows_no_traceback(
     command = [sys.executable, "-c", INTERRUPT.replace("NAME", repr(module))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr.strip(), left()) == (130, "pbdkit: interrupted", [])
+
+
+SIGNAL = """
+import os, runpy, signal, sys
+
+number, seen = int(sys.argv.pop(1)), []
+
+def count(event, arguments):
+    if event == "import" and (seen or arguments[0] == "pbdkit.cli"):
+        seen.append(arguments[0])
+        if len(seen) == number:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.addaudithook(count)
+runpy.run_module("pbdkit", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 10, 30, 100, 200, 300])
+def test_a_signal_as_any_module_is_loaded_ends_it_in_a_line(call: Call, number: int) -> None:
+    command = [sys.executable, "-c", SIGNAL, str(number), "run", "e.json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr.strip(), left()) == (130, "pbdkit: interrupted", [])
+
+
+CLASS = """
+class Stops:
+    def __set_name__(self, owner, name):
+        raise KeyboardInterrupt
+
+class Made:
+    part = Stops()
+"""
+
+
+@pytest.mark.parametrize("body", ["raise KeyboardInterrupt", CLASS], ids=["exec", "class"])
+def test_an_interruption_that_python_makes_something_else_of(body: str) -> None:
+    """Code that is a text, as that of named tuples, ends by the signal; classes by an error."""
+    code = (
+        f"import pbdkit.cli as c; c.program.main = lambda *a, **k: exec({body!r}, {{}}); c.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "pbdkit: interrupted\n")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits on address space are Linux's")
+@pytest.mark.parametrize(("mib", "code"), [(100, 6), (900, 6), (1030, 2), (1300, 0)])
+def test_little_memory_is_told_in_a_line(call: Call, mib: int, code: int) -> None:
+    """Libraries that get none spin, or end the process: they are not asked."""
+    limit = f"import resource as r; r.setrlimit(r.RLIMIT_AS, ({mib} * 2**20,) * 2)"
+    program = f"{limit}; from pbdkit.__main__ import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "run", "e.json", "--quiet"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (code, int(code > 0))
+    assert {6: "(ulimit -v)", 2: "may be used on this machine", 0: ""}[code] in done.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        "MemoryError",
+        'RuntimeError("can\'t start new thread")',
+        "ImportError('libx.so: failed to map segment from shared object')",
+    ],
+)
+def test_memory_that_runs_out_on_the_way_is_told_as_such(
+    error: str, capsys: Any, monkeypatch: Any
+) -> None:
+    from pbdkit.cli import main, program
+
+    def raises(*_: Any, **more: Any) -> None:
+        raise eval(error)
+
+    monkeypatch.setattr(program, "main", raises)
+    with pytest.raises(SystemExit) as caught:
+        main(["run"])
+    assert caught.value.code == 6
+    assert capsys.readouterr().err.startswith("pbdkit: out of memory")
+
+
+def test_a_container_bounds_memory(tmp_path: Path, monkeypatch: Any) -> None:
+    from pbdkit.scene import memory
+
+    monkeypatch.setattr(memory, "CONTAINER", tmp_path / "memory.max")
+    whole = memory.machine_memory()
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.machine_memory() == whole
+    (tmp_path / "memory.max").write_text("1048576\n")
+    assert memory.machine_memory() == 2**20

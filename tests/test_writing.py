@@ -9,16 +9,14 @@ import pbdkit
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.results.progress import Watch
-from pbdkit.results.sink import Sink
+from pbdkit.results.sink import KeepingSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
-from pbdkit.storage.standing import Standing
 
 LARGE = np.zeros(LARGE_BYTES // 8)
-STANDING = Standing({}, {})
 
 
-class Noting(Sink):
+class Noting(KeepingSink):
     """Notes what it is told, by which thread; fails at one value."""
 
     def __init__(self, fails_at=None):
@@ -43,9 +41,12 @@ class Noting(Sink):
         self.calls.append("keep")
 
     def suspend(self, standing):
-        return False
+        self.calls.append("suspend")
 
-    def finish(self, attributes, standing):
+    def note_end(self, standing):
+        self.calls.append("end")
+
+    def finish(self, attributes):
         self.calls.append("finish")
 
     def abandon(self):
@@ -57,7 +58,7 @@ def test_small_values_are_written_at_once():
     sink = OverlappingSink(inner)
     sink.begin([], {}, {})
     sink.put({"a": np.zeros(3)})
-    sink.finish({}, STANDING)
+    sink.finish({})
     assert inner.calls == ["begin", "a", "finish"]
     assert inner.threads == {threading.main_thread()}
 
@@ -68,7 +69,7 @@ def test_large_values_are_written_in_order_by_one_other_thread():
     sink.begin([], {}, {})
     for name in "abcdefgh":
         sink.put({name: LARGE if name in "adf" else np.zeros(1)})
-    sink.finish({}, STANDING)
+    sink.finish({})
     assert inner.calls == ["begin", *"abcdefgh", "finish"]
     assert len(inner.threads - {threading.main_thread()}) == 1
 
@@ -89,7 +90,7 @@ def test_memory_stays_bounded_when_the_disk_is_slow():
     assert len(done) <= MOST_WAITING
     inner.gate.set()
     producer.join(10)
-    sink.finish({}, STANDING)
+    sink.finish({})
     assert inner.calls == [*map(str, range(10)), "finish"]
 
 
@@ -100,7 +101,7 @@ def test_what_fails_in_the_other_thread_is_raised():
     def produce():
         for name in "abcdefgh":
             sink.put({name: LARGE})
-        sink.finish({}, STANDING)
+        sink.finish({})
 
     with pytest.raises(pbdkit.StorageError, match="the disk is full"):
         produce()

@@ -13,9 +13,10 @@ from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leader_groups import kinds_at
+from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.scene.sizes import MIB, machine_memory, sizes_of
+from pbdkit.scene.sizes import MIB, sizes_of
 
 
 @dataclass(frozen=True)

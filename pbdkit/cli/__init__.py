@@ -6,6 +6,7 @@ import os
 import sys
 import traceback
 import warnings
+from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
@@ -13,6 +14,7 @@ import click
 
 from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
+from pbdkit.scene.memory import refuse_little_memory
 
 MODULES = {
     "run": "run resume",
@@ -78,10 +80,13 @@ def main(arguments: list[str] | None = None) -> None:
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]
+    # pydantic would look for plugins of its own, and stop at any torn distribution.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", errors.PbdkitWarning)
             warnings.showwarning = _warn
+            refuse_little_memory()
             code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         where = getattr(error.__cause__, "args", error.args)
@@ -94,6 +99,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             traceback.print_exc()
         code = _report(error)
+    exec("")  # after an interrupt in another `exec` Python would end by the signal
     sys.exit(code or 0)
 
 
@@ -106,10 +112,26 @@ def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: 
 def _report(error: BaseException) -> int:
     if isinstance(error, errors.PbdkitError):
         return _failed(str(error), error.exit_status)
-    if isinstance(error, MemoryError):
-        return _failed("out of memory; `pbdkit check` estimates what an experiment needs", 6)
+    if _of_memory(error):
+        told = f"out of memory: {error}" if str(error) else "out of memory"
+        return _failed(f"{told}; `pbdkit check` estimates what an experiment needs", 6)
+    if any(isinstance(e, KeyboardInterrupt) for e in _contexts(error)):
+        return _failed("interrupted", 130)
     what = f"a bug in pbdkit, please report it: {type(error).__name__}: {error}"
     return _failed(f"{what} (`pbdkit --debug ...` shows where)", 1)
+
+
+def _contexts(error: BaseException | None) -> Iterator[BaseException]:
+    """The error and what it was made of: while modules are loaded, of an interrupt too."""
+    while error:
+        yield error
+        error = error.__context__
+
+
+def _of_memory(error: BaseException) -> bool:
+    """Whether memory is what was missing, which threads and libraries say in words of their own."""
+    words = "can't start new thread", "failed to map segment", "Cannot allocate memory"
+    return isinstance(error, MemoryError) or any(word in str(error) for word in words)
 
 
 def _failed(message: str, code: int) -> int:

@@ -65,14 +65,17 @@ def _verified(file: Path) -> str:
     """What a file's line says against it, if anything."""
     from pbdkit.cli.output import refusals_as
     from pbdkit.errors import StorageError
-    from pbdkit.results.accessor import UNSEALED
+    from pbdkit.results.accessor import UNSEALED, refuse_no_file
+    from pbdkit.results.trial import refuse_no_result
     from pbdkit.storage.seal import SealedFile
 
     fault = ""
     try:
+        refuse_no_file(file)
         with refusals_as(str(file)), SealedFile(file) as content:
             content.check()
             if content.seal is None:
+                refuse_no_result(file)
                 fault = f"{file}: {UNSEALED}"
     except StorageError as error:
         fault = str(error)

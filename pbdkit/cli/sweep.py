@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from pbdkit.cli.stopping import Stop
     from pbdkit.sweeps.course import Summary
 
 PATH = click.Path(path_type=Path)
@@ -29,7 +30,7 @@ def sweep(
     file: Path, folder: Path | None, workers: int | None, address: str | None, quiet: bool
 ) -> int:
     """Run an experiment over many parameters; a second call runs what is left."""
-    from pbdkit.cli.run import asked_to_stop
+    from pbdkit.cli.stopping import asked_to_stop
     from pbdkit.results.progress import progress_bar
     from pbdkit.sweeps.calling import crew_of
     from pbdkit.sweeps.course import carry_out
@@ -47,7 +48,7 @@ def sweep(
         summary = carry_out(asked, kept, crew_of(workers, client), stopping, show)
     for fault in summary.faults:
         click.echo(f"warning: {fault}", err=True)
-    return _told(summary, kept, quiet)
+    return _told(summary, kept, stopping, quiet)
 
 
 def _refuse_folder(folder: Path) -> None:
@@ -83,14 +84,14 @@ def _client(address: str | None) -> Iterator[Any]:
         yield client
 
 
-def _told(summary: Summary, folder: Path, quiet: bool) -> int:
+def _told(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
     """Says how it went; the exit status."""
     count, missing = len(summary.members), len(summary.members) - len(summary.ends)
     failures = summary.failures
     if summary.path is None:
         what = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
         click.echo(f"pbdkit: {what}; the same command goes on with the others", err=True)
-        return 130
+        return stop.exit_status
     if not quiet:
         held = count - summary.run
         before = f" ({summary.run} run now, {held} held before)" if held else ""

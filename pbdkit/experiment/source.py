@@ -6,9 +6,8 @@ keys and tags are what makes YAML dangerous, and an experiment needs none of the
 
 from __future__ import annotations
 
-import copy
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,6 +26,7 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.scanner import Scanner
 
 from pbdkit.errors import ExperimentError, dotted
 
@@ -79,7 +79,7 @@ def read_file(path: Path) -> Source:
 def read_text(text: str, name: str) -> Source:
     """The experiment in a text; `name` is what messages call it."""
     source = Source(name)
-    source.data = _read(text, source)
+    source.data = parsed(text, source)
     if source.data is None:
         raise ExperimentError(f"{name}: is empty; `pbdkit init` writes an experiment to start from")
     if not isinstance(source.data, dict):
@@ -87,8 +87,10 @@ def read_text(text: str, name: str) -> Source:
     return source
 
 
-def _read(text: str, source: Source) -> Any:
+def parsed(text: str, source: Source) -> Any:
+    """The data of a text; the places of its values go into the source. Raises ExperimentError."""
     yaml = YAML(typ="safe", pure=True)
+    yaml.Scanner = _Scanner
     try:
         return _Reading(yaml, text, source).document()
     except ReaderError as error:
@@ -101,6 +103,15 @@ def _read(text: str, source: Source) -> Any:
         place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ExperimentError(f"{source.name}{place}: not valid YAML: {what}") from None
+
+
+class _Scanner(Scanner):
+    """Notes no keys where nothing is taken: at each character it goes through all that it noted."""
+
+    def save_possible_simple_key(self) -> None:
+        """As ruamel's, down to the depth that is taken."""
+        if self.flow_level <= MAX_DEPTH:
+            super().save_possible_simple_key()
 
 
 class _Reading:
@@ -183,58 +194,3 @@ class _Reading:
 
     def _refuse(self, event: Any, what: str) -> NoReturn:
         raise ExperimentError(f"{self._place(event)}: {what}")
-
-
-LONGEST = 80
-"""So many characters of a setting are repeated in messages."""
-
-
-def with_setting(source: Source, setting: str, defaults: Mapping[str, Any]) -> Source:
-    """A copy of the source with one value set.
-
-    `setting` is ``path=value`` with a dotted path, list positions from 0 and a YAML value. A part
-    that the file leaves out starts from its entry in `defaults`.
-    """
-    label = f"--set {setting if len(setting) <= LONGEST else setting[:LONGEST] + '...'}"
-    path, equals, value = setting.partition("=")
-    if not equals or not path:
-        raise ExperimentError(f"{label}: expected PATH=VALUE, for instance rule.K=-0.002")
-    return with_value(source, path, _read(value, Source(label)), label, defaults)
-
-
-def with_value(
-    source: Source, path: str, value: Any, label: str, defaults: Mapping[str, Any]
-) -> Source:
-    """The same of a value that is none of YAML; `label` is what messages call its place."""
-    where = tuple(
-        int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in path.split(".")
-    )
-    places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
-    changed = Source(source.name, copy.deepcopy(source.data), places)
-    _place(changed.data, where, value, label, defaults)
-    for depth in range(1, len(where) + 1):
-        changed.places.setdefault(where[:depth], label)
-    return changed
-
-
-def _place(data: Any, where: Where, value: Any, label: str, defaults: Mapping[str, Any]) -> None:
-    *parents, last = where
-    for depth, part in enumerate(parents):
-        if isinstance(data, dict) and part not in data:
-            data[part] = copy.deepcopy(defaults.get(str(part), {})) if depth == 0 else {}
-        data = _entry(data, part, label)
-    if isinstance(data, dict):
-        data[str(last)] = value
-    else:
-        _entry(data, last, label)
-        data[last] = value
-
-
-def _entry(data: Any, part: str | int, label: str) -> Any:
-    if isinstance(data, dict):
-        return data[part if part in data else str(part)]
-    if not isinstance(data, list):
-        raise ExperimentError(f"{label}: '{part}' is looked for in a single value")
-    if not isinstance(part, int) or part >= len(data):
-        raise ExperimentError(f"{label}: '{part}' is no position in a list of {len(data)}, from 0")
-    return data[part]

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import xarray
+from xarray.backends import StoreBackendEntrypoint
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
-from pbdkit.results.unfinished_dataset import unfinished_dataset
+from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
 from pbdkit.storage.unfinished import STORE, store_of
 
@@ -35,18 +36,18 @@ def open(path: str | Path) -> xarray.Dataset:
     is not as it was written, where it cannot be read as netCDF, where pbdkit did not make it, where
     variables are missing, or where a newer pbdkit made it than this one can read. A change that is
     met later, as values are read, raises StorageError too. Warns, with pbdkit.PbdkitWarning, of a
-    file without a seal.
+    file without a seal, which is first read once in another process.
     """
     file = Path(path)
-    left = _unfinished(file)
-    if not file.is_file() and not left:
-        raise StorageError(f"{file}: there is no such file")
+    left = _output_of(file)
+    if not left:
+        refuse_no_file(file)
     if file.suffix in (".yaml", ".yml", ".json"):
         raise ExperimentError(
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
         )
     try:
-        dataset = _dataset(unfinished_dataset(left)) if left else _opened(file)
+        dataset = _unfinished(left) if left else _opened(file)
     except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
@@ -61,22 +62,43 @@ def open(path: str | Path) -> xarray.Dataset:
     return dataset
 
 
+def refuse_no_file(file: Path) -> None:
+    """Raises StorageError where there is no plain file of that name."""
+    if file.is_dir():
+        raise StorageError(f"{file}: is a folder, no result of pbdkit")
+    if not file.is_file():
+        what = (
+            "is no plain file, and no result of pbdkit"
+            if file.exists()
+            else "there is no such file"
+        )
+        raise StorageError(f"{file}: {what}")
+
+
 def _opened(file: Path) -> xarray.Dataset:
-    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
     with file.open("rb", buffering=0) as start:
         sealed = seal_of(start) is not None
     if not sealed:
-        dataset = xarray.open_dataset(file, engine="netcdf4", decode_times=False)
+        try_reading(file)
+        dataset = opened_unsealed(file)
         warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
         return dataset
     return _dataset(xarray.backends.CachingFileManager(opened, file.absolute(), mode="r"))
 
 
 def _dataset(content: Any) -> xarray.Dataset:
-    return xarray.open_dataset(xarray.backends.H5NetCDFStore(content), decode_times=False)
+    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
+    store = xarray.backends.H5NetCDFStore(content)
+    return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)
 
 
-def _unfinished(file: Path) -> Path | None:
+def _unfinished(output: Path) -> xarray.Dataset:
+    from pbdkit.results.unfinished_dataset import unfinished_dataset  # needs the scene, too
+
+    return _dataset(unfinished_dataset(output))
+
+
+def _output_of(file: Path) -> Path | None:
     """The output of the unfinished run that is meant, by its own name or that of its store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))

@@ -18,7 +18,7 @@ from pbdkit.errors import StorageError
 from pbdkit.results.destination import Destination
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.netcdf import NetcdfFile
-from pbdkit.results.sink import Sink
+from pbdkit.results.sink import KeepingSink
 from pbdkit.storage.paged_file import PagedFile
 from pbdkit.storage.seal import BrokenSealError, SealedFile
 from pbdkit.storage.standing import Standing
@@ -33,7 +33,7 @@ FULL_BYTES = 2**20
 WAITING = "waiting."
 
 
-class NetcdfSink(Sink):
+class NetcdfSink(KeepingSink):
     """Writes beside `path`, first under a temporary name, after a second as the records of an
     unfinished run; `finish` makes it the result. `origin` says of the run where it comes from.
 
@@ -120,18 +120,20 @@ class NetcdfSink(Sink):
         now = time.perf_counter()
         self._next = now + max(EVERY_S, SHARE * (now - begun))
 
-    def suspend(self, standing: Standing) -> bool:
+    def suspend(self, standing: Standing) -> None:
         """Keeps it and leaves it."""
         self.keep(standing)
         self.abandon()
-        return True
 
-    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+    def note_end(self, standing: Standing) -> None:
+        """As a group of the file."""
+        with self._storing() as file:
+            file.add_group(FINAL_STATE, json.dumps(standing.facts), standing.arrays)
+
+    def finish(self, attributes: dict[str, str]) -> None:
         """Completes the file, seals and syncs it, checks it where there was a store, and gives it
         its name; then the store goes."""
         with self._storing() as file:
-            facts = json.dumps(standing.facts)
-            file.add_group(FINAL_STATE, facts, standing.arrays)
             file.finish(attributes)
             file.file.check()
             if self.unfinished:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.results.layout import Column, Values
-from pbdkit.results.sink import Sink
+from pbdkit.results.sink import KeepingSink
 from pbdkit.storage.standing import Standing
 
 LARGE_BYTES = 2**20
@@ -19,14 +19,14 @@ MOST_WAITING, MOST_CALLS = 2, 100
 """So many large values may wait to be written, and so many calls; then the run waits."""
 
 
-class OverlappingSink(Sink):
+class OverlappingSink(KeepingSink):
     """Hands everything to another sink, in order, what is large and what comes while that is being
     written in a second thread.
 
     What goes wrong there is raised at the next call.
     """
 
-    def __init__(self, inner: Sink) -> None:
+    def __init__(self, inner: KeepingSink) -> None:
         self._inner = inner
         self._thread = ThreadPoolExecutor(1, "pbdkit-writer")
         self._waiting: deque[tuple[bool, Future[None]]] = deque()
@@ -54,15 +54,20 @@ class OverlappingSink(Sink):
         """Beside the run, from a copy."""
         self._keeping = self._hand_over(True, self._inner.keep, standing.copied())
 
-    def suspend(self, standing: Standing) -> bool:
+    def suspend(self, standing: Standing) -> None:
         """When all is written."""
         self._wait()
-        return self._inner.suspend(standing)
+        self._inner.suspend(standing)
 
-    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+    def note_end(self, standing: Standing) -> None:
         """When all is written."""
         self._wait()
-        self._inner.finish(attributes, standing)
+        self._inner.note_end(standing)
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """When all is written."""
+        self._wait()
+        self._inner.finish(attributes)
 
     def abandon(self) -> None:
         """What waits is not written."""

@@ -20,7 +20,6 @@ from pbdkit.results.sink import Sink
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
-from pbdkit.storage.standing import Standing
 
 
 @dataclass(frozen=True)
@@ -100,12 +99,9 @@ class Recorder:
             self.sink.put(values)
         self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
 
-    def finish(
-        self, state: State, outcome: Outcome, prediction: dict[str, Any], standing: Standing
-    ) -> None:
-        """Hands over what is known at the end, the attributes, with what was predicted before the
-        first step, and where the run stands; `warnings` says what the user should know of the last
-        state."""
+    def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
+        """Hands over what is known at the end, and the attributes, with what was predicted before
+        the first step; `warnings` says what the user should know of the last state."""
         # Where a run diverged, what broke since the last record is no result.
         diverged = outcome.status == "diverged"
         moment = StateMoment(state, self._tables, self.seen.recorded if diverged else state.step)
@@ -116,7 +112,7 @@ class Recorder:
             self.sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
             self.sink.put(self._measured.diagnosed(When.END, moment))
-        self.sink.finish(self._attributes(outcome, prediction), standing)
+        self.sink.finish(self._attributes(outcome, prediction))
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment

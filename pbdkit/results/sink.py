@@ -29,25 +29,32 @@ class Sink(ABC):
         """One entry for each column that grows, or the whole of a column that does not."""
 
     @abstractmethod
-    def due(self) -> bool:
-        """Whether to hand over where the run stands."""
-
-    @abstractmethod
-    def keep(self, standing: Standing) -> None:
-        """Keeps where the run stands after what was put, so that it can be gone on with."""
-
-    @abstractmethod
-    def suspend(self, standing: Standing) -> bool:
-        """Nothing more comes for now. Whether what was put and where the run stands are kept; if
-        not, the run ends here, and `finish` comes."""
-
-    @abstractmethod
-    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
-        """Nothing more comes; where the run stands at its end."""
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Nothing more comes."""
 
     @abstractmethod
     def abandon(self) -> None:
-        """The run failed: what was put since it was kept is not wanted."""
+        """The run failed: what was put is not wanted."""
+
+
+class KeepingSink(Sink):
+    """A sink that keeps where the run stands, so that it can be gone on with."""
+
+    @abstractmethod
+    def due(self) -> bool:
+        """Whether it is time to."""
+
+    @abstractmethod
+    def keep(self, standing: Standing) -> None:
+        """After what was put; what is kept outlives `abandon`."""
+
+    @abstractmethod
+    def suspend(self, standing: Standing) -> None:
+        """Keeps it; nothing more comes for now."""
+
+    @abstractmethod
+    def note_end(self, standing: Standing) -> None:
+        """Before `finish`: from there the run can be continued to more steps."""
 
 
 class MemorySink(Sink):
@@ -63,18 +70,7 @@ class MemorySink(Sink):
         for name, value in values.items():
             self._entries[name].append(value)
 
-    def due(self) -> bool:
-        """Never: memory keeps nothing of a run that is left."""
-        return False
-
-    def keep(self, standing: Standing) -> None:
-        """Does not."""
-
-    def suspend(self, standing: Standing) -> bool:
-        """Does not."""
-        return False
-
-    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+    def finish(self, attributes: dict[str, str]) -> None:
         """Keeps the attributes."""
         self._attributes = attributes
 

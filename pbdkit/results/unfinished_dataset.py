@@ -18,7 +18,7 @@ from pbdkit.results.sink import Sink
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.storage.seal import opened_in
-from pbdkit.storage.standing import Standing, put_together
+from pbdkit.storage.standing import put_together
 from pbdkit.storage.unfinished import UnfinishedRun
 
 
@@ -35,18 +35,7 @@ class Overlay(Sink):
         """Over the file."""
         self._file.put(values)
 
-    def due(self) -> bool:
-        """Never."""
-        return False
-
-    def keep(self, standing: Standing) -> None:
-        """Does not."""
-
-    def suspend(self, standing: Standing) -> bool:
-        """Does not."""
-        return False
-
-    def finish(self, attributes: dict[str, str], standing: Standing) -> None:
+    def finish(self, attributes: dict[str, str]) -> None:
         """Over the file."""
         self._file.finish(attributes)
 
@@ -84,5 +73,5 @@ def unfinished_dataset(output: Path) -> Any:
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
     with suppress(FloatingPointError):  # a state that is not finite is not shown
         recorder.observe(state, last=True)
-    recorder.finish(state, Outcome("interrupted", reason, state.step), {}, standing)
+    recorder.finish(state, Outcome("interrupted", reason, state.step), {})
     return opened_in(file)

@@ -16,7 +16,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Outcome, Recorder
-from pbdkit.results.sink import MemorySink, Sink
+from pbdkit.results.sink import KeepingSink, MemorySink, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.runs.standing import standing_of
 from pbdkit.scene.scene import Scene
@@ -113,6 +113,7 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
     the sink that has begun goes on with what it took before. A run that is asked to stop is left
     where it stands, where the sink can keep that."""
     begun, scene, first = time.perf_counter(), run.scene, run.state.step
+    keeping = sink if isinstance(sink, KeepingSink) else None
 
     def report(outcome: Outcome, warnings: tuple[str, ...] = ()) -> Report:
         wall_s = time.perf_counter() - begun
@@ -124,7 +125,8 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
             with _located(scene):
                 recorder.begin()
         for state in run:
-            if run.driver.stopped and sink.suspend(standing_of(run.driver, recorder)):
+            if keeping and run.driver.stopped:
+                keeping.suspend(standing_of(run.driver, recorder))
                 return report(run.driver.stopped)
             try:
                 with _located(scene):
@@ -133,13 +135,15 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
                 run.driver.rejection = error
                 continue
             # At its end there is nothing to go on to: what follows from the last state is its end.
-            if state.step < scene.experiment.steps and not run.driver.ending and sink.due():
+            ends = run.driver.ending or state.step >= scene.experiment.steps
+            if keeping and not ends and keeping.due():
                 rate = (state.step - first) / (time.perf_counter() - begun)
-                sink.keep(standing_of(run.driver, recorder, rate))
+                keeping.keep(standing_of(run.driver, recorder, rate))
         assert run.outcome is not None
+        if keeping:
+            keeping.note_end(standing_of(run.driver, recorder))
         with _located(scene):
-            standing = standing_of(run.driver, recorder)
-            recorder.finish(run.state, run.outcome, prediction(scene), standing)
+            recorder.finish(run.state, run.outcome, prediction(scene))
     except BaseException:
         sink.abandon()
         raise

@@ -11,8 +11,9 @@ from typing import Any
 
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
-from pbdkit.experiment.source import Source, with_setting
+from pbdkit.experiment.source import Source
 from pbdkit.results.accessor import reading
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink

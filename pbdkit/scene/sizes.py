@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParti
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
+from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
 
 MIB = 2**20
@@ -119,18 +119,10 @@ def refuse_too_large(
     available = machine_memory()
     if sizes.memory > available:
         raise ExperimentError(
-            f"{sizes.particles:.3g} particles need about {sizes.memory / 2**30:.3g} GiB and this "
-            f"machine has {available / 2**30:.3g}; make it smaller",
+            f"{sizes.particles:.3g} particles need about {sizes.memory / 2**30:.3g} GiB, and "
+            f"{available / 2**30:.3g} may be used on this machine; make it smaller",
             ("body",),
         )
-
-
-def machine_memory() -> int:
-    """The physical memory in bytes; what cannot be asked is taken as 16 GiB."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):
-        return 16 * 2**30
 
 
 def _bytes_of(dtype: str, value: int) -> int:

@@ -138,8 +138,8 @@ def _write(dataset: xarray.Dataset, path: Path) -> None:
     temporary = path.absolute().with_name(name)
     try:
         dataset.to_netcdf(temporary, engine="netcdf4")
-        put_seal(temporary)
-        with temporary.open("rb+") as file:
+        with temporary.open("rb+", buffering=0) as file:
+            put_seal(file)
             os.fsync(file.fileno())
         temporary.replace(path.absolute())
     except (OSError, RuntimeError) as error:

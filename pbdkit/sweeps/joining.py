@@ -11,7 +11,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.scene.sizes import machine_memory
+from pbdkit.scene.memory import machine_memory
 from pbdkit.sweeps.content import Variable, unpacked
 from pbdkit.sweeps.grid import MESSAGE, STATUS, Dimension
 from pbdkit.sweeps.member import Member

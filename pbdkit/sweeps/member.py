@@ -13,7 +13,8 @@ import xxhash
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.source import Source, with_value
+from pbdkit.experiment.settings import with_value
+from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.results.layout import reserved_names
 from pbdkit.sweeps.grid import Dimension, Setting, dimensions, places, words

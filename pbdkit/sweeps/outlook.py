@@ -14,8 +14,8 @@ from pbdkit.interfaces.component import did_you_mean
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import Sink
+from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.scene import build_scene
-from pbdkit.scene.sizes import machine_memory
 from pbdkit.sweeps.member import named
 from pbdkit.sweeps.specification import Keep
 

@@ -176,8 +176,11 @@ def resumes(subject: Subject) -> None:
     rest, recorder = Run(again), Recorder(again, parts)
     take_up(rest.driver, recorder, Standing(kept.about, facts, kept.copied().arrays))
     record(rest, parts, recorder=recorder)
-    found, needed = (sink.dataset().variables for sink in (parts, whole))
-    for name in differing(dict(needed), dict(found)):
+    found, needed = (
+        {str(name): values for name, values in sink.dataset().variables.items()}
+        for sink in (parts, whole)
+    )
+    for name in differing(needed, found):
         raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
 
 

@@ -1,0 +1,180 @@
+"""Fuzzed experiments, as many as are asked for, through all that `pbdkit check` does.
+
+    python tests/reliability/fuzz_experiments.py [--count N] [--seed S] [--only NUMBER]
+
+Each ends in a documented error, soon and in a short text, or is valid and foretold soon. `--only`
+prints one case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import random
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others' threads take their time, too
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+from hostile_input import PARTS, mutant  # noqa: E402
+from hostile_text import hostile_setting, hostile_text, to_yaml  # noqa: E402
+from isolation import Outcome, forget_peak, outcomes, report, resident, serve  # noqa: E402
+
+import pbdkit  # noqa: E402
+from pbdkit.analysis.forecast import forecast  # noqa: E402
+from pbdkit.errors import LONGEST, PbdkitError  # noqa: E402
+from pbdkit.experiment.model import Experiment  # noqa: E402
+from pbdkit.experiment.shipped import shipped_names, shipped_text  # noqa: E402
+from pbdkit.experiment.source import MAX_NODES, Source, read_text  # noqa: E402
+from pbdkit.runs.course import rehearse  # noqa: E402
+from pbdkit.scene import sizes  # noqa: E402
+from pbdkit.scene.scene import build_scene  # noqa: E402
+
+PATIENCE_S = 60.0
+MEMORY = 2**29
+"""The machine that is asked for has so many bytes, whatever this one has."""
+ERROR_S, ERROR_MB, TEXT_S, MARK_S = 0.1, 100.0, 1.0, 1e-4
+"""What an error may cost, of processor time and memory, where it is found before the scene; and
+what each megabyte of text and each mark of it that can begin a value may take besides, up to the
+number of values that is taken."""
+VALID_S, VALID_MB = 5.0, 500.0
+"""What a forecast, or an error that only the scene shows, may cost; and once more for each
+`MEMORY` / 4 that the scene takes."""
+
+
+def case(seed: int, number: int) -> tuple[bytes, list[str]]:
+    """The file of that number, and the settings that go with it."""
+    draw = random.Random(f"{seed}/{number}")
+    text = to_yaml(draw, mutant(draw, BASES)) if draw.random() < 0.5 else draw.choice(TEXTS)
+    settings = [hostile_setting(draw)] if draw.random() < 0.1 else []
+    if draw.random() < 0.5:
+        return hostile_text(draw, text), settings
+    return text.encode("utf-8", "surrogatepass"), settings
+
+
+def tried(content: bytes, settings: list[str], *, quick: bool = False) -> Outcome:
+    """How it ends, and what that took."""
+    sizes.machine_memory = lambda: MEMORY
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "e.yaml")
+        path.write_bytes(content)
+        gc.collect()
+        forget_peak()
+        before, _ = resident()
+        begun = time.process_time()
+        outcome = _checked(path, settings, quick)
+        seconds = time.process_time() - begun
+        _, peak = resident()
+    return outcome | {
+        "text_mb": len(content) / 1e6,
+        "marks": marks(content),
+        "seconds": seconds,
+        "mb": max(0.0, (peak - before) / 1e6),
+    }
+
+
+def marks(content: bytes) -> int:
+    """How many values there can be in a text."""
+    return min(MAX_NODES, sum(content.count(c) for c in b",:-[{"))
+
+
+def _checked(path: Path, settings: list[str], quick: bool) -> Outcome:
+    stage = "file"
+    scene_mb = 0.0
+    try:
+        loaded = pbdkit.load(path, settings=settings)
+        stage = "scene"
+        scene = build_scene(loaded)
+        stage = "forecast"
+        if not quick:
+            rehearse(scene)
+            scene_mb = forecast(scene).memory_mib * 1.05
+    except PbdkitError as error:
+        text = str(error)
+        how = f"refused ({error.exit_status}), {stage}"
+        return {"how": how, "status": error.exit_status, "length": len(text), "said": text[:150]}
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        said = f"{type(error).__name__}: {str(error)[:150]} ({place.filename[-40:]}:{place.lineno})"
+        return {"how": "undocumented error", "said": said}
+    return {"how": "valid", "scene_mb": scene_mb}
+
+
+def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
+    """What is wrong with how a case ended, with `slack` times the bounds."""
+    how = outcome["how"]
+    said = outcome.get("said", "")
+    if how in ("hang", "crash", "undocumented error"):
+        return [f"{how} {said}"]
+    found = []
+    if how != "valid" and (outcome["status"] not in (2, 3) or outcome["length"] > LONGEST + 100):
+        found.append(f"status {outcome['status']}, {outcome['length']} characters: {said}")
+    at_once = "file" in how
+    seconds, mb = (ERROR_S, ERROR_MB) if at_once else (VALID_S, VALID_MB)
+    seconds += TEXT_S * outcome["text_mb"] + MARK_S * outcome["marks"]
+    share = slack + outcome.get("scene_mb", 0.0) / (MEMORY / 4e6)
+    if outcome["seconds"] > seconds * share:
+        found.append(f"{how}: {outcome['seconds']:.2f} s: {said}")
+    if outcome["mb"] > mb * share:
+        found.append(f"{how}: {outcome['mb']:.0f} MB: {said}")
+    return found
+
+
+def warm_up() -> None:
+    """All is imported, and every model is built, before anything is measured."""
+    for part in [{}, *({name: part} for name, part in PARTS)]:
+        tried(json.dumps(BASES[0] | part).encode(), [])
+    for text in TEXTS:
+        read_text(text, "shipped")
+    for base in BASES:
+        Experiment.build(Source(data=base))
+
+
+def _base(name: str) -> Any:
+    return json.loads(pbdkit.load(name).model_dump_json(by_alias=True))
+
+
+BASES = [_base(name) for name in shipped_names()]
+TEXTS = [shipped_text(name) for name in shipped_names()]
+
+
+def fuzz(
+    count: int, seed: int, workers: int = 2, *, quick: bool = False
+) -> list[tuple[int, Outcome]]:
+    """The outcomes of the first `count` cases of a seed; `quick`: of scenes nothing is foretold,
+    and imports are in the figures."""
+    command = [__file__, "--seed", str(seed), *(["--quick"] if quick else [])]
+    return outcomes(command, range(count), PATIENCE_S, workers)
+
+
+def main() -> None:
+    """The command, and the child that it starts."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", type=int)
+    parser.add_argument("--quick", action="store_true", help="as the sample in the suite")
+    parser.add_argument("role", nargs="?", choices=["serve"])
+    given = parser.parse_args()
+    if (given.role or given.only is not None) and not given.quick:
+        warm_up()
+    if given.role:
+        serve(lambda number: tried(*case(given.seed, number), quick=given.quick))
+    elif given.only is not None:
+        content, settings = case(given.seed, given.only)
+        print(content[:20_000].decode(errors="backslashreplace"), settings)
+        print(outcome := tried(content, settings), faults(outcome))
+    else:
+        found = fuzz(given.count, given.seed, given.workers, quick=given.quick)
+        sys.exit(report(found, given.seed, faults) > 0)
+
+
+if __name__ == "__main__":
+    main()

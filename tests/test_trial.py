@@ -1,0 +1,129 @@
+"""Files without seal are tried in another process; samples of the long trials of files."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import xarray
+
+import pbdkit
+from pbdkit.results.trial import BEGINNINGS, MODULE, opened_unsealed, try_reading
+
+sys.path.append(str(Path(__file__).parent / "reliability"))
+import fuzz_experiments
+import mutate_results
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("subjects")
+
+
+@pytest.fixture
+def bare(folder):
+    return mutate_results.make_subject("rewritten", folder)
+
+
+NO_RESULTS = {
+    "picture.jpeg": b"\x89PNG\r\n\x1a\n" + bytes(100),
+    "notes.txt": b"name: x\n",
+    "empty.nc": b"",
+    "short.nc": BEGINNINGS[0][:5],
+}
+
+
+@pytest.mark.parametrize("name", NO_RESULTS)
+def test_what_is_no_result_is_told_in_a_line(name, call):
+    Path(name).write_bytes(NO_RESULTS[name])
+    said = f"{name}: is no result of pbdkit: it begins as no netCDF file does"
+    verified = call("verify", name)
+    assert (verified.code, verified.out) == (6, said + "\n")
+    for command in ("plot", "explain"):
+        assert call(command, name)[::2] == (6, f"pbdkit: {said}\n")
+
+
+def test_an_experiment_a_folder_and_nothing_are_no_results(call):
+    Path("kept").mkdir()
+    result = call("verify", "e.json", "kept", "gone.nc", "/dev/null")
+    assert result.code == 6
+    assert result.out.splitlines() == [
+        "e.json: is no result of pbdkit: it begins as no netCDF file does",
+        "kept: is a folder, no result of pbdkit",
+        "gone.nc: there is no such file",
+        "/dev/null: is no plain file, and no result of pbdkit",
+    ]
+
+
+LIBRARIES = {
+    "crashes": ("import os; os.abort()", r"to read it ends its process \(Aborted"),
+    "ends": ("import os; os._exit(3)", r"to read it ends its process \(status 3"),
+    "hangs": (
+        "import faulthandler as f; f.dump_traceback_later(.3, exit=True)\nwhile True: pass",
+        "to read it comes to no end",
+    ),
+    "fails": ("raise ValueError('odd')", "cannot be read as netCDF-4: odd"),
+    "eats": (
+        "import numpy; numpy.ones(2**60)",
+        "cannot be read as netCDF-4: (Unable to allocate|array is too big|Maximum allowed)",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_a_library_that_fails_brings_nothing_down(name, bare, tmp_path, monkeypatch):
+    source, said = LIBRARIES[name]
+    (tmp_path / f"{MODULE}.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(pbdkit.StorageError, match=rf"rewritten\.nc: .*{said}"):
+        try_reading(bare)
+
+
+def test_sound_files_pass(bare):
+    assert try_reading(bare) is None
+    with pytest.warns(pbdkit.PbdkitWarning, match="carries no seal"):
+        dataset = pbdkit.open(bare)
+    with dataset, opened_unsealed(bare) as plain:
+        xarray.testing.assert_identical(dataset.load(), plain.load())
+
+
+def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):
+    """A length that was changed has libraries fill memory with what is not there."""
+    import h5py
+
+    large = shutil.copy(bare, tmp_path / "large.nc")
+    with h5py.File(large, "r+") as file:
+        file.create_dataset("more", (2**40,), "f8", chunks=(2**16,))
+    with pytest.raises(pbdkit.StorageError, match=r"it cannot hold the 8\.8e\+12 bytes"):
+        pbdkit.open(large)
+
+
+def test_a_large_file_is_read_in_pieces(tmp_path):
+    """What the child takes is a piece, and not the file."""
+    import numpy as np
+
+    path, values = tmp_path / "large.nc", np.zeros((300, 2**17))
+    xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path)
+    code = (
+        "import sys; from pathlib import Path; from pbdkit.results import trial\n"
+        "trial._read(Path(sys.argv[1])); from pbdkit.runs.course import peak_memory\n"
+        "print(peak_memory())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    assert path.stat().st_size > values.nbytes
+    assert int(done.stdout) < 0.9 * values.nbytes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is measured as on Linux")
+def test_fuzzed_experiments_end_in_order():
+    """Ten times the bounds: imports are in them, and others may be at work."""
+    found = fuzz_experiments.fuzz(200, seed=0, quick=True)
+    assert len(found) == 200
+    assert [(n, f) for n, o in found for f in fuzz_experiments.faults(o, slack=10.0)] == []
+
+
+def test_mutated_results_are_never_silently_different(folder):
+    found = mutate_results.mutate(16, seed=0, folder=folder)
+    assert len(found) == 16
+    assert [(n, fault) for n, o in found for fault in mutate_results.faults(o)] == []
