@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -19,6 +18,7 @@ from pbdkit.results.destination import Destination
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.netcdf import NetcdfFile
 from pbdkit.results.sink import KeepingSink
+from pbdkit.storage.file_system import FULL, is_full
 from pbdkit.storage.paged_file import PagedFile
 from pbdkit.storage.seal import BrokenSealError, SealedFile
 from pbdkit.storage.standing import Standing
@@ -29,7 +29,6 @@ FIRST_S, EVERY_S, SHARE = 1.0, 1.0, 50
 what the last one cost."""
 FINAL_STATE = "final_state"
 """The group of the file with what a run needs to be gone on with to more steps."""
-FULL_BYTES = 2**20
 WAITING = "waiting."
 
 
@@ -183,15 +182,14 @@ class NetcdfSink(KeepingSink):
 
     def _reason(self, error: Exception) -> str:
         """The disk's own, where it has one: the library says little."""
-        with suppress(OSError):
-            full = shutil.disk_usage(self._destination.path.parent).free < FULL_BYTES
-            try:
-                if self._file:
-                    self._file.file.check()
-            except OSError as first:
-                error = first
-            if full or getattr(error, "errno", None) == errno.ENOSPC:
-                return "the disk is full; free some space, or record fewer steps"
+        try:
+            if self._file:
+                self._file.file.check()
+        except OSError as first:
+            error = first
+        full = is_full(self._destination.path.absolute().parent)
+        if full or getattr(error, "errno", None) == errno.ENOSPC:
+            return FULL
         return str(getattr(error, "strerror", None) or error)
 
 

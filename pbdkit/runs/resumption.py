@@ -25,7 +25,7 @@ from pbdkit.runs.standing import take_up
 from pbdkit.scene.scene import build_scene
 from pbdkit.storage.seal import opened
 from pbdkit.storage.standing import Standing
-from pbdkit.storage.unfinished import UnfinishedRun, is_unfinished, records_of, remove_unfinished
+from pbdkit.storage.unfinished import UnfinishedRun, is_unfinished
 
 ENDED = ("complete", "settled", "interrupted")
 """The status of results that can be continued."""
@@ -63,9 +63,6 @@ def resumption(
 
 
 def _unfinished(output: Path, watch: Watch, steps: int | None, anyway: bool) -> Resumption | None:
-    if output.exists() and not records_of(output).exists():  # killed after the result had its name
-        remove_unfinished(output)
-        return None
     left = UnfinishedRun.open(output, writing=True)
     try:
         about, origin = left.about, left.about.get("origin", {})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -11,6 +12,8 @@ from pathlib import Path
 LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "overlay"}
 LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
 """File systems of one machine, where SQLite's write-ahead log can share memory."""
+FULL = "the disk is full; free some space, or record fewer steps"
+FULL_BYTES = 2**20
 TRIES, PAUSE_S = 10, 0.02
 
 
@@ -53,6 +56,14 @@ def opened_alone(path: Path) -> io.FileIO | None:
         file.close()
         time.sleep(PAUSE_S)
     return None
+
+
+def is_full(folder: Path) -> bool:
+    """Whether next to nothing is free where a folder lies."""
+    try:
+        return shutil.disk_usage(folder).free < FULL_BYTES
+    except OSError:
+        return False
 
 
 def sync_folder(folder: Path) -> None:

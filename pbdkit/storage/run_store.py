@@ -13,7 +13,7 @@ import numpy as np
 import xxhash
 
 from pbdkit.errors import StorageError
-from pbdkit.storage.file_system import is_local
+from pbdkit.storage.file_system import FULL, is_full, is_local
 
 FORMAT = "1"
 """Of the store; a newer one is refused."""
@@ -136,6 +136,9 @@ class RunStore:
     def _sqlite(self) -> Iterator[None]:
         try:
             yield
+        except sqlite3.OperationalError as error:  # which says of a full disk this and that
+            reason = FULL if is_full(self.path.absolute().parent) else error
+            raise StorageError(f"{self.path}: {reason}") from None
         except sqlite3.Error as error:
             raise StorageError(f"{self.path}: {error}") from None
 

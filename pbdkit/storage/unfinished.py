@@ -254,9 +254,9 @@ def _written(output: Path) -> ExperimentError:
 
 
 def has_committed(output: Path) -> bool:
-    """Whether anything of a run was kept. Raises StorageError."""
+    """Whether anything of a run was kept that is not finished. Raises StorageError."""
     store = store_of(output)
-    if not store.exists():
+    if not store.exists() or (output.exists() and not records_of(output).exists()):
         return False
     with RunStore(store) as found:
         return found.made and bool(found.keys("about"))

@@ -1,0 +1,119 @@
+"""Runs stopped at random looks and gone on with, in this process, by other engines and threads
+too."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from trials import differences, often
+
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import Component
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.overlapping_sink import OverlappingSink
+from pbdkit.results.progress import StoppedError, Watch
+from pbdkit.results.recorder import Recorder, columns_of
+from pbdkit.runs import drivers
+from pbdkit.runs.course import Report, Run, record
+from pbdkit.runs.standing import take_up
+from pbdkit.scene.scene import build_scene
+from pbdkit.storage.unfinished import UnfinishedRun, is_unfinished
+
+Components = Iterable[type[Component]]
+MOST_STOPS = 4
+NUMPY = {"engine": "numpy"}
+ENGINES = [NUMPY, {"engine": "compiled", "threads": 1}, {"engine": "compiled", "threads": 2}]
+
+
+class Looks(Watch):
+    """Stops at one of the looks to come; not while the last good state of a run that diverged is
+    looked for: who stops that does without it."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.left = at
+
+    def look(self, share: float, what: str = "") -> None:
+        self.left -= 1
+        if self.left <= 0:
+            raise StoppedError
+
+
+def with_engine(parts: dict[str, Any], engine: dict[str, Any]) -> dict[str, Any]:
+    """The same, carried out by another engine; an equilibrium has none to choose."""
+    solver = parts["solver"]
+    return parts if solver["type"] == "equilibrium" else parts | {"solver": solver | engine}
+
+
+def compression_of(experiment: Experiment) -> str:
+    """That of its file."""
+    return experiment.record.compression
+
+
+def begun(parts: dict[str, Any], output: Path, own: Components, watch: Watch) -> Report:
+    """A run from its start."""
+    experiment = Experiment.build(Source("trial", parts), own)
+    sink = NetcdfSink(output, compression=compression_of(experiment))
+    return record(Run(build_scene(experiment), watch=watch), OverlappingSink(sink))
+
+
+def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> Report:
+    """The unfinished run of an output, by an engine of its own, as `pbdkit resume` does it."""
+    left = UnfinishedRun.open(output, writing=True)
+    try:
+        parts = with_engine(json.loads(left.about["experiment"]), engine)
+        experiment = Experiment.build(Source("stored", parts), own)
+        scene, standing = build_scene(experiment), left.standing()
+        sink = NetcdfSink(output)
+        run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
+        take_up(run.driver, recorder, standing)
+        sink.go_on(left, standing, columns_of(scene), compression_of(experiment))
+    except BaseException:
+        left.close()
+        raise
+    return record(run, recorder.sink, recorder=recorder)
+
+
+def resumed_otherwise(
+    parts: dict[str, Any],
+    folder: Path,
+    draw: random.Random,
+    own: Components = (),
+    engines: list[dict[str, Any]] = ENGINES,
+) -> tuple[list[str], int]:
+    """In what the run, stopped here and there and gone on with, differs from the same in one go;
+    and how often it was stopped."""
+    own, often_enough = list(own), drivers.LONGEST_CALL_S
+    whole, output = folder / "whole.nc", folder / "out.nc"
+    for path in (whole, output):
+        path.unlink(missing_ok=True)
+    dumped = json.loads(
+        Experiment.build(Source("trial", parts), own).model_dump_json(by_alias=True)
+    )
+    parts = with_engine(dumped, draw.choice(engines))
+    often(1e9)
+    counting = Looks(2**60)
+    begun(parts, whole, own, counting)
+    most = min(2**60 - counting.left, parts["steps"]) + 1
+    often(0.0 if draw.random() < 0.5 else 1e9)
+    if draw.random() < 0.5:
+        drivers.LONGEST_CALL_S = 0.0  # a look each step
+        most = parts["steps"] + 1
+    stops = 0
+    try:
+        report = begun(parts, output, own, Looks(draw.randint(1, most)))
+        while is_unfinished(output):
+            stops += 1
+            watch = Looks(draw.randint(1, most) if stops < MOST_STOPS else 2**60)
+            report = gone_on(output, own, watch, draw.choice(engines))
+    finally:
+        drivers.LONGEST_CALL_S = often_enough
+    del report
+    found = [d for d in differences(whole, output) if d != "attributes ['experiment']"]
+    left = sorted(p.name for p in folder.iterdir() if p not in (whole, output))
+    return found + ([f"left behind: {left}"] if left else []), stops
