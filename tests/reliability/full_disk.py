@@ -47,7 +47,9 @@ def tried(folder: Path, kib: int, whole: Path) -> tuple[list[str], bool]:
             return [*found, f"unreadable: {error}"], True
         if told and not kept:
             found.append("was told to resume what is not there")
-        command = ["resume", OUTPUT] if kept else ["run", str(whole.parent / "e.json"), "-o", OUTPUT]
+        command = (
+            ["resume", OUTPUT] if kept else ["run", str(whole.parent / "e.json"), "-o", OUTPUT]
+        )
         code, said = done(*command, log=LOG)
         if code:
             return [*found, f"{command[0]} with room again: exit {code}: {said}"], True

@@ -78,7 +78,10 @@ def cases(scenes: int) -> Iterator[tuple[str, dict[str, Any], list[type[Componen
     of_plugins = plugins()
     for name, own in of_plugins.items():
         for file in sorted((PLUGINS / f"pbdkit-{name}" / "experiments").glob("*.yaml")):
-            parts = read_text(file.read_text(), file.name).data | {"steps": 12, "record": {"every": 3}}
+            parts = read_text(file.read_text(), file.name).data | {
+                "steps": 12,
+                "record": {"every": 3},
+            }
             yield f"{name}/{file.stem}", parts, own
     for own in ([], *of_plugins.values()):
         for component in own or pbdkit_components():

@@ -97,9 +97,9 @@ def race(seed: str, whole: Path, seconds: float, parts: dict[str, Any]) -> list[
     for command, code, words in zip(pair, codes, said, strict=True):
         if code and (code not in (2, 6) or not any(r in words for r in REFUSALS)):
             found.append(f"{pair}: {command} ended with {code}: {words}")
-    if 0 not in codes and not Path(OUTPUT).exists():
-        if done("resume", OUTPUT, log=Path("log"))[0]:
-            return [*found, f"{pair}: nobody finished: {said}"]
+    nobody = 0 not in codes and not Path(OUTPUT).exists()
+    if nobody and done("resume", OUTPUT, log=Path("log"))[0]:
+        return [*found, f"{pair}: nobody finished: {said}"]
     others = [p for p in Path.cwd().glob("out*.nc") if p.name != OUTPUT]
     for result in (Path(OUTPUT), *others):
         found += [f"{pair}: {result.name}: {d}" for d in differences(whole, result)]
