@@ -216,5 +216,10 @@ def reopened(
     written = standing.facts.get("written")
     if not isinstance(written, dict) or not {*waiting} <= {*written} == {*found.waiting}:
         raise StorageError("the store holds another dataset than the experiment makes")
-    found.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
+    try:
+        found.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
+    except StorageError:
+        raise
+    except Exception as error:  # whatever the libraries below make of it
+        raise StorageError(f"the store holds a damaged file: {error}") from None
     return found

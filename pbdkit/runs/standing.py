@@ -46,10 +46,26 @@ def take_up(
     state, seen = parts.get("state"), parts.get("seen")
     if not isinstance(seen, Seen) or not isinstance(state, State) or not state.fits(driver.state):
         raise StorageError("the state that was kept is not one of this experiment")
+    if not _is_possible(driver.scene, state, seen, parts):
+        raise StorageError("the state that was kept is damaged: it is none that a run comes to")
     if recorded is not None:
         parts["kept"] = seen.recorded = recorded
     driver.take_up(parts)
     recorder.seen = seen
+
+
+def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) -> bool:
+    """Whether steps follow each other, so that a run that goes on comes to its end."""
+    now, steps = state.step, scene.experiment.steps
+    guard, pace = parts.get("guard", {"good_step": 0, "next_look": now + 1}), parts.get("pace")
+    try:
+        past = [seen.step, seen.recorded, parts.get("kept", -1), guard["good_step"]]
+        coming = [guard["next_look"], pace.next_look if pace else now, steps]
+        whole = all(isinstance(step, int) for step in (now, *past, *coming))
+        in_order = min(past) >= -1 and max(past) <= now <= min(coming)
+        return whole and in_order and (now < guard["next_look"] or now == steps)
+    except (KeyError, TypeError, AttributeError):
+        return False
 
 
 def _parts(scene: Scene, standing: Standing) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -26,6 +27,8 @@ LONGEST = 2**26
 """Bytes of anything in the file that this program believes."""
 PATIENCE_S = 60.0
 """So long a commit waits for somebody who reads."""
+JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
+"""How a journal of SQLite ends that names another one."""
 MARK = 0x70626472
 """The application_id of the file: `pbdr`."""
 
@@ -43,6 +46,7 @@ class RunStore:
         """`mode` is ro, rw, or rwc to make it. To read what a killed process was writing, SQLite
         may have to write, so that nobody opens it but for both."""
         self.path, self._writes = path, mode != "ro"
+        _refuse_others(path)
         self._digests: dict[str, bytes] = {}
         with self._sqlite():
             # Nobody but the process's own writer thread uses it, one call after the other.
@@ -172,6 +176,15 @@ def array_of(
 def files_of(path: Path) -> list[Path]:
     """The files that SQLite keeps of a store."""
     return [path.with_name(path.name + more) for more in ("", "-journal", "-wal", "-shm")]
+
+
+def _refuse_others(path: Path) -> None:
+    """Raises StorageError where the journal names a further file, which SQLite would remove once
+    it has rolled back: no store has such a journal."""
+    with suppress(FileNotFoundError), Path(f"{path}-journal").open("rb") as journal:
+        journal.seek(max(0, journal.seek(0, os.SEEK_END) - len(JOURNAL_MARK)))
+        if journal.read() == JOURNAL_MARK:
+            raise StorageError(f"{path}-journal: names another file, and is none of pbdkit's")
 
 
 def _journal(path: Path) -> str:
