@@ -134,6 +134,8 @@ def warm_up() -> None:
         read_text(text, "shipped")
     for base in BASES:
         Experiment.build(Source(data=base))
+    gc.collect()
+    gc.freeze()  # what is there already is not gone through again and again
 
 
 def _base(name: str) -> Any:

@@ -24,6 +24,8 @@ def serve(case: Callable[[int], Outcome]) -> None:
     """The child: of every number that is read the outcome is written."""
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is no outcome
+    out.write("ready\n")
+    out.flush()
     for line in sys.stdin:
         out.write(json.dumps(case(int(line))) + "\n")
         out.flush()
@@ -41,16 +43,23 @@ def outcomes(
         return [outcome for share in found for outcome in share]
 
 
+def _started(command: list[str]) -> subprocess.Popen[str]:
+    """A child that has imported all that it needs."""
+    child = subprocess.Popen(
+        [sys.executable, *command, "serve"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert child.stdout.readline() == "ready\n", "the child cannot be started"
+    return child
+
+
 def _of_share(command: list[str], share: range, patience_s: float) -> Iterator[tuple[int, Outcome]]:
     child = None
     for number in share:
-        child = child or subprocess.Popen(
-            [sys.executable, *command, "serve"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
+        child = child or _started(command)
         watchdog = threading.Timer(patience_s, child.kill)
         watchdog.start()
         begun = time.monotonic()

@@ -31,7 +31,8 @@ from pbdkit.errors import PbdkitError  # noqa: E402
 from pbdkit.results.accessor import reading  # noqa: E402
 from pbdkit.results.snapshot import take_snapshots  # noqa: E402
 
-PATIENCE_S = 20.0
+PATIENCE_S, LONGEST_S = 120.0, 20.0
+"""After so many seconds a case is ended, and so many it may take."""
 TORN = ["--set=leaders.1.motion.velocity=[1.2, 0.0]", "--set=steps=12"]
 SUBJECTS = ("sealed", "sealed-zlib", "rewritten", "rewritten-zlib")
 
@@ -158,12 +159,14 @@ def tried(seed: int, number: int, folder: Path) -> Outcome:
     }
 
 
-def faults(outcome: Outcome) -> list[str]:
-    """What is wrong with how a case ended."""
+def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
+    """What is wrong with how a case ended, with `slack` times the time."""
     how, what = outcome["how"], outcome.get("what", "")
     found = []
     if how in ("hang", "crash", "read, differs, silently") or how.startswith("undocumented"):
         found.append(f"{how}: {what}")
+    if outcome.get("seconds", 0.0) > LONGEST_S * slack:
+        found.append(f"{outcome['seconds']:.1f} s: {what}")
     if outcome.get("passes") and outcome["changed"]:
         found.append(f"verify finds nothing: {what}")
     if not outcome.get("changed", True) and "the same" not in how:
