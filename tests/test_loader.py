@@ -15,6 +15,10 @@ from plugin_sources import BROKEN, NEWER, listed, rule
 import pbdkit
 from pbdkit.cli import COMMANDS
 from pbdkit.registry.registry import Registry
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import Run, record
+from pbdkit.scene.scene import build_scene
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -25,6 +29,8 @@ TEARING = "--set=fracture={type: strain, failure: 0.05}"
 EVERY_COMMAND = {
     "run": ["run", "e.json", HEALTHY, TEARING, "-o", "torn.nc"],
     "sweep": ["sweep", "s.json", "--workers", "1"],
+    "resume": ["resume", "torn.nc", "--steps", "12", "--anyway"],
+    "status": ["status", "left.nc"],
     "check": ["check", "e.json", HEALTHY],
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
@@ -44,8 +50,11 @@ CHEAP = [name for name in EVERY_COMMAND if name not in ("bench", "plot")]
 
 
 @pytest.fixture
-def healthy(install: Install) -> None:
+def healthy(install: Install, call: Call) -> None:
+    """The plugin, and an unfinished run of left.nc."""
     install("zz-healthy", rule("zz-healthy"), "2.1")
+    run = Run(build_scene(pbdkit.load("e.json")), watch=Watch(lambda: True))
+    record(run, NetcdfSink(Path("left.nc")))
 
 
 def test_every_command_is_tried() -> None:

@@ -16,8 +16,8 @@ from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.trial import opened_unsealed, try_reading
+from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
-from pbdkit.storage.unfinished import STORE, store_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
