@@ -174,8 +174,9 @@ class NetcdfSink(Sink):
             self.abandon()
             raise
         except (OSError, RuntimeError, ValueError) as error:
+            reason = self._reason(error)
             self.abandon()
-            raise StorageError(f"{path}: cannot be written: {self._reason(error)}") from None
+            raise StorageError(f"{path}: cannot be written: {reason}") from None
 
     def _reason(self, error: Exception) -> str:
         """The disk's own, where it has one: the library says little."""

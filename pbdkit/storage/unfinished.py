@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.storage.file_system import opened_alone, sync_folder
-from pbdkit.storage.paged_file import PagedFile
+from pbdkit.storage.paged_file import PAGE, PagedFile
 from pbdkit.storage.run_store import (
     FORMAT,
     RunStore,
@@ -162,7 +162,8 @@ class UnfinishedRun:
         rows = [self._store.piece(key) for key in self._store.keys(EXTENTS)]
         table = np.frombuffer(b"".join(rows), EXTENT)
         extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
-        if layout != {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}:
+        counts = {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}
+        if layout != counts or any(len(page) != PAGE for page in pages.values()):
             raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")
         end = extents[-1].stop if extents else 0
         if end > os.fstat(self.disk.fileno()).st_size:
@@ -221,17 +222,19 @@ def remove_unfinished(output: Path) -> None:
 def is_unfinished(output: Path, *, discard: bool = False) -> bool:
     """Whether there is a run to go on with. What one left behind that committed nothing is removed,
     and, to `discard` it, any. Raises ExperimentError where one is going on."""
-    with _alone(output):
+    with _alone(output) as ours:
         committed = not discard and has_committed(output)
-        if not committed:
+        if ours and not committed:
             remove_unfinished(output)
         return committed
 
 
 @contextmanager
-def _alone(output: Path) -> Iterator[None]:
-    """Nobody else writes the run meanwhile. At its end its records have the name of the result."""
-    for path in (records_of(output), output) if store_of(output).exists() else [records_of(output)]:
+def _alone(output: Path) -> Iterator[bool]:
+    """Whether there is a run, which nobody else writes meanwhile. At its end its records have the
+    name of the result."""
+    there = store_of(output).exists()
+    for path in (records_of(output), output) if there else [records_of(output)]:
         try:
             file = opened_alone(path)
         except (FileNotFoundError, NotADirectoryError):
@@ -241,9 +244,9 @@ def _alone(output: Path) -> Iterator[None]:
         if file is None:
             raise _written(output)
         with file:
-            yield
+            yield True
         return
-    yield
+    yield there
 
 
 def _written(output: Path) -> ExperimentError:
@@ -263,6 +266,6 @@ def has_committed(output: Path) -> bool:
 
 
 def _remove_store(output: Path) -> None:
-    for path in files_of(store_of(output)):
+    for path in reversed(files_of(store_of(output))):
         with suppress(OSError):
             path.unlink(missing_ok=True)
