@@ -35,17 +35,19 @@ def remove_unfinished(output: Path) -> None:
 def is_unfinished(output: Path, *, discard: bool = False) -> bool:
     """Whether there is a run to go on with. What one left behind that committed nothing is removed,
     and, to `discard` it, any. Raises ExperimentError where one is going on."""
-    with _alone(output):
+    with _alone(output) as ours:
         committed = not discard and has_committed(output)
-        if not committed:
+        if ours and not committed:
             remove_unfinished(output)
         return committed
 
 
 @contextmanager
-def _alone(output: Path) -> Iterator[None]:
-    """Nobody else writes the run meanwhile. At its end its records have the name of the result."""
-    for path in (records_of(output), output) if store_of(output).exists() else [records_of(output)]:
+def _alone(output: Path) -> Iterator[bool]:
+    """Whether there is a run, which nobody else writes meanwhile. At its end its records have the
+    name of the result."""
+    there = store_of(output).exists()
+    for path in (records_of(output), output) if there else [records_of(output)]:
         try:
             file = opened_alone(path)
         except (FileNotFoundError, NotADirectoryError):
@@ -55,9 +57,9 @@ def _alone(output: Path) -> Iterator[None]:
         if file is None:
             raise being_written(output)
         with file:
-            yield
+            yield True
         return
-    yield
+    yield there
 
 
 def being_written(output: Path) -> ExperimentError:
@@ -79,6 +81,6 @@ def has_committed(output: Path) -> bool:
 
 def remove_store(output: Path) -> None:
     """Without its records, which the result may have become."""
-    for path in files_of(store_of(output)):
+    for path in reversed(files_of(store_of(output))):
         with suppress(OSError):
             path.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import opened_alone, sync_folder
-from pbdkit.storage.paged_file import PagedFile
+from pbdkit.storage.paged_file import PAGE, PagedFile
 from pbdkit.storage.run_files import (
     being_written,
     records_of,
@@ -165,7 +165,8 @@ class UnfinishedRun:
         rows = [self._store.piece(key) for key in self._store.keys(EXTENTS)]
         table = np.frombuffer(b"".join(rows), EXTENT)
         extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
-        if layout != {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}:
+        counts = {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}
+        if layout != counts or any(len(page) != PAGE for page in pages.values()):
             raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")
         end = extents[-1].stop if extents else 0
         if end > os.fstat(self.disk.fileno()).st_size:

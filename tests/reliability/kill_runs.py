@@ -42,6 +42,7 @@ from pbdkit.storage import run_store, unfinished
 from pbdkit.storage.file_system import is_local
 from pbdkit.storage.run_status import status_of
 
+KINDS = tuple(EXPERIMENTS)
 MOST_KILLS = 4
 ACKNOWLEDGED = "acknowledged"
 NUMBER = struct.Struct("<q")
@@ -206,17 +207,18 @@ def main() -> None:
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--seed", type=int, default=1)
     asked.add_argument("--only", type=int)
+    asked.add_argument("--kinds", nargs="+", default=[*KINDS])
     given = asked.parse_args()
     print(f"seed {given.seed}")
     numbers = range(given.trials) if given.only is None else [given.only]
-    failed, kills, lost, unreadable = tried(given.seed, numbers)
+    failed, kills, lost, unreadable = tried(given.seed, numbers, given.kinds)
     row("kill -9: acknowledged records lost 0", f"{lost} in {len(numbers)} runs, {kills} kills")
     row("kill -9: unreadable runs 0", f"{unreadable} in {len(numbers)}")
     row("kill -9: resumed runs that differ in a bit 0", f"{failed} in {len(numbers)}")
     raise SystemExit(failed > 0)
 
 
-def tried(seed: int, numbers: Any, kinds: Any = tuple(EXPERIMENTS)) -> tuple[int, int, int, int]:
+def tried(seed: int, numbers: Any, kinds: list[str]) -> tuple[int, int, int, int]:
     """Trials that found something, kills, records lost, runs unreadable."""
     failed = kills = lost = unreadable = 0
     here = Path.cwd()

@@ -39,6 +39,7 @@ from pbdkit.results import destination
 from pbdkit.storage import unfinished
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
+KINDS = tuple(PARTS)
 PAIRS = [("run", "run"), ("run", "resume"), ("resume", "resume"), ("run --force", "run --force")]
 PAIRS.append(("run --force", "resume"))
 REFUSALS = ("being written", "exists", "unfinished", "another run", "appeared while", "is finished")
@@ -117,16 +118,17 @@ def main() -> None:
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--seed", type=int, default=1)
     asked.add_argument("--only", type=int)
+    asked.add_argument("--kinds", nargs="+", default=[*KINDS])
     given = asked.parse_args()
     numbers = range(given.trials) if given.only is None else [given.only]
-    failed = tried(given.seed, numbers)
+    failed = tried(given.seed, numbers, given.kinds)
     row("two writers: damaged files 0, runs lost 0", f"{failed} in {len(numbers)} races")
     raise SystemExit(failed > 0)
 
 
-def tried(seed: int, numbers: Any) -> int:
+def tried(seed: int, numbers: Any, kinds: list[str]) -> int:
     """In how many races something was found."""
-    failed, here, kinds = 0, Path.cwd(), tuple(PARTS)
+    failed, here = 0, Path.cwd()
     with tempfile.TemporaryDirectory() as name:
         wholes = {kind: reference(PARTS[kind], Path(name, kind)) for kind in kinds}
         for number in numbers:
