@@ -71,9 +71,10 @@ def tried(content: bytes, settings: list[str], *, quick: bool = False) -> Outcom
         outcome = _checked(path, settings, quick)
         seconds = time.process_time() - begun
         _, peak = resident()
+    text = b"\n".join([content, *(os.fsencode(setting) for setting in settings)])
     return outcome | {
-        "text_mb": len(content) / 1e6,
-        "marks": marks(content),
+        "text_mb": len(text) / 1e6,
+        "marks": marks(text),
         "seconds": seconds,
         "mb": max(0.0, (peak - before) / 1e6),
     }
