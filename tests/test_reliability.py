@@ -30,7 +30,8 @@ from pbdkit.storage import run_store, unfinished
 from pbdkit.storage.file_system import is_local
 from pbdkit.storage.run_status import status_of
 from pbdkit.storage.run_store import RunStore
-from pbdkit.storage.unfinished import UnfinishedRun, store_of
+from pbdkit.storage.run_files import store_of
+from pbdkit.storage.unfinished import UnfinishedRun
 
 FOLDER = Path(__file__).parent / "reliability"
 sys.path.append(str(FOLDER))
