@@ -1,5 +1,6 @@
 """Files without seal are tried in another process; samples of the long trials of files."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -86,6 +87,20 @@ def test_sound_files_pass(bare):
         dataset = pbdkit.open(bare)
     with dataset, opened_unsealed(bare) as plain:
         xarray.testing.assert_identical(dataset.load(), plain.load())
+
+
+def test_the_child_finds_this_pbdkit_from_anywhere(bare):
+    """As where Python was started beside the package, and left for another folder."""
+    code = "import os, sys, pbdkit; os.chdir('/'); pbdkit.open(sys.argv[1]).close()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, bare],
+        cwd=Path(pbdkit.__file__).parents[1],
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "carries no seal" in done.stderr
 
 
 def test_more_than_a_file_can_hold_is_refused(bare, tmp_path):

@@ -51,7 +51,8 @@ def try_reading(path: Path) -> None:
     """Raises StorageError where the file is no netCDF file, or reading it fails, crashes or comes
     to no end."""
     refuse_no_result(path)
-    paths = os.pathsep.join(filter(None, sys.path))
+    # What is imported here is imported there, from wherever either runs.
+    paths = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[2])])
     done = subprocess.run(
         [sys.executable, "-P", "-m", "pbdkit.results.trial", str(path.absolute())],
         env=os.environ | {"PYTHONPATH": paths},
