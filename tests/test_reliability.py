@@ -63,7 +63,10 @@ def test_runs_that_are_stopped_and_gone_on_with_are_the_same(
         patch.setattr(netcdf_sink, "EVERY_S", 0.0)
         patch.setattr(netcdf_sink, "SHARE", 0)
         patch.setitem(NetcdfSink.__init__.__kwdefaults__, "first_s", 0.0)
-        found, _ = resumed_otherwise(parts, Path(folder), random.Random(seed), engines=[NUMPY])
+        try:
+            found, _ = resumed_otherwise(parts, Path(folder), random.Random(seed), engines=[NUMPY])
+        except pbdkit.ExperimentError:  # no scene
+            return
     assert found == []
 
 

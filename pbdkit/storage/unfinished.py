@@ -159,8 +159,8 @@ class UnfinishedRun:
         pages = {}
         for key in self._store.keys(PAGES):
             pages[int(key.removeprefix(PAGES))] = self._store.piece(key)
-        rows = [self._store.piece(key) for key in self._store.keys(EXTENTS)]
-        table = np.frombuffer(b"".join(rows), EXTENT)
+        rows = b"".join(self._store.piece(key) for key in self._store.keys(EXTENTS))
+        table = np.frombuffer(rows[: len(rows) // EXTENT.itemsize * EXTENT.itemsize], EXTENT)
         extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
         counts = {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}
         if layout != counts or any(len(page) != PAGE for page in pages.values()):
@@ -258,11 +258,15 @@ def _written(output: Path) -> ExperimentError:
 
 def has_committed(output: Path) -> bool:
     """Whether anything of a run was kept that is not finished. Raises StorageError."""
-    store = store_of(output)
-    if not store.exists() or (output.exists() and not records_of(output).exists()):
+    if not is_left(output):
         return False
-    with RunStore(store) as found:
+    with RunStore(store_of(output)) as found:
         return found.made and bool(found.keys("about"))
+
+
+def is_left(output: Path) -> bool:
+    """Whether there is a store, and its records have not got the name of the result yet."""
+    return store_of(output).exists() and (records_of(output).exists() or not output.exists())
 
 
 def _remove_store(output: Path) -> None:
