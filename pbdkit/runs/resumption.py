@@ -66,7 +66,9 @@ def resumption(
 def _unfinished(output: Path, watch: Watch, steps: int | None, anyway: bool) -> Resumption | None:
     left = UnfinishedRun.open(output, writing=True)
     try:
-        about, origin = left.about, left.about.get("origin", {})
+        about, origin = left.about, left.about.get("origin")
+        if not isinstance(origin, dict):
+            raise StorageError("what is noted under 'origin' is damaged")
         sink = NetcdfSink(output, replace=origin.get("replace") is True, origin=origin)
         if "finished" in left.facts:
             sink.conclude(left)

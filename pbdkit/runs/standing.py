@@ -42,7 +42,7 @@ def take_up(
 ) -> None:
     """Lets a run that has not begun go on from there; `recorded` is the last step recorded, where
     that is another one than was kept. Raises StorageError for the standing of another scene."""
-    parts = _parts(driver.scene, standing)
+    parts = _parts(driver, standing)
     state, seen = parts.get("state"), parts.get("seen")
     if not isinstance(seen, Seen) or not isinstance(state, State) or not state.fits(driver.state):
         raise StorageError("the state that was kept is not one of this experiment")
@@ -68,8 +68,27 @@ def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) 
         return False
 
 
-def _parts(scene: Scene, standing: Standing) -> dict[str, Any]:
+def _is_like(found: Any, own: Any) -> bool:
+    """Whether facts are of the kinds of a run's own; what it does not know yet may be a number, an
+    array, or numbers."""
+    if isinstance(own, dict) and "array" not in own:
+        same = isinstance(found, dict) and found.keys() == own.keys()
+        return same and all(_is_like(found[key], part) for key, part in own.items())
+    if isinstance(found, list):
+        return (own is None or isinstance(own, list)) and all(
+            _is_like(part, None) for part in found
+        )
+    if isinstance(found, dict):
+        return found.keys() == {"array"} and (own is None or isinstance(own, dict))
+    if isinstance(own, str) or isinstance(found, str):
+        return isinstance(own, str) and isinstance(found, str)
+    return found is None or (isinstance(found, int | float) and abs(found) < 2**63)
+
+
+def _parts(driver: Driver, standing: Standing) -> dict[str, Any]:
     kinds = dict(KINDS)
+    own = taken_apart(driver.standing(), "run", Arrays())
+    scene = driver.scene
     if scene.experiment.stepping.settle:
         from pbdkit.equilibrium.settlement import Pace
 
@@ -78,5 +97,7 @@ def _parts(scene: Scene, standing: Standing) -> dict[str, Any]:
         facts = {**standing.facts["run"], "seen": standing.facts["seen"]}
     except (KeyError, TypeError) as error:
         raise StorageError(f"the state that was kept is damaged: {error}") from None
+    if not _is_like(standing.facts["run"], own):
+        raise StorageError("the state that was kept is damaged: it is of other kinds")
     found: dict[str, Any] = put_together(facts, standing.arrays, kinds)
     return found

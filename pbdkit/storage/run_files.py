@@ -72,11 +72,15 @@ def being_written(output: Path) -> ExperimentError:
 
 def has_committed(output: Path) -> bool:
     """Whether anything of a run was kept that is not finished. Raises StorageError."""
-    store = store_of(output)
-    if not store.exists() or (output.exists() and not records_of(output).exists()):
+    if not is_left(output):
         return False
-    with RunStore(store) as found:
+    with RunStore(store_of(output)) as found:
         return found.made and bool(found.keys("about"))
+
+
+def is_left(output: Path) -> bool:
+    """Whether there is a store, and its records have not got the name of the result yet."""
+    return store_of(output).exists() and (records_of(output).exists() or not output.exists())
 
 
 def remove_store(output: Path) -> None:

@@ -162,8 +162,8 @@ class UnfinishedRun:
         pages = {}
         for key in self._store.keys(PAGES):
             pages[int(key.removeprefix(PAGES))] = self._store.piece(key)
-        rows = [self._store.piece(key) for key in self._store.keys(EXTENTS)]
-        table = np.frombuffer(b"".join(rows), EXTENT)
+        rows = b"".join(self._store.piece(key) for key in self._store.keys(EXTENTS))
+        table = np.frombuffer(rows[: len(rows) // EXTENT.itemsize * EXTENT.itemsize], EXTENT)
         extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
         counts = {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}
         if layout != counts or any(len(page) != PAGE for page in pages.values()):

@@ -23,8 +23,10 @@ import xarray  # noqa: E402, F401
 
 import pbdkit  # noqa: E402
 import pbdkit.analysis.forecast  # noqa: E402
+import pbdkit.cli.run  # noqa: E402
 import pbdkit.results.accessor  # noqa: E402
 import pbdkit.runs.resumption  # noqa: E402
+import pbdkit.storage.run_status  # noqa: E402
 from pbdkit.cli import main  # noqa: E402
 from pbdkit.results import netcdf_sink  # noqa: E402
 from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink  # noqa: E402

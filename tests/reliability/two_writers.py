@@ -37,6 +37,7 @@ from trials import (
 
 from pbdkit.results import destination
 from pbdkit.storage import unfinished
+from pbdkit.storage.unfinished import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
 KINDS = tuple(PARTS)
@@ -78,7 +79,7 @@ def race(seed: str, whole: Path, seconds: float, parts: dict[str, Any]) -> list[
     if "resume" in pair:
         pid = called("run", "e.json", "-o", OUTPUT, log=Path("log"))
         end = time.monotonic() + 20.0
-        while not Path(OUTPUT + ".run").exists() and time.monotonic() < end:
+        while not has_committed(Path(OUTPUT)) and time.monotonic() < end:
             time.sleep(0.005)
         time.sleep(draw.uniform(0.0, 0.5 * seconds))
         os.kill(pid, signal.SIGKILL)
