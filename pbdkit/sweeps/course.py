@@ -60,7 +60,7 @@ def carry_out(
     Raises ExperimentError and PluginError before anything runs, and StorageError. `stopping` is
     asked all the time; once it says so, what is finished is kept and there is no dataset.
     """
-    grid, members, versions = _validated(asked, show)
+    grid, members, versions = validated(asked, show)
     jobs = {member.job.key: member.job for member in members}
     with Store(folder) as store:
         ends, faults = store.held()
@@ -99,8 +99,9 @@ def _heard(
         yield report
 
 
-def _validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
-    """The grid, the members on it, and the versions of what they use."""
+def validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
+    """The grid, the members on it, and the versions of what they use. Raises ExperimentError and
+    PluginError."""
     experiment = asked.experiment()
     grid, outlook = asked.grid(experiment), Outlook(asked.sweep.keep, asked.sweep.count)
     members: list[Member] = []

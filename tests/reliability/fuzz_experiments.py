@@ -101,10 +101,15 @@ def _checked(path: Path, settings: list[str], quick: bool) -> Outcome:
         how = f"refused ({error.exit_status}), {stage}"
         return {"how": how, "status": error.exit_status, "length": len(text), "said": text[:150]}
     except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        said = f"{type(error).__name__}: {str(error)[:150]} ({place.filename[-40:]}:{place.lineno})"
-        return {"how": "undocumented error", "said": said}
+        return undocumented(error)
     return {"how": "valid", "scene_mb": scene_mb}
+
+
+def undocumented(error: Exception) -> Outcome:
+    """With its place."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    said = f"{type(error).__name__}: {str(error)[:150]} ({place.filename[-40:]}:{place.lineno})"
+    return {"how": "undocumented error", "said": said}
 
 
 def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
