@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any
 
 from pbdkit.storage.seal import BLOCK, BrokenSealError, Extent, digest, put_seal
@@ -86,9 +86,8 @@ class PagedFile(io.RawIOBase):
         view = view[: max(0, self.size - self._place)]
         self.verify(self._place, self._place + len(view))
         view[:] = self._on_disk(self._place, len(view))
-        for page, inside, outside in _overlaps(self._place, len(view)):
-            if page in self.pages:
-                view[outside] = self.pages[page][inside]
+        for page, inside, outside in _overlaps(self._place, len(view), self.pages):
+            view[outside] = self.pages[page][inside]
         self._place += len(view)
         return len(view)
 
@@ -99,10 +98,9 @@ class PagedFile(io.RawIOBase):
         to_disk = values and self._place >= self._append_from
         if to_disk:
             self._append(view)
-        for page, inside, outside in _overlaps(self._place, len(view)):
+        there = self.pages if to_disk else None
+        for page, inside, outside in _overlaps(self._place, len(view), there):
             if page not in self.pages:
-                if to_disk:
-                    continue
                 self.pages[page] = bytearray(self._on_disk(page * PAGE, PAGE))
             self.pages[page][inside] = view[outside]
             self.changed.add(page)
@@ -190,10 +188,14 @@ class PagedFile(io.RawIOBase):
         return self.disk.read(length).ljust(length, b"\0")
 
 
-def _overlaps(begin: int, length: int) -> Iterator[tuple[int, slice, slice]]:
-    """The pages that some bytes touch: number, part of the page, part of the bytes."""
+def _overlaps(
+    begin: int, length: int, among: Container[int] | None = None
+) -> Iterator[tuple[int, slice, slice]]:
+    """The pages that some bytes touch, all or those `among` some: number, part of the page, part of
+    the bytes."""
     end = begin + length
-    for page in range(begin // PAGE, -(-end // PAGE)):
+    touched = range(begin // PAGE, -(-end // PAGE))
+    for page in touched if among is None else [page for page in touched if page in among]:
         first, last = max(begin, page * PAGE), min(end, (page + 1) * PAGE)
         inside = slice(first - page * PAGE, last - page * PAGE)
         yield page, inside, slice(first - begin, last - begin)

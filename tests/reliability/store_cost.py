@@ -1,6 +1,6 @@
 """What it costs to keep unfinished runs, against the same without; in turns, medians of pairs.
 
-python tests/reliability/store_cost.py [--turns N] [--seconds S]
+python tests/reliability/store_cost.py [--turns N] [--records N]
 """
 
 from __future__ import annotations
@@ -75,12 +75,11 @@ def one_record_in_100_ms(folder: Path, turns: int, length_s: float) -> tuple[flo
     return in_pairs(kept, plain, turns)
 
 
-def against_raw(folder: Path, turns: int, length_s: float) -> tuple[float, str]:
+def against_raw(folder: Path, turns: int, records: int) -> tuple[float, str]:
     """1000², every tenth step, against stepping and plain writing of the same bytes, synced."""
     solver = {"type": "stepping", "engine": "compiled", "threads": 1}
     running = Running(moving(1000, solver=solver), 10)
     running()
-    records = max(2, round(length_s / (2.5 * seconds(running))))
     parts = moving(1000, solver=solver, steps=10 * records, record={"every": 10})
     path, plain = folder / "out.nc", folder / "plain"
     work = recording(parts, path)
@@ -113,17 +112,17 @@ def files_of_short_runs(folder: Path) -> int:
 def main() -> None:
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     asked.add_argument("--turns", type=int, default=5)
-    asked.add_argument("--seconds", type=float, default=30.0)
+    asked.add_argument("--records", type=int, default=500)
     asked.add_argument("--folder", help="on the disk to measure")
     given = asked.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as name:
         folder = Path(name)
         row("a run of less than a second leaves 0 files", f"{files_of_short_runs(folder)}")
-        found, told = one_record_in_100_ms(folder, given.turns, min(given.seconds, 10.0))
+        found, told = one_record_in_100_ms(folder, 2 * given.turns, 4.0)
         row("store, 64 KiB each 100 ms: at most 1.05", f"{found:.3f} ({told})")
-        found, told = against_raw(folder, given.turns, 0.5)
-        row("recording within a second against raw: at most 1.3", f"{found:.3f} ({told})")
-        found, told = against_raw(folder, given.turns, given.seconds)
+        found, told = against_raw(folder, given.turns, 20)
+        row("20 records, about a second, against raw: at most 1.3", f"{found:.3f} ({told})")
+        found, told = against_raw(folder, given.turns, given.records)
         row("recording, store included, against raw: at most 1.5", f"{found:.3f} ({told})")
 
 
