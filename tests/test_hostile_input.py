@@ -23,7 +23,7 @@ from pbdkit.runs.course import rehearse
 from pbdkit.scene.scene import build_scene
 
 Call = Callable[..., Any]
-SOON_S = 2.0
+SOON_S = 5.0
 """Of processor time, so that a busy machine does not decide."""
 
 

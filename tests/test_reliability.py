@@ -41,14 +41,14 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs.py --trials 10 --kinds breaking settling",
+        "kill_runs.py --trials 20 --kinds breaking",
         "two_writers.py --trials 6 --kinds small",
-        "mutate_stores.py --trials 8 --kinds breaking",
+        "mutate_stores.py --trials 6 --kinds breaking",
     ],
 )
 def test_a_sample_of_the_long_trials(trial: str) -> None:
     script, *words = trial.split()
-    command = [sys.executable, str(FOLDER / script), *words, "--seed", str(random.randrange(10**6))]
+    command = [sys.executable, str(FOLDER / script), *words, "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
