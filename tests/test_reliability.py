@@ -26,11 +26,12 @@ import pbdkit
 from pbdkit.results import netcdf_sink
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.storage import run_store, unfinished
+from pbdkit.storage import run_store
 from pbdkit.storage.file_system import is_local
+from pbdkit.storage.leftovers import store_of
 from pbdkit.storage.run_status import status_of
 from pbdkit.storage.run_store import RunStore
-from pbdkit.storage.unfinished import UnfinishedRun, store_of
+from pbdkit.storage.unfinished import UnfinishedRun
 
 FOLDER = Path(__file__).parent / "reliability"
 sys.path.append(str(FOLDER))
@@ -40,9 +41,9 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs.py --trials 10 --kinds breaking settling",
-        "two_writers.py --trials 6 --kinds small",
-        "mutate_stores.py --trials 8 --kinds breaking",
+        "kill_runs.py --trials 4 --kinds breaking",
+        "two_writers.py --trials 3 --kinds small",
+        "mutate_stores.py --trials 5 --kinds breaking",
     ],
 )
 def test_a_sample_of_the_long_trials(trial: str) -> None:
@@ -284,7 +285,7 @@ def test_what_has_its_name_and_was_killed_before_its_store_went_is_finished(
     with monkeypatch.context() as patch:
         patch.setattr(UnfinishedRun, "remove", lambda self: self.close())
         assert call("run", "e.json", "-o", str(OUT)).code == 0
-    assert unfinished.store_of(OUT).exists()
+    assert store_of(OUT).exists()
     assert "is finished" in call("status", str(OUT)).err
     assert "is finished" in call("resume", str(OUT)).err
     assert is_whole(right)

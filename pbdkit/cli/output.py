@@ -79,7 +79,7 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 def refuse_unfinished(path: Path, *, force: bool) -> None:
     """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
     process is writing it."""
-    from pbdkit.storage.unfinished import is_unfinished
+    from pbdkit.storage.leftovers import is_unfinished
 
     if is_unfinished(path, discard=force):
         raise ExperimentError(

@@ -15,8 +15,8 @@ from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.unfinished_dataset import unfinished_dataset
+from pbdkit.storage.leftovers import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
-from pbdkit.storage.unfinished import STORE, store_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

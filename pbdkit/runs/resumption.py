@@ -22,9 +22,10 @@ from pbdkit.results.recorder import Recorder, columns_of
 from pbdkit.runs.course import Report, Run, record
 from pbdkit.runs.standing import take_up
 from pbdkit.scene.scene import build_scene
+from pbdkit.storage.leftovers import is_unfinished
 from pbdkit.storage.seal import opened
 from pbdkit.storage.standing import Standing
-from pbdkit.storage.unfinished import UnfinishedRun, is_unfinished
+from pbdkit.storage.unfinished import UnfinishedRun
 
 ENDED = ("complete", "settled", "interrupted")
 """The status of results that can be continued."""

@@ -9,7 +9,8 @@ from typing import Any
 
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import lock
-from pbdkit.storage.unfinished import UnfinishedRun, has_committed, is_left, store_of
+from pbdkit.storage.leftovers import has_committed, is_left, store_of
+from pbdkit.storage.unfinished import UnfinishedRun
 
 
 def status_of(output: Path) -> dict[str, Any] | None:

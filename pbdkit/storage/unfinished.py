@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import opened_alone, sync_folder
+from pbdkit.storage.leftovers import (
+    being_written,
+    records_of,
+    remove_store,
+    remove_unfinished,
+    store_of,
+)
 from pbdkit.storage.paged_file import PAGE, PagedFile
 from pbdkit.storage.run_store import (
     FORMAT,
     RunStore,
     array_of,
-    files_of,
     json_piece,
     parts_of,
 )
 from pbdkit.storage.seal import Extent
 from pbdkit.storage.standing import Arrays, Standing
 
-STORE, RECORDS = ".run", ".run-records"
-"""Behind the name of the output: the store, and the file of large values."""
 EXTENT = np.dtype([("start", "<u8"), ("stop", "<u8"), ("digest", "<u8")])
 LARGEST_ARRAY = 2**40
 PAGES, EXTENTS, ARRAYS = "page/", "extents/", "array/"
@@ -83,7 +86,7 @@ class UnfinishedRun:
         except OSError as error:
             raise StorageError(f"{records}: cannot be read: {error.strerror}") from None
         if disk is None:
-            raise _written(output)
+            raise being_written(output)
         try:
             opened = cls(output, disk, RunStore(store, mode="rw" if writing else "ro"))
             opened._refuse_newer()
@@ -184,7 +187,7 @@ class UnfinishedRun:
     def remove(self) -> None:
         """Once the records have the name of the result: the store goes, and then the lock."""
         self._store.close()
-        _remove_store(self.output)
+        remove_store(self.output)
         self.disk.close()
 
     def _dict(self, key: str) -> dict[str, Any]:
@@ -200,76 +203,3 @@ class UnfinishedRun:
                 f"{self._store.path}: is of format {found}, and this pbdkit reads {FORMAT}; take "
                 "the pbdkit that wrote it"
             )
-
-
-def store_of(output: Path) -> Path:
-    """The SQLite file of an unfinished run."""
-    return output.with_name(output.name + STORE)
-
-
-def records_of(output: Path) -> Path:
-    """The file of its large values."""
-    return output.with_name(output.name + RECORDS)
-
-
-def remove_unfinished(output: Path) -> None:
-    """Removes the files of a store; the records last, whose lock keeps others away."""
-    _remove_store(output)
-    with suppress(OSError):
-        records_of(output).unlink(missing_ok=True)
-
-
-def is_unfinished(output: Path, *, discard: bool = False) -> bool:
-    """Whether there is a run to go on with. What one left behind that committed nothing is removed,
-    and, to `discard` it, any. Raises ExperimentError where one is going on."""
-    with _alone(output) as ours:
-        committed = not discard and has_committed(output)
-        if ours and not committed:
-            remove_unfinished(output)
-        return committed
-
-
-@contextmanager
-def _alone(output: Path) -> Iterator[bool]:
-    """Whether there is a run, which nobody else writes meanwhile. At its end its records have the
-    name of the result."""
-    there = store_of(output).exists()
-    for path in (records_of(output), output) if there else [records_of(output)]:
-        try:
-            file = opened_alone(path)
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        except OSError as error:
-            raise StorageError(f"{path}: {error.strerror}") from None
-        if file is None:
-            raise _written(output)
-        with file:
-            yield True
-        return
-    yield there
-
-
-def _written(output: Path) -> ExperimentError:
-    return ExperimentError(
-        f"{output}: is being written by another run; `pbdkit status {output}` says how far it is; "
-        "-o names another file"
-    )
-
-
-def has_committed(output: Path) -> bool:
-    """Whether anything of a run was kept that is not finished. Raises StorageError."""
-    if not is_left(output):
-        return False
-    with RunStore(store_of(output)) as found:
-        return found.made and bool(found.keys("about"))
-
-
-def is_left(output: Path) -> bool:
-    """Whether there is a store, and its records have not got the name of the result yet."""
-    return store_of(output).exists() and (records_of(output).exists() or not output.exists())
-
-
-def _remove_store(output: Path) -> None:
-    for path in reversed(files_of(store_of(output))):
-        with suppress(OSError):
-            path.unlink(missing_ok=True)

@@ -22,7 +22,8 @@ from pbdkit.runs import drivers
 from pbdkit.runs.course import Report, Run, record
 from pbdkit.runs.standing import take_up
 from pbdkit.scene.scene import build_scene
-from pbdkit.storage.unfinished import UnfinishedRun, is_unfinished
+from pbdkit.storage.leftovers import is_unfinished
+from pbdkit.storage.unfinished import UnfinishedRun
 
 Components = Iterable[type[Component]]
 MOST_STOPS = 4

@@ -24,7 +24,7 @@ from sheets import Running, moving, scene_of
 from pbdkit.results.netcdf_sink import FIRST_S, NetcdfSink
 from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.runs.course import Run, record
-from pbdkit.storage.unfinished import store_of
+from pbdkit.storage.leftovers import store_of
 
 NEVER = 1e9
 Work = Callable[[], object]

@@ -37,7 +37,7 @@ from trials import (
 
 from pbdkit.results import destination
 from pbdkit.storage import unfinished
-from pbdkit.storage.unfinished import has_committed
+from pbdkit.storage.leftovers import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
 KINDS = tuple(PARTS)
