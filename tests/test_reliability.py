@@ -26,7 +26,7 @@ import pbdkit
 from pbdkit.results import netcdf_sink
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.storage import run_store, unfinished
+from pbdkit.storage import run_store
 from pbdkit.storage.file_system import is_local
 from pbdkit.storage.run_files import store_of
 from pbdkit.storage.run_status import status_of
@@ -285,7 +285,7 @@ def test_what_has_its_name_and_was_killed_before_its_store_went_is_finished(
     with monkeypatch.context() as patch:
         patch.setattr(UnfinishedRun, "remove", lambda self: self.close())
         assert call("run", "e.json", "-o", str(OUT)).code == 0
-    assert unfinished.store_of(OUT).exists()
+    assert store_of(OUT).exists()
     assert "is finished" in call("status", str(OUT)).err
     assert "is finished" in call("resume", str(OUT)).err
     assert is_whole(right)

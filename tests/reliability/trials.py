@@ -88,6 +88,7 @@ def often(first_s: float = 0.0) -> None:
 
 def started(work: Callable[[], object], log: Path) -> int:
     """A process that does the work and exits as it does; what it says goes to the log."""
+    log.touch()  # it may be killed before it says anything
     if pid := os.fork():
         return pid
     code = 70
