@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +24,9 @@ settings.register_profile("anywhere", deadline=None)
 settings.register_profile("landing", derandomize=True, deadline=None)
 settings.register_profile("long", max_examples=2000, deadline=None)
 settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
+
+# A shell that runs tests in the background has Ctrl-C ignored; processes started here hear it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config: pytest.Config) -> None:

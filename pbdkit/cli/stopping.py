@@ -45,7 +45,8 @@ def asked_to_stop() -> Iterator[Stop]:
     ours = threading.current_thread() is threading.main_thread()
     found = [getattr(signal, name) for name in NAMES if hasattr(signal, name)] if ours else []
     # Who starts it with `nohup` wants it to survive the terminal.
-    numbers = [n for n in found if signal.getsignal(n) is not signal.SIG_IGN]
+    hears = {n: n.name != "SIGHUP" or signal.getsignal(n) is not signal.SIG_IGN for n in found}
+    numbers = [number for number in found if hears[number]]
     before = {number: signal.signal(number, note) for number in numbers}
     try:
         yield stop

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from contextlib import suppress
 
 import numpy as np
 
@@ -128,7 +129,8 @@ def _apart(one: Floats, other: Floats, all_of_them: Floats) -> float:
 @asked_of(is_needed=True)
 def continues_where_it_stopped(subject: Subject) -> None:
     """A run that is saved, read by a component made anew from its JSON and continued is the same to
-    the last bit as one that was never interrupted."""
+    the last bit as one that was never interrupted; so is what is recorded of one that is kept as
+    the run store keeps it."""
     component, kind = subject.component, type(subject.component)
     anew = kind.model_validate_json(component.model_dump_json(by_alias=True))
     if any(getattr(anew, name) != getattr(component, name) for name in kind.model_fields):
@@ -150,20 +152,15 @@ def continues_where_it_stopped(subject: Subject) -> None:
             other = measured_by(component, StateMoment(whole, Tables(scene)))
             for name in differing(other, one):
                 raise PropertyError(f"`{name}` of a run continued at step {STEPS} is another one")
+    with suppress(PluginError):  # what no dataset can be made of, other properties tell
+        _refuse_other_records(subject.scene, Subject(anew, subject.parts).scene)
 
 
-@asked_of(is_needed=True)
-def resumes(subject: Subject) -> None:
-    """A run that is stopped, kept as the run store keeps it, and gone on with by a component made
-    anew from its JSON records what one does that was never interrupted, to the last bit."""
-    component, scene = subject.component, subject.scene
-    anew = type(component).model_validate_json(component.model_dump_json(by_alias=True))
-    again = Subject(anew, subject.parts).scene
-    start, whole, parts = (
-        state_with(scene, displacements(scene, 5, share=0.4)),
-        MemorySink(),
-        MemorySink(),
-    )
+def _refuse_other_records(scene: Scene, again: Scene) -> None:
+    """Raises PropertyError where a run that is stopped, kept as the run store keeps it, and gone on
+    with in a scene made anew records something else than one that was never interrupted."""
+    whole, parts = MemorySink(), MemorySink()
+    start = state_with(scene, displacements(scene, 5, share=0.4))
     record(Run(scene, start=start.copy()), whole)
     left, recorder = Run(scene, start=start), Recorder(scene, parts)
     recorder.begin()
