@@ -21,11 +21,11 @@ def is_local(path: Path, mounts: str = "/proc/self/mountinfo") -> bool:
     """Whether a file lies on a file system that is known to be local; False where nobody tells."""
     kinds: dict[str, str] = {}
     with suppress(OSError):
-        for line in Path(mounts).read_text().splitlines():
+        for line in Path(mounts).read_text(errors="surrogateescape").splitlines():
             before, _, after = line.partition(" - ")
-            place = before.split()[4].encode().decode("unicode_escape")
-            kinds[place] = after.split()[0]
-    folders = (str(folder) for folder in (path.absolute(), *path.absolute().parents))
+            place = os.fsencode(before.split()[4]).decode("unicode_escape").encode("latin-1")
+            kinds[os.fsdecode(place)] = after.split()[0]
+    folders = (str(folder) for folder in (path.resolve(), *path.resolve().parents))
     return next((kinds[folder] in LOCAL for folder in folders if folder in kinds), False)
 
 

@@ -3,20 +3,21 @@ it. Nobody writes here but the process of the sweep."""
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import socket
 import sqlite3
-import sys
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
 from pbdkit.errors import StorageError
+from pbdkit.storage.file_system import is_local, lock
 from pbdkit.sweeps.worker import Report, digest_of
 
 DATABASE, LOCK, LARGE = "sweep.sqlite", "lock", "members"
@@ -26,8 +27,6 @@ COMMIT_S = 1.0
 """So much at most of what was finished is lost when the machine stops."""
 APPLICATION, FORMAT = 0x70626473, 1
 """What SQLite keeps to tell whose database it is, and which form it has."""
-LOCAL = {"ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "tmpfs", "overlay"}
-"""File systems on which the write-ahead log, which needs shared memory, is known to hold."""
 TABLE = """CREATE TABLE IF NOT EXISTS member
 (key TEXT, status TEXT, message TEXT, file INTEGER, content BLOB, digest BLOB)"""
 
@@ -48,7 +47,7 @@ class Store:
         """Creates the folder, locks it, and opens the database."""
         with self._storing():
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._closing.callback(os.close, _locked(self._folder / LOCK))
+            self._closing.enter_context(_locked(self._folder / LOCK))
         try:
             with self._storing():
                 self._open()
@@ -167,7 +166,7 @@ class Store:
         (form,) = database.execute("PRAGMA user_version").fetchone()
         if not new and (owner, form) != (APPLICATION, FORMAT):
             raise StorageError(f"{path}: is no store of a sweep that this pbdkit reads")
-        journal = "WAL" if file_system(self._folder) in LOCAL else "TRUNCATE"
+        journal = "WAL" if is_local(path) else "TRUNCATE"
         for pragma in (f"journal_mode = {journal}", "synchronous = FULL",
                        f"application_id = {APPLICATION}", f"user_version = {FORMAT}"):  # fmt: skip
             database.execute(f"PRAGMA {pragma}")
@@ -187,36 +186,13 @@ class Store:
             raise StorageError(f"{self._folder}: {error.strerror or error}") from None
 
 
-def _locked(path: Path) -> int:
-    """The descriptor of a lock file that this process alone holds. Raises StorageError."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise StorageError(
-            f"{path.parent}: another sweep is running into this folder; wait for its end, or name "
-            "another folder"
-        ) from None
-    return descriptor
-
-
-def file_system(folder: Path) -> str:
-    """The type of the file system that a folder lies on, as Linux tells; empty elsewhere."""
-    found, longest = "", -1
-    with suppress(OSError):
-        target = os.fsencode(folder.resolve())
-        for line in Path("/proc/self/mountinfo").read_bytes().splitlines():
-            mount, _, more = line.partition(b" - ")
-            point = mount.split()[4].decode("unicode_escape").encode("latin-1")
-            inside = target == point or target.startswith(point.rstrip(b"/") + b"/")
-            if inside and len(point) >= longest:
-                found, longest = more.split()[0].decode(), len(point)
-    return found
+def _locked(path: Path) -> io.FileIO:
+    """The lock file, which this process alone holds while it is open. Raises StorageError."""
+    file = io.FileIO(path, "ab")
+    if lock(file):
+        return file
+    file.close()
+    raise StorageError(
+        f"{path.parent}: another sweep is running into this folder; wait for its end, or name "
+        "another folder"
+    )
