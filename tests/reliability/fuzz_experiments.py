@@ -22,19 +22,19 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others' threads take their time, too
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
-from hostile_input import PARTS, mutant  # noqa: E402
-from hostile_text import hostile_setting, hostile_text, to_yaml  # noqa: E402
-from isolation import Outcome, forget_peak, outcomes, report, resident, serve  # noqa: E402
+from hostile_input import PARTS, mutant
+from hostile_text import hostile_setting, hostile_text, to_yaml
+from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
-import pbdkit  # noqa: E402
-from pbdkit.analysis.forecast import forecast  # noqa: E402
-from pbdkit.errors import LONGEST, PbdkitError  # noqa: E402
-from pbdkit.experiment.model import Experiment  # noqa: E402
-from pbdkit.experiment.shipped import shipped_names, shipped_text  # noqa: E402
-from pbdkit.experiment.source import MAX_NODES, Source, read_text  # noqa: E402
-from pbdkit.runs.course import rehearse  # noqa: E402
-from pbdkit.scene import sizes  # noqa: E402
-from pbdkit.scene.scene import build_scene  # noqa: E402
+import pbdkit
+from pbdkit.analysis.forecast import forecast
+from pbdkit.errors import LONGEST, PbdkitError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.shipped import shipped_names, shipped_text
+from pbdkit.experiment.source import MAX_NODES, Source, read_text
+from pbdkit.runs.course import rehearse
+from pbdkit.scene import sizes
+from pbdkit.scene.scene import build_scene
 
 PATIENCE_S = 60.0
 MEMORY = 2**29

@@ -21,18 +21,18 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others' threads take their time, too
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
-import fuzz_experiments  # noqa: E402
-from fuzz_experiments import BASES, MEMORY, PATIENCE_S, marks, undocumented  # noqa: E402
-from hostile_input import mutant  # noqa: E402
-from hostile_text import hostile_text, to_yaml  # noqa: E402
-from isolation import Outcome, forget_peak, outcomes, report, resident, serve  # noqa: E402
+import fuzz_experiments
+from fuzz_experiments import BASES, MEMORY, PATIENCE_S, marks, undocumented
+from hostile_input import mutant
+from hostile_text import hostile_text, to_yaml
+from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
-from pbdkit.errors import PbdkitError  # noqa: E402
-from pbdkit.scene import sizes  # noqa: E402
-from pbdkit.sweeps import outlook  # noqa: E402
-from pbdkit.sweeps.course import validated  # noqa: E402
-from pbdkit.sweeps.member import Asked  # noqa: E402
-from pbdkit.sweeps.specification import read_sweep  # noqa: E402
+from pbdkit.errors import PbdkitError
+from pbdkit.scene import sizes
+from pbdkit.sweeps import outlook
+from pbdkit.sweeps.course import validated
+from pbdkit.sweeps.member import Asked
+from pbdkit.sweeps.specification import read_sweep
 
 MEMBER_S = 0.2
 """What each of the members, of which there are a few dozen, may take besides."""

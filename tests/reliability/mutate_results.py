@@ -23,13 +23,13 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path[:0] = [str(Path(__file__).parent)]
-from isolation import Outcome, outcomes, report, serve  # noqa: E402
+from isolation import Outcome, outcomes, report, serve
 
-import pbdkit  # noqa: E402
-from pbdkit.cli import main as program  # noqa: E402
-from pbdkit.errors import PbdkitError  # noqa: E402
-from pbdkit.results.accessor import reading  # noqa: E402
-from pbdkit.results.snapshot import take_snapshots  # noqa: E402
+import pbdkit
+from pbdkit.cli import main as program
+from pbdkit.errors import PbdkitError
+from pbdkit.results.accessor import reading
+from pbdkit.results.snapshot import take_snapshots
 
 PATIENCE_S, LONGEST_S = 120.0, 20.0
 """After so many seconds a case is ended, and so many it may take."""
