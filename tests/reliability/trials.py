@@ -18,19 +18,19 @@ sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent
 
 import h5netcdf  # noqa: F401  # the children find all that is heavy loaded
 import h5py  # noqa: F401
-import numpy as np  # noqa: E402
+import numpy as np
 import xarray  # noqa: F401
 
-import pbdkit  # noqa: E402
-import pbdkit.analysis.forecast  # noqa: E402
-import pbdkit.cli.run  # noqa: E402
-import pbdkit.results.accessor  # noqa: E402
-import pbdkit.runs.resumption  # noqa: E402
-import pbdkit.storage.run_status  # noqa: E402
-from pbdkit.cli import main  # noqa: E402
-from pbdkit.results import netcdf_sink  # noqa: E402
-from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink  # noqa: E402
-from pbdkit.storage.seal import SealedFile, opened  # noqa: E402
+import pbdkit
+import pbdkit.analysis.forecast
+import pbdkit.cli.run
+import pbdkit.results.accessor
+import pbdkit.runs.resumption
+import pbdkit.storage.run_status
+from pbdkit.cli import main
+from pbdkit.results import netcdf_sink
+from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink
+from pbdkit.storage.seal import SealedFile, opened
 
 OUTPUT = "out.nc"
 BASE: dict[str, Any] = {
