@@ -6,7 +6,7 @@ particles with the same neighbours present answer alike, and one of each kind is
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -32,17 +32,27 @@ Present = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Response:
-    """The move of some followers, linearised: ∂move/∂u_k for each slot and ∂move/∂u_j, (follower,
-    axis of the move, axis of u), and the move itself, (follower, axis); views of one where all
-    followers answer alike. `neighbours` is gone through once, for they are large."""
+    """The answer of some followers, linearised: it is of some kinds only. `kind` is that of each
+    follower, `own` ∂answer/∂u_j and `neighbours` ∂answer/∂u_k by slot, (kind, axis of the answer,
+    axis of u), `answer` the answer itself, (kind, axis)."""
 
-    neighbours: Iterator[tuple[Slot, Floats]]
+    kind: Indices
     own: Floats
-    move: Floats
+    neighbours: dict[Slot, Floats]
+    answer: Floats
+
+    def of_each(self, values: Floats) -> Floats:
+        """The values of all followers; a view of one where all answer alike."""
+        if len(values) == 1:
+            return np.broadcast_to(values[0], (len(self.kind), *values.shape[1:]))
+        return values[self.kind]
 
 
-def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Response:
-    """The response at a state of the followers at some flat places, all of one sublattice.
+def respond(
+    scene: Scene, state: State, sublattice: int, place: Indices, answers: Sequence[str] = ("move",)
+) -> list[Response]:
+    """The answers at a state of the followers at some flat places, all of one sublattice: the
+    "move", and the "force" where the rule knows forces.
 
     Raises PluginError where the rule's functions fail, or are not finite at rest.
     """
@@ -52,19 +62,10 @@ def respond(scene: Scene, state: State, sublattice: int, place: Indices) -> Resp
     with blaming(scene.experiment.rule, "when linearised"):
         if same and at_rest:
             kinds, place = _alike(scene, state, sublattice, place)
-        some = _Followers(scene, state, sublattice, place)
-        move, own = some.move(), some.derivative(None)
-        neighbours = {slot: some.derivative(slot) for slot in some.slots}
-        if at_rest and not all(np.isfinite(v).all() for v in (move, own, *neighbours.values())):
-            raise ValueError("its move at rest, or a derivative of it, is not finite")
-
-    def of_each(values: Floats) -> Floats:
-        if len(values) == 1:
-            return np.broadcast_to(values[0], (len(kinds), *values.shape[1:]))
-        return values[kinds]
-
-    each = ((slot, of_each(found)) for slot, found in neighbours.items())
-    return Response(each, of_each(own), of_each(move))
+        return [
+            _Followers(scene, state, sublattice, place, answer).response(kinds, at_rest)
+            for answer in answers
+        ]
 
 
 def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
@@ -118,29 +119,37 @@ def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple
 class _Followers:
     """The rule on some places, with differences that can be nudged."""
 
-    def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
+    def __init__(
+        self, scene: Scene, state: State, sublattice: int, place: Indices, answer: str
+    ) -> None:
         self._evaluator = Evaluator(scene)
+        self._answer = {"move": self._evaluator.move, "force": self._evaluator.force}[answer]
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
         u = state.u.astype(float, copy=False)
-        self._here, self.slots = around.here(u, state), around.slots
+        self._here, self._slots = around.here(u, state), around.slots
         self._d = dict(zip(around.slots, around.differences(u), strict=True))
         self._neighbours = dict(zip(around.slots, around.neighbours(state), strict=True))
         self._still = self._contributions(self._d, self._here.u)
 
-    def move(self) -> Floats:
-        """(place, axis)."""
-        moved = self._applied(self._still, self._here.u)
-        return np.stack([np.broadcast_to(m, self._here.u.x.shape) for m in moved], axis=-1)
+    def response(self, kinds: Indices, finite: bool) -> Response:
+        """Of followers of these kinds, `finite` or refused."""
+        found = self._applied(self._still, self._here.u)
+        shape = self._here.u.x.shape
+        answer = np.stack([np.broadcast_to(part, shape) for part in found], axis=-1)
+        own, neighbours = self._derivative(None), {s: self._derivative(s) for s in self._slots}
+        if finite and not all(np.isfinite(v).all() for v in (answer, own, *neighbours.values())):
+            raise ValueError("its answer at rest, or a derivative of it, is not finite")
+        return Response(kinds, own, neighbours, answer)
 
-    def derivative(self, mover: Slot | None) -> Floats:
-        """∂move/∂u_k through a slot or, for None, ∂move/∂u_j with all neighbours where they are;
-        (place, axis of the move, axis of u)."""
+    def _derivative(self, mover: Slot | None) -> Floats:
+        """∂answer/∂u_k through a slot or, for None, ∂answer/∂u_j with all neighbours where they
+        are; (place, axis of the answer, axis of u)."""
         shape, axes = self._here.u.x.shape, np.eye(len(self._here.u))
         columns = [derivative(partial(self._moved, mover, e), shape) for e in axes]
         return np.moveaxis(np.array(columns), (0, 1), (2, 1))
 
     def _moved(self, mover: Slot | None, along: Floats, step: complex) -> Any:
-        """The moves (place) after a step of the neighbour at a slot, or of one's own."""
+        """The answers (place) after a step of the neighbour at a slot, or of one's own."""
         here, nudge = self._here.u, vector(step * component for component in along)
         if mover is not None:
             nudged = {mover: self._d[mover] + nudge}
@@ -160,4 +169,4 @@ class _Followers:
     def _applied(self, contributions: dict[Slot, Contributions], here: Components) -> Any:
         parts = [(contributions[slot], to.present) for slot, to in self._neighbours.items()]
         with np.errstate(all="ignore"):
-            return self._evaluator.move(summed(parts), self._here._replace(u=here))
+            return self._answer(summed(parts), self._here._replace(u=here))

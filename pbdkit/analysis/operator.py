@@ -139,13 +139,13 @@ def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Coupl
     moving = np.flatnonzero(has_neighbours(scene, place)).astype(np.int32)
     for s, own in by_sublattice(scene, place[moving]):
         some = moving[own]
-        response = respond(scene, state, s, place[some])
-        moves[some] = response.move
-        couplings.add(some, place[some], response.own)
-        for slot, derivative in response.neighbours:
+        (response,) = respond(scene, state, s, place[some])
+        moves[some] = response.of_each(response.answer)
+        couplings.add(some, place[some], response.of_each(response.own))
+        for slot, derivative in response.neighbours.items():
             there = place[some] + slot_step(scene.raster.shape, slot)
             has = kind[there] != EMPTY
-            couplings.add(some[has], there[has], some_of(derivative, has))
+            couplings.add(some[has], there[has], some_of(response.of_each(derivative), has))
     return moves, couplings
 
 

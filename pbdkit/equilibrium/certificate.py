@@ -9,21 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.system import System
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
-from pbdkit.interfaces.frame import Indices
 from pbdkit.results.progress import Watch
+from pbdkit.scene.leader_groups import kinds_at
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
 from pbdkit.stepping.state import Floats, State
 
 WAYS = {
-    "inverse": "the inverse of the step operator's system, entry by entry",
-    "barrier": "a barrier: v > 0 with A v > 0 bounds the inverse of a matrix A without positive "
-    "entries off its diagonal",
-    "estimated norm of the inverse": "three times an estimate of the norm of the inverse",
+    "inverse": "the solution for what is left of the moves, and the inverse for their rounding",
+    "solution": "the solution for what is left of the moves",
+    "energy": "some iterations more, and the energy of what they leave",
     "nothing to solve": "nobody follows",
 }
 CORRECTION = "correction, "
@@ -89,21 +90,21 @@ class Moves:
     def __init__(self, scene: Scene) -> None:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation)
         self._scene, self._followers = scene, SlotFollowers(scene, stepping)
-        self._after: Floats | None = None
 
-    def at(self, state: State, place: Indices) -> NDArray[np.float64]:
-        """(follower, axis) at the flat places; brings the state's frame into line."""
+    def at(self, state: State, step: int) -> Floats:
+        """Planes, zero where nobody follows in that step; brings the state's frame into line."""
         u = state.u
         flat = u.reshape(len(u), -1)
         if self._scene.frame:
             self._scene.frame.follow(flat, flat)
-        if self._after is None:
-            self._after = np.empty_like(u)
-        self._after[...] = u
+        moves = u.astype(float)
         with np.errstate(all="ignore"):
-            self._followers.move(u, self._after, state)
-        moved = (self._after.reshape(len(self._after), -1)[:, place] - flat[:, place]).T
-        return moved.astype(float)
+            self._followers.move(u, moves, state)
+            moves -= u
+        for leading in self._scene.leading:
+            if leading.group.leads(step):
+                moves.reshape(len(u), -1)[:, leading.place] = 0.0
+        return moves
 
 
 def rounding(u: Floats) -> float:
@@ -175,18 +176,19 @@ class Foresight:
 
     def _linearised(self, state: State, u: Floats) -> System:
         self._linearisations += 1
-        return System(self._scene, replace(state, u=u), "auto", self._watch)
+        at, steps = replace(state, u=u), self._scene.experiment.steps
+        return linearised(self._scene, at, steps, "auto", self._watch)
 
     def _outlook(self, here: State, known: System, *, anew: bool = False) -> Outlook:
         """By the system of the scene at rest, or by one that was linearised `anew` at the state."""
-        moves = self._moves.at(here, known.place)
+        moves = self._moves.at(here, self._scene.experiment.steps)
         ahead, distance = here.u.copy(), math.inf
         correction, obstacle = self._correction(here, known, moves, anew)
         if correction is not None:
-            ahead.reshape(len(ahead), -1)[:, known.place] += correction.T
-            left = self._moves.at(replace(here, u=ahead), known.place)
+            ahead += correction
+            left = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
             bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
-            distance = float(np.hypot(*correction.T).max(initial=0.0)) + bound
+            distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
             most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding(ahead)
             if anew and not np.abs(left).max(initial=0.0) <= most:
                 distance, obstacle = math.inf, BENT
@@ -208,11 +210,11 @@ class Foresight:
     def _correction(
         self, here: State, known: System, moves: NDArray[np.float64], anew: bool
     ) -> tuple[NDArray[np.float64] | None, str]:
-        """(follower, axis); None, and why, where there is no equilibrium, or none that is known."""
+        """None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:
                 known.refuse_moving_floats(moves, rounding(here.u))
-            return known.solve(moves, ACCURACY, known.owed(here)), ""
+            return known.solve(moves, ACCURACY * self._scale, here), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 
@@ -220,11 +222,10 @@ class Foresight:
         """Whether followers put elsewhere, at random and as far as the body has come, move by what
         the linearisation at rest says."""
         size = float(np.abs(here.u).max()) or spacing_of(self._scene)
-        shape = (len(known.place), 2)
-        put = np.random.default_rng(0).uniform(-size, size, shape)
-        there = here.u.copy()
-        there.reshape(len(there), -1)[:, known.place] += put.T
-        moved, moves = (self._moves.at(replace(here, u=u), known.place) for u in (there, here.u))
-        with np.errstate(all="ignore"):
-            wrong = float(np.linalg.norm(moved - moves + known.times(put)))
-        return wrong <= LINEAR * float(np.linalg.norm(put))
+        put, steps = np.zeros_like(here.u), self._scene.experiment.steps
+        kinds = kinds_at(self._scene.raster, self._scene.leading, steps)
+        at = self._scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
+        random = np.random.default_rng(0).uniform(-size, size, (len(put), len(at)))
+        put.reshape(len(put), -1)[:, at] = random
+        moves, moved = (self._moves.at(replace(here, u=u), steps) for u in (here.u, here.u + put))
+        return known.mismatch(put, moves, moved) <= LINEAR

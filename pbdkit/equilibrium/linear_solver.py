@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import DENSE
 from pbdkit.equilibrium.dissection import dissected
-from pbdkit.equilibrium.multigrid import aggregated, classical
+from pbdkit.equilibrium.algebraic_multigrid import aggregated, classical
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 

@@ -1,71 +1,195 @@
-"""Algebraic multigrid: one V-cycle over the grids that pyamg makes of a matrix."""
+"""Multigrid on a lattice: ever coarser grids of stencils, and one V-cycle over them.
+
+The functions of a coarser grid are bilinear hats; its stencils are what those of the finer one do
+to them (Galerkin). Where one direction is much stiffer, only that one is made coarser.
+"""
 
 from __future__ import annotations
 
+import math
+from functools import cache
+from importlib.resources import files
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from pbdkit.equilibrium.stencil_matrix import OWN, StencilMatrix, inverses
+from pbdkit.stepping.compiled.kernel_cache import load_kernel
+
+Floats = NDArray[np.floating[Any]]
+COARSEST = 200
+"""Unknowns below which a grid is solved with its inverse."""
+WEIGHT = 0.8
+"""Of a relaxation; below 1, since the places of a row do not know of each other."""
+STIFFER = 3.0
+"""So many times stiffer, a direction is made coarser alone."""
+NARROW = 5
+"""Places across, with the ring around, at which a grid is not made narrower."""
+SINGULAR = 1e-12
+"""Relative size of the smallest eigenvalue of the coarsest grid below which nothing holds a body."""
 
 
-class Grids:
-    """Approximates A⁻¹ r by one V-cycle, in the precision of the grids.
+@cache
+def kernels() -> SimpleNamespace:
+    """The compiled functions of one grid."""
+    source = files("pbdkit.equilibrium").joinpath("grid_kernels.py").read_text(encoding="utf-8")
+    return SimpleNamespace(**load_kernel(source, {}, ()).__globals__)
 
-    The cycle is made here and not by pyamg, which takes the residual of the finest grid twice more
-    to tell how far it came.
+
+class FloatingError(Exception):
+    """Something of the body is not held."""
+
+
+class Grid:
+    """One grid: its `code` and `kind` as of StencilMatrix, its `stencils`, and what kernels are
+    given of them in a precision."""
+
+    def __init__(self, code: NDArray[np.int32], kind: NDArray[np.int8], stencils: Floats) -> None:
+        self.code, self.kind, self.stencils = code, kind, stencils
+        rows = len(code) + 1
+        first, lone = np.empty(rows, np.int64), np.empty(rows, np.int64)
+        none = np.empty(0, np.int32)
+        run_count, lone_count = kernels().runs(code, first, none, none, lone, none, none)
+        begin, end = (np.empty(run_count, np.int32) for _ in range(2))
+        place, which = (np.empty(lone_count, np.int32) for _ in range(2))
+        kernels().runs(code, first, begin, end, lone, place, which)
+        self._lists = first, begin, end, lone, place, which
+        self.unknowns = 2 * (int((end - begin).sum()) + lone_count)
+
+    def given(self, precision: type[np.floating[Any]]) -> Any:
+        """The grid as kernels take it."""
+        middle = inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
+        same, own = (tuple(map(precision, v[0].ravel())) for v in (self.stencils, middle))
+        tables = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
+        stencils, inverse = tables
+        return kernels().Grid(*self._lists, same, stencils, own, inverse)
+
+    def field(self, precision: type[np.floating[Any]]) -> Floats:
+        """Room for one number an axis and place."""
+        return np.zeros((2, *self.code.shape), precision)
+
+    def halved(self) -> tuple[int, int]:
+        """Along which axes the next grid has half the places."""
+        along = [np.abs(_stiffness(self.stencils[0], axis)) for axis in range(2)]
+        rows, columns = self.code.shape
+        if rows <= NARROW or columns <= NARROW:
+            return int(rows > columns), int(columns >= rows)
+        if max(along) <= STIFFER * min(along):
+            return 1, 1
+        return int(along[0] > along[1]), int(along[1] > along[0])
+
+    def coarser(self, halved: tuple[int, int]) -> Grid:
+        """The next grid."""
+        shape = [(n - 2) // 2 + 3 if half else n for n, half in zip(self.code.shape, halved, strict=True)]
+        kind, code = np.zeros(shape, np.int8), np.zeros(shape, np.int32)
+        kernels().coarse_kinds(self.kind, halved, kind)
+        count = kernels().coarse_codes(self.code, kind, halved, code)
+        stencils = np.zeros((count + 1, *self.stencils.shape[1:]))
+        kernels().galerkin(self.code, self.stencils, code, halved, stencils)
+        stencils[0] = _coarse_stencil(self.stencils[:1], halved)
+        return Grid(code, kind, stencils)
+
+    def matrix(self) -> tuple[tuple[NDArray[np.intp], ...], Floats]:
+        """Where the unknowns are, and the matrix, dense."""
+        at = np.nonzero(self.code >= 0)
+        number = np.full(self.code.shape, -1)
+        number[at] = np.arange(len(at[0]))
+        K = np.zeros((len(at[0]), 2, len(at[0]), 2))
+        blocks = self.stencils[self.code[at]].reshape(-1, 9, 2, 2)
+        for s in range(9):
+            there = number[at[0] + s // 3 - 1, at[1] + s % 3 - 1]
+            some = np.flatnonzero(there >= 0)
+            K[some, :, there[some], :] += blocks[some, s]
+        return at, K.reshape(2 * len(at[0]), -1)
+
+
+def _stiffness(stencil: Floats, axis: int) -> float:
+    """What a wave along an axis meets."""
+    c = np.moveaxis(stencil.reshape(3, 3, 2, 2), axis, 0)
+    sides: Floats = c[0].sum(axis=0) + c[2].sum(axis=0)
+    return float(np.trace(sides))
+
+
+def _coarse_stencil(stencils: Floats, halved: tuple[int, int]) -> Floats:
+    """What one stencil everywhere makes of itself."""
+    coarse = np.full((7, 7), -1, np.int32)
+    coarse[3, 3] = 1
+    found = np.zeros((2, *stencils.shape[1:]))
+    kernels().galerkin(np.zeros((12, 12), np.int32), stencils, coarse, halved, found)
+    return found[1]
+
+
+class Multigrid:
+    """The grids of a matrix: ``cycle(r)`` approximates K⁻¹ r, in single precision.
+
+    Raises FloatingError where leaders leave a motion of the body free.
     """
 
-    def __init__(self, hierarchy: Any) -> None:
-        self._levels, self._coarsest = hierarchy.levels, hierarchy.coarse_solver
-        self._precision = self._levels[0].A.dtype
+    precision = np.float32
 
-    def __call__(self, r: Floats) -> Floats:
-        """One cycle from zero. `r` is scaled to 1, for it may be tiny in single precision."""
-        scale = float(np.abs(r).max(initial=0.0))
-        if not 0.0 < scale < np.inf:
-            return r.copy()
-        x: Floats = self._cycled(0, (r * (1.0 / scale)).astype(self._precision)).astype(float)
-        x *= scale
-        return x
+    def __init__(self, matrix: StencilMatrix) -> None:
+        grid = Grid(matrix.code, matrix.kind, matrix.stencils)
+        self._levels = [_Level(grid, self.precision)]
+        while grid.unknowns > COARSEST:
+            halved = grid.halved()
+            grid = grid.coarser(halved)
+            self._levels[-1].halved = halved
+            self._levels.append(_Level(grid, self.precision))
+        self._at, K = grid.matrix()
+        values, modes = np.linalg.eigh((K + K.T) / 2)
+        if len(values) and not values[0] > SINGULAR * values[-1]:
+            raise FloatingError
+        self._inverse = ((modes / values) @ modes.T).astype(self.precision)
+        self._gives_way = (modes * modes / values).sum(axis=1)
 
-    def _cycled(self, depth: int, b: Any) -> Any:
-        level = self._levels[depth]
+    def __len__(self) -> int:
+        """How many grids there are."""
+        return len(self._levels)
+
+    def grid(self, depth: int = 0) -> Grid:
+        """The finest, or one so much coarser."""
+        return self._levels[depth].grid
+
+    def cycle(self, r: Floats, depth: int = 0) -> Floats:
+        """One V-cycle from zero. What it gives out is valid until the next."""
+        return self._cycled(depth, r)
+
+    @property
+    def softest(self) -> tuple[int, tuple[int, int], float]:
+        """Of the coarsest grid the axis and place that gives way most to a unit load, and how
+        far."""
+        n = int(self._gives_way.argmax())
+        i, j = (int(index[n // 2]) for index in self._at)
+        return n % 2, (i, j), float(self._gives_way[n])
+
+    def finer_place(self, depth: int, place: tuple[int, int]) -> tuple[int, int]:
+        """Where a place of a grid lies on the one before it."""
+        halved = self._levels[depth - 1].halved
+        i, j = (2 * n - 1 if half else n for n, half in zip(place, halved, strict=True))
+        return i, j
+
+    def _cycled(self, depth: int, b: Floats) -> Floats:
+        level, kernel = self._levels[depth], kernels()
         if depth == len(self._levels) - 1:
-            return self._coarsest(level.A, b)
-        x = np.zeros_like(b)
-        level.presmoother(level.A, x, b)
-        x += level.P @ self._cycled(depth + 1, level.R @ (b - level.A @ x))
-        level.postsmoother(level.A, x, b)
-        return x
+            found = self._inverse @ b[:, self._at[0], self._at[1]].T.ravel()
+            level.x[:, self._at[0], self._at[1]] = found.reshape(-1, 2).T
+            return level.x
+        weight, below = self.precision(WEIGHT), self._levels[depth + 1]
+        kernel.relax(level.given, b, level.x, level.row, weight, True, False)
+        kernel.restrict(level.given, b, level.x, level.halved, below.grid.code, below.b)
+        kernel.prolong(level.given, self._cycled(depth + 1, below.b), level.halved, level.x)
+        kernel.relax(level.given, b, level.x, level.row, weight, False, True)
+        return level.x
 
 
-def classical(matrix: Any) -> Grids:
-    """Of Ruge and Stüben, in single precision: they only precondition, and half the bytes move."""
-    import pyamg
+class _Level:
+    """A grid with room for what a cycle does there."""
 
-    # One way down the unknowns, the other way up: half the work of both ways each time, for an
-    # iteration or two more, and symmetric all the same.
-    down, up = (("gauss_seidel", {"sweep": way}) for way in ("forward", "backward"))
-    narrow = _narrow(matrix, np.float32)
-    return Grids(pyamg.ruge_stuben_solver(narrow, presmoother=down, postsmoother=up))
+    halved = 0, 0
 
-
-def aggregated(matrix: Any, near_kernel: Floats, *, symmetric: bool) -> Grids:
-    """By smoothed aggregation, for matrices that couple the axes: unknowns 2n and 2n + 1 stay
-    together, and `near_kernel` (unknown, mode) are what the matrix hardly changes."""
-    import pyamg
-
-    symmetry = "symmetric" if symmetric else "nonsymmetric"
-    blocks = _narrow(matrix, np.float64).tobsr((2, 2))
-    return Grids(pyamg.smoothed_aggregation_solver(blocks, B=near_kernel, symmetry=symmetry))
-
-
-def _narrow(matrix: Any, precision: type[np.floating[Any]]) -> Any:
-    """A copy as pyamg wants it: a scipy matrix with indices of 32 bits."""
-    import scipy.sparse
-
-    found = scipy.sparse.csr_matrix(matrix, dtype=precision, copy=True)
-    found.indices, found.indptr = found.indices.astype(np.int32), found.indptr.astype(np.int32)
-    return found
+    def __init__(self, grid: Grid, precision: type[np.floating[Any]]) -> None:
+        self.grid, self.given = grid, grid.given(precision)
+        self.x, self.b = grid.field(precision), grid.field(precision)
+        self.row = np.zeros((2, grid.code.shape[1]), precision)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
+from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.system import System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -17,6 +18,8 @@ from pbdkit.stepping.state import State
 
 Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
+SHARE = 0.25
+"""Of the tolerance, for linear systems."""
 SHORTEST = 2.0**-14
 """The shortest share of a correction that is tried."""
 
@@ -63,12 +66,11 @@ class _Search:
         self._linear = False
         at_rest = replace(state, u=np.zeros_like(state.u))
         self._system = self._linearised(at_rest, "assembling")
-        self._place = self._system.place
-        self._owed = self._system.owed(state)
+        self._owed: State | None = state.copy()
         self._left = self._moves()
 
     def run(self) -> Certificate:
-        if not self._left.any() and self._owed is None and not self._state.u.any():
+        if not self._left.any() and not self._state.u.any() and not self._state.previous.any():
             self._linear = True  # nothing is prescribed but rest
             return self._certified()
         start, moves = self._state.u.copy(), self._left
@@ -84,13 +86,14 @@ class _Search:
         """Corrections by the first system; whether the tolerance is reached, or the rule is known
         not to be linear."""
         for n in range(MOST_CORRECTIONS):
-            before, accuracy = _size(self._left), self._accuracy()
-            self._shift(self._system.solve(self._left, accuracy, self._owed), 1.0)
+            moves, before = self._left, _size(self._left)
+            correction = self._system.solve(moves, self._wanted, self._owed)
+            self._shift(correction, 1.0)
             self._owed = None
             after, floor = _size(self._left), self._floor()
-            if n == 0:
-                expected = max(LINEAR, 10 * accuracy) * before + floor
-                self._linear = before > 1e3 * floor and after <= expected
+            if n == 0 and before > 1e3 * floor:
+                mismatch = self._system.mismatch(correction, moves, self._left)
+                self._linear = mismatch <= LINEAR + floor / before
             if not self._linear or not math.isfinite(after):
                 return False
             if self._distance() <= self._finder.tolerance:
@@ -106,7 +109,7 @@ class _Search:
             self._system = self._linearised(self._state, what)
             self._system.refuse_moving_floats(self._left, self._rounding())
             if self._distance() <= self._finder.tolerance or not self._search_along(
-                self._system.solve(self._left, self._accuracy())
+                self._system.solve(self._left, self._wanted)
             ):
                 return
 
@@ -152,24 +155,23 @@ class _Search:
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return System(finder.scene, at, finder.method, finder.watch, self._step)
+        return linearised(finder.scene, at, self._step, finder.method, finder.watch)
 
     def _shift(self, correction: Vectors, share: float) -> None:
-        self._state.u.reshape(len(self._state.u), -1)[:, self._place] += share * correction.T
+        self._state.u += correction if share == 1.0 else share * correction
         self._left = self._moves()
 
     def _moves(self) -> Vectors:
-        return self._finder.moves.at(self._state, self._place)
+        return self._finder.moves.at(self._state, self._step)
 
     def _distance(self) -> float:
         bound = self._system.distance(self._left, self._rounding())
         return math.inf if math.isnan(bound) else bound * (1.0 if self._linear else FIRST_ORDER)
 
-    def _accuracy(self) -> float:
-        """How well a linear system must be solved for the tolerance."""
-        distance = self._distance()
-        wanted = self._finder.tolerance / distance if distance > 0.0 else 1.0
-        return min(1e-6, max(1e-13, wanted))
+    @property
+    def _wanted(self) -> float:
+        """How near a linear system must be solved: what the certificate adds has room besides."""
+        return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
         return self._system.amplification * rounding(self._state.u)

@@ -25,12 +25,11 @@ from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
 SAFETY = 3.0
-"""What an estimated norm, which may come out too small, is multiplied with."""
-ROUGH, ROUGHER = 1e-3, 1e-2
-"""The accuracy of solutions that only serve a bound, and of those for barriers: smoothing mends the
-rest."""
-LEVEL, MOST_SMOOTHINGS = 0.5, 10
-"""A barrier's A v, aimed at 1, is smoothed until it is nowhere below, at most so many times."""
+"""What an estimate that may come out too small is multiplied with."""
+ACCURACY = 1e-9
+"""Of solutions, relative; corrections are corrected where more is wanted."""
+ROUGH = 1e-3
+"""The relative accuracy of solutions that only serve a bound."""
 SINGULAR = 1e-10
 """Relative size below which a singular value counts as zero."""
 SHIFT, MOST_MODES = 1e-11, 6
@@ -54,14 +53,9 @@ class Part(ABC):
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
     @abstractmethod
-    def solve(self, r: Floats, accuracy: float, owed: Floats | None = None) -> Floats:
+    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
         """The x to which steps from x = 0 converge; `owed` is what invariants have to gain. Raises
         DriftingError where there is none."""
-
-    @property
-    def barrier(self) -> tuple[Floats, Floats] | None:
-        """v > 0 with A v > 0, and A v, where A is known to have such a v that bounds A⁻¹."""
-        return None
 
     @property
     def name(self) -> str:
@@ -73,42 +67,34 @@ class Part(ABC):
         """Of the linear solver."""
         return self._solver.iterations if self._solver else 0
 
-    def farthest(self, r: Floats) -> float:
-        """A bound on max |A⁻¹ r'| over all |r'| ≤ r, r ≥ 0: from the inverse where it is at hand,
-        else from a bound on it."""
+    def farthest(self, r: Floats, rounding: float) -> float:
+        """max |A⁻¹ r|, and what rounding of r by so much may add to it."""
         if self._solver is None:
-            return math.inf if r.any() else 0.0
-        if isinstance(self._solver, Dense):
-            inverse = np.abs(self._solver.inverse[: self._size, : self._size])
-            return float((inverse @ r).max(initial=0.0))
-        if self.barrier:
-            height, climb = self.barrier
-            return float(height.max() * (r / climb).max())
-        return self._norm * float(r.max(initial=0.0))
+            return math.inf if r.any() or rounding else 0.0
+        found = np.abs(self._inverted(r)).max(initial=0.0)
+        return float(found) + self._spread * rounding
 
     @property
     def how(self) -> str:
         """How the bound is obtained."""
-        if isinstance(self._solver, Dense):
-            return "inverse"
-        return "barrier" if self.barrier else "estimated norm of the inverse"
+        return "inverse" if isinstance(self._solver, Dense) else "solution"
+
+    def _inverted(self, r: Floats) -> Floats:
+        """A⁻¹ r, roughly."""
+        assert self._solver is not None
+        b = np.append(r, np.zeros(self._borders))
+        return self._solver.solve(b, ROUGH)[: self._size]
 
     @cached_property
-    def _norm(self) -> float:
-        """Three times an estimate from below of the largest row sum of |A⁻¹| (Higham, Tisseur)."""
-        from scipy.sparse.linalg import LinearOperator, onenormest
-
-        solver, size = self._solver, self._size
-        assert solver is not None
+    def _spread(self) -> float:
+        """How far A⁻¹ takes numbers of up to 1: the largest row sum of |A⁻¹| where the inverse is
+        at hand; else some times as far as it takes random ones, as rounding is."""
+        if isinstance(self._solver, Dense):
+            inverse = np.abs(self._solver.inverse[: self._size, : self._size])
+            return float(inverse.sum(axis=1).max(initial=0.0))
         self._watch.begin("bounding the error")
-        nothing = np.zeros(self._borders)
-        transposed = LinearOperator(
-            (size, size),
-            matvec=lambda b: solver.solve_transposed(np.append(b, nothing), ROUGH)[:size],
-            rmatvec=lambda b: solver.solve(np.append(b, nothing), ROUGH)[:size],
-            dtype=float,
-        )
-        return SAFETY * float(onenormest(transposed))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size)
+        return SAFETY * float(np.abs(self._inverted(signs)).max(initial=0.0))
 
 
 class Held(Part):
@@ -132,53 +118,22 @@ class Held(Part):
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
         solver = linear_solver(matrix, method, near_kernel=near_kernel, watch=watch, **self._how)
         super().__init__(matrix.shape[0], solver, watch)
-        ones = np.ones(self._size)
-        most = self.farthest(ones) if isinstance(solver, Dense) else np.abs(self._of_ones).max()
-        if not most < 1.0 / SINGULAR:
+        if not self._spread < 1.0 / SINGULAR:
             raise np.linalg.LinAlgError("singular")
 
-    def solve(self, r: Floats, accuracy: float, owed: Floats | None = None) -> Floats:
+    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
         """By this method; nothing is owed, for what is held has no invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
         assert self._solver is not None
-        x = self._solver.solve(r, accuracy)
+        x = self._solver.solve(r, ACCURACY)
         if isinstance(self._solver, Krylov) and self._has_choice:
             left = float(np.linalg.norm(r - self._matrix @ x))
-            if not left <= 100 * accuracy * float(np.linalg.norm(r)):  # the iteration got stuck
+            if not left <= 100 * ACCURACY * float(np.linalg.norm(r)):  # the iteration got stuck
                 self._solver = linear_solver(self._matrix, "lu", **self._how)
-                x = self._solver.solve(r, accuracy)
+                x = self._solver.solve(r, ACCURACY)
         return x
-
-    @cached_property
-    def barrier(self) -> tuple[Floats, Floats] | None:
-        """v > 0 with A v > 0, where no entry off the diagonal is positive: then A⁻¹ ≥ 0, and
-        |A⁻¹ r| ≤ v · max(|r| / A v). Any such v will do; it is near A⁻¹ 1, made smooth by
-        v + (1 - A v)/2, half a step of an averaging rule."""
-        if not self._may_have_barrier:
-            return None
-        height = self._of_ones
-        climb = self._matrix @ height
-        for _ in range(MOST_SMOOTHINGS):
-            if climb.min() >= LEVEL:
-                break
-            height = height + 0.5 * (1.0 - climb)
-            climb = self._matrix @ height
-        return (height, climb) if min(height.min(), climb.min()) > 0.0 else None
-
-    @cached_property
-    def _may_have_barrier(self) -> bool:
-        diagonal = self._matrix.diagonal()
-        return bool((self._matrix.data > 0.0).sum() == (diagonal > 0.0).sum())
-
-    @cached_property
-    def _of_ones(self) -> Floats:
-        """A⁻¹ 1, roughly."""
-        self._watch.begin("bounding the error")
-        accuracy = ROUGHER if self._may_have_barrier else ROUGH
-        assert self._solver is not None
-        return self._solver.solve(np.ones(self._matrix.shape[0]), accuracy)
 
 
 class Floating(Part):
@@ -199,7 +154,7 @@ class Floating(Part):
                 solver = _sparse_bordered(matrix, left, np.asarray(rows))
         super().__init__(size, solver, watch, modes)
 
-    def solve(self, r: Floats, accuracy: float, owed: Floats | None = None) -> Floats:
+    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
         """By this method."""
         push = self._left.T @ r
         large = SINGULAR * max(1.0, float(np.linalg.norm(r)))
@@ -209,7 +164,7 @@ class Floating(Part):
             return np.zeros_like(r)
         kept = np.zeros(len(push)) if owed is None else self._left.T @ owed
         b = np.concatenate([r - self._left @ push, kept])
-        return self._solver.solve(b, accuracy)[: self._size]
+        return self._solver.solve(b, ACCURACY)[: self._size]
 
 
 def _sparse_bordered(matrix: Any, left: Floats, rows: Floats) -> LinearSolver:

@@ -1,0 +1,92 @@
+"""Conjugate gradients on a lattice's stencils, preconditioned by multigrid, and what their own
+numbers tell of the error.
+
+The cycle is made in single precision, all else in double; no iteration is lost by that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.equilibrium.multigrid import Multigrid, kernels
+
+Floats = NDArray[np.floating[Any]]
+MOST_ITERATIONS = 400
+SLOWEST = 0.9
+"""The slowest fall of the jumps that is extrapolated."""
+
+
+@dataclass
+class Descent:
+    """What was found: x with K x ≈ b. `jumps` are the largest ways made in each iteration, in
+    `steps` and `turns` the numbers α and β; `left` is rᵀ B r, B the cycle, of what is left."""
+
+    x: Floats
+    left: float = math.inf
+    jumps: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+    turns: list[float] = field(default_factory=list)
+
+    @property
+    def ahead(self) -> float:
+        """How far x still is from the solution, extrapolated from the last jumps."""
+        if len(self.jumps) < 3:
+            return math.inf
+        a, b, c = self.jumps[-3:]
+        fall = max(b / a, c / b) if a and b else 0.0
+        return c * fall / (1.0 - fall) if fall <= SLOWEST else math.inf
+
+    def smallest(self) -> float:
+        """The smallest eigenvalue of B K that the iteration has seen (Lanczos)."""
+        a, b = np.array(self.steps), np.array(self.turns)
+        diagonal = 1.0 / a
+        diagonal[1:] += b[1:] / a[:-1]
+        beside = np.sqrt(b[1:]) / a[:-1]
+        T = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        return float(np.linalg.eigvalsh(T)[0])
+
+
+class ConjugateGradients:
+    """Solves K x = b for a symmetric positive K by its grids, or that of a coarser one."""
+
+    def __init__(self, grids: Multigrid, depth: int = 0) -> None:
+        self._grids, self._depth = grids, depth
+        self._grid = grids.grid(depth)
+        self.matrix = self._grid.given(np.float64)
+
+    def solve(
+        self, b: Floats, done: Callable[[Descent], bool], most: int = MOST_ITERATIONS
+    ) -> Descent:
+        """Iterates until `done`. b is overwritten with what is left of it."""
+        kernel, grid = kernels(), self._grid
+        found, r = Descent(grid.field(np.float64)), b
+        p, q, rounded = grid.field(np.float64), grid.field(np.float64), grid.field(np.float32)
+        size = math.sqrt(kernel.dot(r, r))
+        if not 0.0 < size < math.inf:
+            found.left = 0.0 if size == 0.0 else math.inf
+            return found
+        np.multiply(r, 1.0 / size, out=rounded, casting="same_kind")
+        while True:
+            z = self._grids.cycle(rounded, self._depth)
+            before, found.left = found.left, size * kernel.dot(r, z)
+            if len(found.steps) >= most or (found.steps and done(found)):
+                return found
+            turned = found.left / before if found.steps else 0.0
+            kernel.turn(size, z, turned, p)
+            bent = kernel.product(self.matrix, p, q)
+            if not bent > 0.0 or not math.isfinite(bent):
+                return found
+            step = found.left / bent
+            square, jump = kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded)
+            found.steps.append(step)
+            found.turns.append(turned)
+            found.jumps.append(jump)
+            if square == 0.0:
+                found.left = 0.0
+                return found

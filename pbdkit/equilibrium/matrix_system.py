@@ -1,0 +1,211 @@
+"""The linear system of an equilibrium as a sparse matrix, taken apart.
+
+Where x and y do not move each other there are two systems, often equal; where one moves the other
+only (mixed coordinates), it is solved first. Parts of the body that nothing holds are told apart.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.couplings import connected, one_minus
+from pbdkit.analysis.operator import step_operator
+from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
+from pbdkit.errors import ExperimentError
+from pbdkit.results.progress import Watch
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass
+class _Stage:
+    """The unknowns of one axis, or of both where they move each other, with their parts: who
+    belongs to each. `into` is what the axis solved before adds to the moves."""
+
+    axes: list[int]
+    parts: list[tuple[Indices, Part]]
+    into: Any = None
+
+
+class MatrixSystem(System):
+    """The system by one of the solver's methods, direct or iterative."""
+
+    def __init__(
+        self, scene: Scene, state: State, method: str, watch: Watch, step: int | None = None
+    ) -> None:
+        self._shape = state.u.shape
+        self._operator = operator = step_operator(scene, state, step)
+        self._method, self._watch = method, watch
+        self._X = scene.raster.reference(operator.followers)
+        self._place = scene.raster.place_of(operator.followers)
+        self._both = both = operator.couplings_both
+        first = 1 if both.couples(0, 1) else 0
+        self._stages = [] if both.couples(first, 1 - first) else [self._stage([first])]
+        # One axis has a share in the invariants of the other, where it moves it.
+        parts = [part for stage in self._stages for _, part in stage.parts]
+        floats = any(isinstance(part, Floating) for part in parts)
+        if not self._stages or (floats and both.couples(1 - first, first)):
+            self._stages = [self._stage([0, 1])]
+        else:
+            self._stages.append(self._following(first))
+
+    @property
+    def methods(self) -> str:  # type: ignore[override]
+        """The names of the methods used."""
+        names = {part.name for stage in self._stages for _, part in stage.parts}
+        return ", ".join(sorted(names)) or "nothing to solve"
+
+    @property
+    def how(self) -> str:  # type: ignore[override]
+        """By the solution; its rounding by the inverse itself where that is at hand."""
+        ways = {part.how for stage in self._stages for _, part in stage.parts}
+        return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
+
+    @property
+    def iterations(self) -> int:  # type: ignore[override]
+        """Of all linear solvers together."""
+        parts = {id(part): part for stage in self._stages for _, part in stage.parts}
+        return sum(part.iterations for part in parts.values())
+
+    def _table(self, planes: Floats) -> Floats:
+        """(follower, axis) of planes."""
+        return planes.reshape(len(planes), -1)[:, self._place].T
+
+    def _planes(self, table: Floats) -> Floats:
+        """Planes of (follower, axis)."""
+        planes = np.zeros(self._shape)
+        planes.reshape(len(planes), -1)[:, self._place] = table.T
+        return planes
+
+    def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
+        """Looks at each part by itself."""
+        table = self._table(moves)
+        for stage in self._stages:
+            for unknowns, part in stage.parts:
+                r = table[:, stage.axes].ravel()[unknowns]
+                if isinstance(part, Floating) and np.abs(r).max(initial=0.0) > 8 * rounding:
+                    raise ExperimentError(
+                        "there is no unique equilibrium: leaders do not hold a part of "
+                        f"{self._named(stage, unknowns)}; let one hold it, or take solver: "
+                        "{type: stepping}",
+                        ("leaders",),
+                    )
+
+    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+        """Stage by stage, part by part."""
+        back = None if owed is None else self._owed(owed)
+        return self._planes(self._solved(self._table(moves), back))
+
+    def _solved(self, moves: Floats, owed: Floats | None) -> Floats:
+        found = np.zeros_like(moves)
+        for stage in self._stages:
+            r = moves[:, stage.axes].ravel()
+            if stage.into is not None:
+                r = r + stage.into @ found[:, 1 - stage.axes[0]]
+            back = None if owed is None else owed[:, stage.axes].ravel()
+            x = np.empty_like(r)
+            for some, part in stage.parts:
+                try:
+                    x[some] = part.solve(r[some], None if back is None else back[some])
+                except DriftingError:
+                    raise ExperimentError(
+                        "there is no equilibrium: nothing holds a part of "
+                        f"{self._named(stage, some)}, and it is pushed on for ever; let a leader "
+                        "hold it",
+                        ("leaders",),
+                    ) from None
+            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
+        return found
+
+    def _owed(self, state: State) -> Floats | None:
+        """What followers have yet to get, (follower, axis), where the step looks back:
+        before · (u(t-1) - u(t)), None elsewhere."""
+        if not self._operator.couplings_before.parts:
+            return None
+        u, previous = self._table(state.u), self._table(state.previous)
+        return self._operator.couplings_before.times((previous - u).astype(float))
+
+    def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
+        """By the operator."""
+        table = self._table(c)
+        with np.errstate(all="ignore"):
+            pull = table - self._both.times(table)
+            left = pull + self._table(after) - self._table(before)
+            return float(np.linalg.norm(left) / np.linalg.norm(pull))
+
+    def distance(self, moves: Floats, rounding: float) -> float:
+        """Solves once more for what is left of the moves, and adds what rounding may make of it."""
+        table, bounds = self._table(moves), np.zeros(2)
+        for stage in self._stages:
+            r = table[:, stage.axes].ravel()
+            unsure = np.full(len(r), rounding)
+            if stage.into is not None:
+                unsure += abs(stage.into).sum(axis=1) * bounds[1 - stage.axes[0]]
+            far = (part.farthest(r[some], float(unsure[some].max(initial=0.0))) for some, part in stage.parts)
+            bounds[stage.axes] = max(far, default=0.0)
+        return math.hypot(*bounds)
+
+    def _named(self, stage: _Stage, unknowns: Indices) -> str:
+        numbers = np.unique(self._operator.followers[unknowns // len(stage.axes)]) + 1
+        return f"{len(numbers)} particles (with number {numbers[0]})"
+
+    def _following(self, first: int) -> _Stage:
+        """The stage of the other axis; it shares the solvers of the first where both are alike."""
+        other, led = 1 - first, self._operator.couplings_led
+        coupled = self._both.couples(other, first)
+        into = self._both.entries([other], [first]).matrix() if coupled else None
+        if self._both.is_isotropic() and led.is_isotropic():
+            return _Stage([other], self._stages[0].parts, into)
+        stage = self._stage([other])
+        stage.into = into
+        return stage
+
+    def _stage(self, axes: list[int]) -> _Stage:
+        matrix = one_minus(self._both.entries(axes).matrix())
+        largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
+        self.amplification = max(self.amplification, largest)
+        led = self._operator.couplings_led.entries(axes)
+        count, label = connected(matrix, strongly=False)
+        held = np.zeros(count, bool)
+        held[label[led.rows[led.values != 0.0]]] = True
+        # What leaders move directly or not is solved together, each part that floats by itself.
+        groups = [np.flatnonzero(held[label])] if held.any() else []
+        stage = _Stage(axes, [])
+        for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held)]:
+            part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
+            stage.parts.append((some, part))
+        return stage
+
+    def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
+        """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
+        if held:
+            kernel = places = None
+            if len(axes) == 2:
+                kernel, places = self._rigid_modes()[some], self._X.repeat(2, axis=0)[some]
+            with suppress(np.linalg.LinAlgError):
+                return Held(matrix, self._method, kernel, self._watch, places)
+        before = self._operator.couplings_before
+        back = _within(before.entries(axes).matrix(), some) if before.parts else None
+        return Floating(matrix, back, self._watch)
+
+    def _rigid_modes(self) -> Floats:
+        """(unknown, mode): two translations and a rotation."""
+        modes = np.zeros((2 * len(self._X), 3))
+        modes[0::2, 0] = modes[1::2, 1] = 1.0
+        centred = self._X - self._X.mean(axis=0)
+        modes[0::2, 2], modes[1::2, 2] = -centred[:, 1], centred[:, 0]
+        return modes / max(1.0, float(np.abs(centred).max()))
+
+
+def _within(matrix: Any, unknowns: Indices) -> Any:
+    return matrix if len(unknowns) == matrix.shape[0] else matrix[unknowns][:, unknowns]
