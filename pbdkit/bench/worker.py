@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pbdkit.api import load
 from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.newton import UnconvergedError
-from pbdkit.equilibrium.system import System
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.results.progress import Watch
@@ -199,19 +199,20 @@ def decay_of(scene: Scene, exact: NDArray[np.float64]) -> Decay:
     to `exact`, (axis, follower): v ← A⁻¹ v, A = 1 - (step operator). Its share is the projection of
     that way onto it."""
     start = initial_state(scene)
-    way = (exact - _of_followers(scene, start)).T
+    steps, resting = scene.experiment.steps, initial_state(scene)
+    resting.u[...] = 0.0
+    way = np.zeros_like(resting.u)
+    way.reshape(len(way), -1)[:, followers_of(scene)] = exact - _of_followers(scene, start)
     if not way.any():
         return Decay(0.0, 0.0)
-    resting = initial_state(scene)
-    resting.u[...] = 0.0
-    system, mode, slowness = System(scene, resting, "auto", Watch()), way, 0.0
+    system, mode, slowness = linearised(scene, resting, steps, "auto", Watch()), way, 0.0
     for _ in range(TURNS):
         mode = mode / np.abs(mode).max()
         after = system.solve(mode, ROUGH)
         slowness = float((after * after).sum() / (after * mode).sum())
         mode = after
     along = float((way * mode).sum() / (mode * mode).sum())
-    share = abs(along) * float(np.linalg.norm(mode, axis=1).max()) / scale_of(scene, start)
+    share = abs(along) * _longest(mode) / scale_of(scene, start)
     return Decay(share, 1.0 - 1.0 / slowness)
 
 

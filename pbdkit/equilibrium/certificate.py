@@ -13,12 +13,15 @@ from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.system import System
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
+from pbdkit.interfaces import RenewsParticles
 from pbdkit.results.progress import Watch
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
+from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
 
 WAYS = {
@@ -80,6 +83,8 @@ def broken_bonds(state: State) -> int:
     return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step >= 0))
 
 
+LARGEST_BY_NUMPY = 100_000
+"""Particles beyond which moves are evaluated by the compiled engine."""
 ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -88,22 +93,34 @@ class Moves:
     frame standing where the body tells it to."""
 
     def __init__(self, scene: Scene) -> None:
-        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation)
+        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene, self._followers = scene, SlotFollowers(scene, stepping)
+        self._engine: Engine | None = None
+        renews = isinstance(scene.experiment.rule, RenewsParticles)
+        if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
+            experiment = scene.experiment.model_copy(update={"solver": stepping})
+            stepped = replace(scene, experiment=experiment)
+            choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
+            self._engine, _ = make_engine(stepped, choice)
 
     def at(self, state: State, step: int) -> Floats:
         """Planes, zero where nobody follows in that step; brings the state's frame into line."""
-        u = state.u
+        u, frame = state.u, self._scene.frame
         flat = u.reshape(len(u), -1)
-        if self._scene.frame:
-            self._scene.frame.follow(flat, flat)
-        moves = u.astype(float)
+        if frame:
+            frame.follow(flat, flat)
+        if self._engine:
+            here = replace(state, step=step - 1, previous=np.zeros_like(u))
+            moves = self._engine.advance(here).u
+        else:
+            moves = u.astype(float)
+            with np.errstate(all="ignore"):
+                self._followers.move(u, moves, state)
         with np.errstate(all="ignore"):
-            self._followers.move(u, moves, state)
             moves -= u
-        for leading in self._scene.leading:
-            if leading.group.leads(step):
-                moves.reshape(len(u), -1)[:, leading.place] = 0.0
+        still = [led.place for led in self._scene.leading if led.group.leads(step)]
+        for place in [*still, *([frame.place] if frame else [])]:
+            moves.reshape(len(u), -1)[:, place] = 0.0
         return moves
 
 

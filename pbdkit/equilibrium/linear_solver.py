@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cached_property, partial
-from importlib.util import find_spec
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import DENSE
 from pbdkit.equilibrium.dissection import dissected
-from pbdkit.equilibrium.algebraic_multigrid import aggregated, classical
-from pbdkit.errors import ExperimentError
+from pbdkit.equilibrium.sparse_multigrid import SparseGrids
 from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.float64]
@@ -23,11 +22,8 @@ Preconditioner = Callable[[Floats], Floats]
 MOST_ITERATIONS = 400
 FINEST = 1e-14
 """No residual becomes smaller than this share."""
-LARGEST_LU = 30_000
-"""Unknowns up to which `auto` takes an LU factorisation (measured: multigrid, with the import of
-pyamg, takes as long there)."""
-LARGEST_COUPLED_LU = 200_000
-"""The same where the axes move each other."""
+LARGEST_LU, LARGEST_COUPLED_LU = 30_000, 200_000
+"""Unknowns up to which `auto` takes an LU factorisation; more where the axes move each other."""
 STURDY = 0.1
 """Diagonal entries that are this share of the largest of their columns serve as pivots."""
 LOPSIDED = 1.2
@@ -35,6 +31,20 @@ LOPSIDED = 1.2
 symmetric."""
 SAME = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where the unknowns lie, `axes` of each particle next to each other: the places of particles
+    and of leaders, (particle, axis of space)."""
+
+    axes: int
+    places: Floats
+    led: Floats
+
+    def grids(self, matrix: Any) -> Preconditioner:
+        """Multigrid for a matrix of these unknowns."""
+        return SparseGrids(matrix, self.axes, self.places, self.led)
 
 
 class LinearSolver(ABC):
@@ -74,7 +84,7 @@ class SparseLU(LinearSolver):
 
     name = "lu"
 
-    def __init__(self, matrix: Any, symmetric: bool, places: Floats | None = None) -> None:
+    def __init__(self, matrix: Any, symmetric: bool, ground: Ground | None = None) -> None:
         from scipy.sparse.linalg import splu
 
         how: dict[str, Any] = {}
@@ -85,7 +95,7 @@ class SparseLU(LinearSolver):
             how = {"diag_pivot_thresh": STURDY}
         if how:
             how["permc_spec"] = "MMD_AT_PLUS_A"
-            self._order = None if places is None else dissected(matrix, places)
+            self._order = ground and dissected(matrix, ground.places.repeat(ground.axes, axis=0))
         if self._order is not None:
             how["permc_spec"] = "NATURAL"
             matrix = matrix[self._order][:, self._order]
@@ -162,34 +172,23 @@ def linear_solver(
     method: str,
     *,
     symmetric: bool,
-    near_kernel: Floats | None = None,
-    places: Floats | None = None,
+    ground: Ground | None = None,
     watch: Watch | None = None,
 ) -> LinearSolver:
     """The solver for a sparse matrix by a method, or by what serves its size.
 
-    `places` (unknown, axis) says where the unknowns lie, those of one place next to each other:
-    then an order of elimination by them pays. `near_kernel` (unknown, mode) are what the matrix
-    hardly changes, for the coarser grids of matrices that couple the axes. Raises LinAlgError
-    where the matrix is found to be singular, and ExperimentError where the method is not installed.
+    `ground` says where the unknowns lie: grids need it, and an order of elimination where axes
+    move each other gains by it. Raises LinAlgError where the matrix is found to be singular.
     """
-    size = matrix.shape[0]
+    size, coupled = matrix.shape[0], ground is not None and ground.axes > 1
     if method == "auto":
-        large = size > (LARGEST_LU if near_kernel is None else LARGEST_COUPLED_LU)
-        method = "multigrid" if large and find_spec("pyamg") is not None else "lu"
+        large = size > (LARGEST_COUPLED_LU if coupled else LARGEST_LU)
+        method = "multigrid" if large and ground else "lu"
     if method == "lu":
         if size <= DENSE:
             return Dense(dense(matrix))
-        return SparseLU(matrix, symmetric, places)
-    if method == "conjugate-gradients":
-        return Krylov(matrix, symmetric, watch or Watch())
-    if find_spec("pyamg") is None:
-        raise ExperimentError(
-            "method multigrid needs pyamg: pip install 'pbdkit[fast]'", ("solver", "method")
-        )
-    grids: Callable[[Any], Preconditioner] = classical
-    if near_kernel is not None:
-        grids = partial(aggregated, near_kernel=near_kernel, symmetric=symmetric)
+        return SparseLU(matrix, symmetric, ground if coupled else None)
+    grids = ground.grids if ground and method == "multigrid" else None
     return Krylov(matrix, symmetric, watch or Watch(), grids)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
+from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
 from pbdkit.errors import ExperimentError
@@ -47,6 +48,7 @@ class MatrixSystem(System):
         self._operator = operator = step_operator(scene, state, step)
         self._method, self._watch = method, watch
         self._X = scene.raster.reference(operator.followers)
+        self._led = scene.raster.reference(operator.leaders)
         self._place = scene.raster.place_of(operator.followers)
         self._both = both = operator.couplings_both
         first = 1 if both.couples(0, 1) else 0
@@ -189,22 +191,12 @@ class MatrixSystem(System):
     def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
         """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
         if held:
-            kernel = places = None
-            if len(axes) == 2:
-                kernel, places = self._rigid_modes()[some], self._X.repeat(2, axis=0)[some]
+            ground = Ground(len(axes), self._X[some[:: len(axes)] // len(axes)], self._led)
             with suppress(np.linalg.LinAlgError):
-                return Held(matrix, self._method, kernel, self._watch, places)
+                return Held(matrix, self._method, ground, self._watch)
         before = self._operator.couplings_before
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
         return Floating(matrix, back, self._watch)
-
-    def _rigid_modes(self) -> Floats:
-        """(unknown, mode): two translations and a rotation."""
-        modes = np.zeros((2 * len(self._X), 3))
-        modes[0::2, 0] = modes[1::2, 1] = 1.0
-        centred = self._X - self._X.mean(axis=0)
-        modes[0::2, 2], modes[1::2, 2] = -centred[:, 1], centred[:, 0]
-        return modes / max(1.0, float(np.abs(centred).max()))
 
 
 def _within(matrix: Any, unknowns: Indices) -> Any:

@@ -138,11 +138,11 @@ class Multigrid:
             self._levels[-1].halved = halved
             self._levels.append(_Level(grid, self.precision))
         self._at, K = grid.matrix()
-        values, modes = np.linalg.eigh((K + K.T) / 2)
-        if len(values) and not values[0] > SINGULAR * values[-1]:
+        values, modes = np.linalg.eigh(K)
+        if not values[0] > SINGULAR * values[-1]:
             raise FloatingError
-        self._inverse = ((modes / values) @ modes.T).astype(self.precision)
-        self._gives_way = (modes * modes / values).sum(axis=1)
+        inverse = (modes / values) @ modes.T
+        self._inverse, self._gives_way = inverse.astype(self.precision), inverse.diagonal()
 
     def __len__(self) -> int:
         """How many grids there are."""

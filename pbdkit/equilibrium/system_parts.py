@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import DENSE
 from pbdkit.equilibrium.linear_solver import (
     Dense,
+    Ground,
     Krylov,
     LinearSolver,
     SparseLU,
@@ -105,18 +106,17 @@ class Held(Part):
         self,
         matrix: Any,
         method: str,
-        near_kernel: Floats | None,
+        ground: Ground,
         watch: Watch,
-        places: Floats | None = None,
     ) -> None:
         if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
             from scipy.sparse import csr_array
 
             matrix = csr_array(matrix)
-        self._how: dict[str, Any] = {"symmetric": is_symmetric(matrix), "places": places}
+        self._how: dict[str, Any] = {"symmetric": is_symmetric(matrix), "ground": ground}
         self._matrix = matrix
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
-        solver = linear_solver(matrix, method, near_kernel=near_kernel, watch=watch, **self._how)
+        solver = linear_solver(matrix, method, watch=watch, **self._how)
         super().__init__(matrix.shape[0], solver, watch)
         if not self._spread < 1.0 / SINGULAR:
             raise np.linalg.LinAlgError("singular")
