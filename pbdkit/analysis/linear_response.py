@@ -97,23 +97,30 @@ def _differ(scene: Scene, state: State) -> bool:
 def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple[Indices, Indices]:
     """(kind, place): which kind each place is of, and one place of each; those of a kind have the
     same neighbours, the same shares of cells around them and the same broken bonds."""
+    block = scene.raster.body_block(sublattice)
+    whole = block is not None and len(place) == block.of(scene.raster.kind).size
+    around = Surroundings(scene, block if whole else Places(scene.raster.shape, place), sublattice)
     code = np.zeros(len(place), np.int64)
-    around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
     neighbours = around.neighbours(state)
     if scene.cells:
-        left = np.array([np.broadcast_to(to.w.left, place.shape) for to in neighbours])
-        cut = (left != 1.0).any(axis=0)
-        code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
+        shares = [to.w.left for to in neighbours if np.ndim(to.w.left)]
+        left = np.array([np.ravel(share) for share in shares]).reshape(len(shares), -1)
+        cut = np.flatnonzero((left != 1.0).any(axis=0)) if shares else []
+        if len(cut):
+            code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
-        code = 2 * code + mask
-    if len(code) and (code == code[0]).all():
-        return np.zeros(len(place), np.intp), place[:1]
+        code *= 2
+        code += mask.ravel()
     # More than fits a number, leaving 20 bits for the cut cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
-    _, first, kind = np.unique(code, return_index=True, return_inverse=True)
-    return kind, place[first]
+    middle = code[len(code) // 2] if len(code) else 0
+    others = np.flatnonzero(code != middle)
+    kind = np.zeros(len(place), np.intp)
+    _, first, kind[others] = np.unique(code[others], return_index=True, return_inverse=True)
+    kind[others] += 1
+    return kind, place[np.append(len(code) // 2, others[first])] if len(code) else place
 
 
 class _Followers:

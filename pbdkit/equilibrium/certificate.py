@@ -94,7 +94,7 @@ class Moves:
 
     def __init__(self, scene: Scene) -> None:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
-        self._scene, self._followers = scene, SlotFollowers(scene, stepping)
+        self._scene = scene
         self._engine: Engine | None = None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
@@ -102,6 +102,7 @@ class Moves:
             stepped = replace(scene, experiment=experiment)
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
+        self._followers = None if self._engine else SlotFollowers(scene, stepping)
 
     def at(self, state: State, step: int) -> Floats:
         """Planes, zero where nobody follows in that step; brings the state's frame into line."""
@@ -113,6 +114,7 @@ class Moves:
             here = replace(state, step=step - 1, previous=np.zeros_like(u))
             moves = self._engine.advance(here).u
         else:
+            assert self._followers
             moves = u.astype(float)
             with np.errstate(all="ignore"):
                 self._followers.move(u, moves, state)

@@ -6,7 +6,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,17 +52,9 @@ class LinearSolver(ABC):
     name: str
     iterations = 0
 
+    @abstractmethod
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
-        return self._solved(b, accuracy, transposed=False)
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """The same for Aᵀ."""
-        return self._solved(b, accuracy, transposed=True)
-
-    @abstractmethod
-    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
-        """By the method."""
 
 
 class Dense(LinearSolver):
@@ -74,8 +65,9 @@ class Dense(LinearSolver):
     def __init__(self, matrix: Floats) -> None:
         self.inverse = np.linalg.inv(matrix)
 
-    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
-        return (self.inverse.T if transposed else self.inverse) @ b
+    def solve(self, b: Floats, accuracy: float) -> Floats:
+        """By a product."""
+        return self.inverse @ b
 
 
 class SparseLU(LinearSolver):
@@ -104,8 +96,15 @@ class SparseLU(LinearSolver):
         except RuntimeError as error:  # "Factor is exactly singular"
             raise np.linalg.LinAlgError(str(error)) from None
 
-    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
-        how = "T" if transposed else "N"
+    def solve(self, b: Floats, accuracy: float) -> Floats:
+        """By the factors."""
+        return self._by_factors(b, "N")
+
+    def solve_transposed(self, b: Floats) -> Floats:
+        """Aᵀ x = b."""
+        return self._by_factors(b, "T")
+
+    def _by_factors(self, b: Floats, how: str) -> Floats:
         if self._order is None:
             return np.asarray(self._factors.solve(b, trans=how))
         x = np.empty_like(b, dtype=float)
@@ -126,20 +125,14 @@ class Krylov(LinearSolver):
     ) -> None:
         inner = "conjugate-gradients" if symmetric else "gmres"
         self.name = f"multigrid, {inner}" if grids else inner
-        self._symmetric, self._grids, self._watch = symmetric, grids, watch
-        self._upright = self._prepared(matrix)
+        self._matrix, self._symmetric, self._watch = matrix, symmetric, watch
+        self._cycle = grids(matrix) if grids else np.copy
+        self._most = MOST_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
 
-    def _prepared(self, matrix: Any) -> tuple[Any, Preconditioner]:
-        return matrix, self._grids(matrix) if self._grids else np.copy
-
-    @cached_property
-    def _transposed(self) -> tuple[Any, Preconditioner]:
-        return self._upright if self._symmetric else self._prepared(self._upright[0].T.tocsr())
-
-    def _solved(self, b: Floats, accuracy: float, *, transposed: bool) -> Floats:
+    def solve(self, b: Floats, accuracy: float) -> Floats:
+        """Until it is accurate enough, or most iterations are made."""
         from scipy.sparse.linalg import LinearOperator, cg, gmres
 
-        matrix, preconditioner = self._transposed if transposed else self._upright
         accuracy, whole = max(accuracy, FINEST), float(np.linalg.norm(b))
         if not 0.0 < whole < math.inf:
             return np.zeros_like(b)
@@ -151,18 +144,17 @@ class Krylov(LinearSolver):
         def told(r: Floats) -> Floats:
             """Conjugate gradients precondition the residual of every iteration."""
             tell(float(np.linalg.norm(r)) / whole)
-            return preconditioner(r)
+            return self._cycle(r)
 
-        first = told if self._symmetric else preconditioner
-        M = LinearOperator(matrix.shape, matvec=first, dtype=float)
+        first = told if self._symmetric else self._cycle
+        M = LinearOperator(self._matrix.shape, matvec=first, dtype=float)
         how: dict[str, Any] = {"M": M, "rtol": accuracy, "atol": 0.0}
         with np.errstate(all="ignore"):  # A that is no matrix for it: what comes out shows it
             if self._symmetric:
-                most = MOST_ITERATIONS + (0 if self._grids else 20 * math.isqrt(len(b)))
-                x, _ = cg(matrix, b, maxiter=most, **how)
+                x, _ = cg(self._matrix, b, maxiter=self._most, **how)
             else:
                 how |= {"callback": tell, "callback_type": "pr_norm", "restart": 30}
-                x, _ = gmres(matrix, b, maxiter=MOST_ITERATIONS // 30, **how)
+                x, _ = gmres(self._matrix, b, maxiter=MOST_ITERATIONS // 30, **how)
         self._watch.look(1.0)
         return np.asarray(x)
 

@@ -14,7 +14,7 @@ from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.system import System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import Floats, State
 
 Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
@@ -68,6 +68,8 @@ class _Search:
         self._system = self._linearised(at_rest, "assembling")
         self._owed: State | None = state.copy()
         self._left = self._moves()
+        self._known: tuple[float, Floats | None, System | None] = math.inf, None, None
+        """The last distance, of which moves, by which system."""
 
     def run(self) -> Certificate:
         if not self._left.any() and not self._state.u.any() and not self._state.previous.any():
@@ -165,8 +167,11 @@ class _Search:
         return self._finder.moves.at(self._state, self._step)
 
     def _distance(self) -> float:
-        bound = self._system.distance(self._left, self._rounding())
-        return math.inf if math.isnan(bound) else bound * (1.0 if self._linear else FIRST_ORDER)
+        known, of, by = self._known
+        if of is not self._left or by is not self._system:
+            known = self._system.distance(self._left, self._rounding())
+            self._known = known, self._left, self._system
+        return math.inf if math.isnan(known) else known * (1.0 if self._linear else FIRST_ORDER)
 
     @property
     def _wanted(self) -> float:

@@ -189,6 +189,6 @@ def _left_kernel(matrix: Any) -> Floats:
     shifted = SparseLU(matrix + SHIFT * eye_array(matrix.shape[0]), is_symmetric(matrix))
     basis = np.random.default_rng(0).normal(size=(matrix.shape[0], MOST_MODES))
     for _ in range(4):
-        basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
+        basis = np.linalg.qr(shifted.solve_transposed(basis))[0]
     _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
     return np.asarray(basis @ turned[values <= SINGULAR].T)

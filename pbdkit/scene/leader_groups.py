@@ -129,13 +129,8 @@ class Selecting:
 
     def _edge(self, edge: str) -> Indices:
         """The body particle of smallest or largest i in every row j, or j in every column i."""
-        site, axis = self.raster.site_of(self._body), 0 if edge in ("left", "right") else 1
-        along, line = site[:, axis], np.delete(site, axis, axis=1)
-        if edge in ("right", "top"):
-            along = -along
-        order = np.lexsort((along, *line.T))
-        _, first = np.unique(line[order], axis=0, return_index=True)
-        return self._body[order[first]]
+        axis = 0 if edge in ("left", "right") else 1
+        return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
 
     def _box(self, box: tuple[float, float, float, float]) -> Indices:
         slack = 1e-9 * _spacing(self.raster)

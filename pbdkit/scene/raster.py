@@ -148,6 +148,14 @@ class Raster:
                 own[..., axis] = plane[s][there]
         return out.reshape(-1, len(u))
 
+    def ends_of_lines(self, axis: int, *, last: bool) -> Indices:
+        """The rows of the body's first or last particles on every line of sites along an axis."""
+        body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
+        some = np.nonzero(body.any(axis=0))
+        end = (body[::-1] if last else body).argmax(axis=0)[some]
+        site = np.insert(np.stack(some, axis=1), axis, len(body) - 1 - end if last else end, axis=1)
+        return self.rows_of_sites(site + self.low)
+
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
         found = bounds(self.kind[sublattice] == FOLLOWER)

@@ -22,8 +22,8 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.places import Mask, distinct, hull
-from pbdkit.scene.raster import FOLLOWER, Raster, positions
+from pbdkit.scene.places import Mask, distinct
+from pbdkit.scene.raster import Raster, positions
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
 
@@ -158,12 +158,11 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
 
 
 def body_box(raster: Raster) -> tuple[Components, Components]:
-    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
-    cell = raster.lattice.cell()
-    bodies = (rows[raster.table_kind[rows] == FOLLOWER] for rows in raster.chunks())
-    parts = (positions(cell, *raster.cells_of(rows)) for rows in bodies if len(rows))
-    lower, upper = hull(([x.min() for x in at], [x.max() for x in at]) for at in parts)
-    return vector(map(float, lower)), vector(map(float, upper))
+    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0): along a
+    line of sites every component rises or falls."""
+    ends = [raster.ends_of_lines(raster.sites.ndim - 1, last=last) for last in (False, True)]
+    at = positions(raster.lattice.cell(), *raster.cells_of(np.concatenate(ends)))
+    return vector(float(x.min()) for x in at), vector(float(x.max()) for x in at)
 
 
 def _doubts(
