@@ -53,7 +53,7 @@ class NetcdfFile:
         for name in sorted(self._columns, key=tables.__getitem__):
             self._define(self._columns[name], sizes, planned)
 
-    def reopen(self, waiting: Waiting, written: Mapping[str, int]) -> None:
+    def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
         """Goes on with a file as it was committed. Raises StorageError where it does not hold what
         is said to be written."""
         self.waiting |= waiting
