@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.storage.paged_file import PagedFile
 
@@ -52,11 +53,15 @@ class NetcdfFile:
         for name in sorted(self._columns, key=tables.__getitem__):
             self._define(self._columns[name], sizes, planned)
 
-    def reopen(self, waiting: Waiting, written: Mapping[str, int]) -> None:
-        """Goes on with a file as it was committed."""
+    def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
+        """Goes on with a file as it was committed. Raises StorageError where it does not hold what
+        is said to be written."""
         self.waiting |= waiting
         self.written |= written
         self._open("r+")
+        for name, count in self.written.items():
+            if not (isinstance(count, int) and 0 <= count <= self._content[name].shape[0]):
+                raise StorageError(f"the store holds no {count!r} entries of '{name}'")
         self._batch = {name: self._content[name].chunks[0] for name in self.written}
 
     def put(self, values: Values) -> None:

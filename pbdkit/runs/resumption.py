@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -63,6 +64,15 @@ def resumption(
     return _continued(output, watch, steps, anyway)
 
 
+@contextmanager
+def _damage_named(output: Path) -> Iterator[None]:
+    """What was kept in other forms than a run keeps is damage, not a bug."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise StorageError(f"{output}: what was kept of it is damaged: {error}") from error
+
+
 def _unfinished(output: Path, watch: Watch, steps: int | None, anyway: bool) -> Resumption | None:
     left = UnfinishedRun.open(output, writing=True)
     try:
@@ -71,16 +81,19 @@ def _unfinished(output: Path, watch: Watch, steps: int | None, anyway: bool) -> 
             raise StorageError("what is noted under 'origin' is damaged")
         sink = NetcdfSink(output, replace=origin.get("replace") is True, origin=origin)
         if "finished" in left.facts:
-            sink.conclude(left)
+            with _damage_named(output):
+                sink.conclude(left)
             return None
         experiment = _experiment(about, f"{output}, unfinished", steps, left.facts.get("step"))
         if not anyway:
             _refuse_versions(output, about, experiment)
             _refuse_changed_file(output, about, origin)
-        scene, standing = build_scene(experiment), left.standing()
+        scene = build_scene(experiment)
         run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
-        take_up(run.driver, recorder, standing)
-        sink.go_on(left, standing, columns_of(scene), experiment.record.compression)
+        with _damage_named(output):
+            standing = left.standing()
+            take_up(run.driver, recorder, standing)
+            sink.go_on(left, standing, columns_of(scene), experiment.record.compression)
     except BaseException:
         left.close()
         raise

@@ -224,7 +224,7 @@ def tried(whole: Path, others: list[Path], seed: str) -> list[str]:
             found.append(f"{name} ended with {code}: {said[-1500:]}")
         elif name == "open" and code == 0 and not told and is_other(whole):
             found.append("what was read is not what the run recorded, and nothing said")
-        elif name == "resume" and code == 0 and (wrong := result_is_other(whole)) and not told:
+        elif name == "resume" and code == 0 and not told and (wrong := result_is_other(whole)):
             found.append(f"gone on with to another result: {wrong}")
     if not precious.exists() or precious.read_bytes() != b"not yours":
         found.append("touched another file")
