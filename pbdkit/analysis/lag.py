@@ -31,7 +31,7 @@ from pbdkit.experiment.leaders import Oscillation
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 DEAREST = 2e8
 """Products of numbers that are made at most to know the lag at the end of an interval."""
 WORST = 1e12

@@ -6,6 +6,7 @@ particles with the same neighbours present answer alike, and one of each kind is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -97,30 +98,49 @@ def _differ(scene: Scene, state: State) -> bool:
 def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple[Indices, Indices]:
     """(kind, place): which kind each place is of, and one place of each; those of a kind have the
     same neighbours, the same shares of cells around them and the same broken bonds."""
-    block = scene.raster.body_block(sublattice)
-    whole = block is not None and len(place) == block.of(scene.raster.kind).size
-    around = Surroundings(scene, block if whole else Places(scene.raster.shape, place), sublattice)
-    code = np.zeros(len(place), np.int64)
+    plain = _plain(scene, state, sublattice).ravel()[place % math.prod(scene.raster.shape[1:])]
+    others = np.flatnonzero(~plain)
+    first = np.flatnonzero(plain)[:1] if len(others) < len(place) else others[:0]
+    kind, some = np.zeros(len(place), np.intp), place[others]
+    around = Surroundings(scene, Places(scene.raster.shape, some), sublattice)
     neighbours = around.neighbours(state)
+    code = np.zeros(len(some), np.int64)
     if scene.cells:
-        shares = [to.w.left for to in neighbours if np.ndim(to.w.left)]
-        left = np.array([np.ravel(share) for share in shares]).reshape(len(shares), -1)
-        cut = np.flatnonzero((left != 1.0).any(axis=0)) if shares else []
-        if len(cut):
-            code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
+        left = np.array([np.broadcast_to(to.w.left, some.shape) for to in neighbours])
+        cut = (left != 1.0).any(axis=0)
+        code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
-        code *= 2
-        code += mask.ravel()
+        code = 2 * code + mask
     # More than fits a number, leaving 20 bits for the cut cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
-    middle = code[len(code) // 2] if len(code) else 0
-    others = np.flatnonzero(code != middle)
-    kind = np.zeros(len(place), np.intp)
-    _, first, kind[others] = np.unique(code[others], return_index=True, return_inverse=True)
-    kind[others] += 1
-    return kind, place[np.append(len(code) // 2, others[first])] if len(code) else place
+    _, found, kind[others] = np.unique(code, return_index=True, return_inverse=True)
+    kind[others] += len(first)
+    return kind, place[np.concatenate([first, others[found]])]
+
+
+def _plain(scene: Scene, state: State, sublattice: int) -> Present:
+    """(cell, cell): around which particles of a sublattice all neighbours are there, all cells
+    whole and no bonds broken."""
+    raster, around = scene.raster, scene.neighbourhood
+    plain = np.zeros(raster.shape[1:], bool)
+    if not (block := raster.body_block(sublattice)):
+        return plain
+    here = block.within(plain)
+    here[...] = True
+    there = raster.kind != EMPTY
+    whole = scene.cells.share == 1.0 if scene.cells else there
+    for slot in around.slots[sublattice]:
+        here &= block.seen_through(slot).of(there)
+        if state.broken_step is not None:
+            plane, at_this_end = around.home[slot]
+            home = block if at_this_end else block.seen_through(slot)
+            here &= home.within(state.broken_step[plane]) < 0
+        for side in around.tiling.beside[slot] if scene.cells else ():
+            first = block.seen_through(side.first) if side.first else block
+            here &= first.of(whole[side.kind])
+    return plain
 
 
 class _Followers:

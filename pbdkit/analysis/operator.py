@@ -26,7 +26,7 @@ from pbdkit.stepping.state import State, initial_state
 if TYPE_CHECKING:
     import scipy.sparse
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.signedinteger[Any]]
 
 

@@ -32,14 +32,14 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.state import State, initial_state
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Job = dict[str, Any]
 REPEATS, PATIENCE_S = 7, 2.0
 """A way is gone so often, unless that takes longer; the best counts."""
 LONGEST_S = 60.0
 """After a tolerance that took longer, tighter ones are left out."""
 COMPILED = "pbdkit.stepping.compiled.compiled_stepper"
-SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "pyamg")
+SOLVERS = ("scipy.sparse.linalg", "scipy.sparse.csgraph", "numba")
 TURNS, ROUGH = 12, 1e-3
 """Of the inverse iteration for the slowest mode, and the accuracy of each."""
 
@@ -194,7 +194,7 @@ def _of_followers(scene: Scene, state: State) -> Floats:
     return state.u.reshape(len(state.u), -1)[:, followers_of(scene)].astype(float)
 
 
-def decay_of(scene: Scene, exact: NDArray[np.float64]) -> Decay:
+def decay_of(scene: Scene, exact: Floats) -> Decay:
     """Of the slowest mode that the start excites, by inverse iteration from the way that is to go
     to `exact`, (axis, follower): v ← A⁻¹ v, A = 1 - (step operator). Its share is the projection of
     that way onto it."""

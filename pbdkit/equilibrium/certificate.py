@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.system import System
@@ -227,8 +226,8 @@ class Foresight:
         return Outlook(ahead, certificate, obstacle)
 
     def _correction(
-        self, here: State, known: System, moves: NDArray[np.float64], anew: bool
-    ) -> tuple[NDArray[np.float64] | None, str]:
+        self, here: State, known: System, moves: Floats, anew: bool
+    ) -> tuple[Floats | None, str]:
         """None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:

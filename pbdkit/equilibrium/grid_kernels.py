@@ -28,7 +28,10 @@ stencils, and the inverses of their middles."""
 def around(x, i, lo, hi):
     """The rows before, at and after a run, x and y, from one place before it to one after."""
     lo, hi = lo - 1, hi + 1
-    before, after = (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]), (x[0, i + 1, lo:hi], x[1, i + 1, lo:hi])
+    before, after = (
+        (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]),
+        (x[0, i + 1, lo:hi], x[1, i + 1, lo:hi]),
+    )
     return before[0], before[1], x[0, i, lo:hi], x[1, i, lo:hi], after[0], after[1]
 
 
@@ -122,7 +125,10 @@ def solve_own(grid, i, r, weight, x, adds):
                 oy[j] = weight * (d[2] * rx[j] + d[3] * ry[j])
     for e in range(grid.lone[i], grid.lone[i + 1]):
         j, c = grid.place[e], grid.own_inverse[grid.which[e]]
-        u, v = weight * (c[0] * r[0, j] + c[1] * r[1, j]), weight * (c[2] * r[0, j] + c[3] * r[1, j])
+        u, v = (
+            weight * (c[0] * r[0, j] + c[1] * r[1, j]),
+            weight * (c[2] * r[0, j] + c[3] * r[1, j]),
+        )
         x[0, i, j], x[1, i, j] = (x[0, i, j] + u, x[1, i, j] + v) if adds else (u, v)
 
 
@@ -149,7 +155,7 @@ def relax(grid, b, x, row, weight, start, upwards):
 @njit(**FAST)
 def restrict(grid, b, x, halved, code, out):
     """out = Pᵀ (b - K x) at the free places of the next grid, those of a `code` of at least 0.
-    `halved` tells along which axes it has half the places: place n of it lies at 2n - 1, or at n."""
+    `halved` tells along which axes it has half the places: its place n lies at 2n - 1, or at n."""
     half, width, across = x.dtype.type(0.5), code.shape[1], x.shape[2]
     odd, even = np.zeros((2, across), x.dtype), np.zeros((2, across), x.dtype)
     sums = np.zeros((2, 2 * width + 2), x.dtype)

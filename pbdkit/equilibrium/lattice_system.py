@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 LOOKS_AHEAD = 2
 """Iterations that a bound takes."""
 SAFETY = 2.0
@@ -72,6 +73,9 @@ class LatticeSystem(System):
         way = math.sqrt(float((found.x * found.x).sum(axis=0).max()))
         return way + self._farthest(found.left) + rounding * self._spread
 
+    def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
+        """All is held."""
+
     def _descended(self, r: Floats, done: Callable[[Descent], bool]) -> Descent:
         found = self._solver.solve(r, done)
         self.iterations += len(found.steps)
@@ -98,7 +102,10 @@ class LatticeSystem(System):
         last = len(self._grids) - 1
         if last == 0:
             return found
-        solver, b = ConjugateGradients(self._grids, last - 1), self._grids.grid(last - 1).field(np.float64)
+        solver, b = (
+            ConjugateGradients(self._grids, last - 1),
+            self._grids.grid(last - 1).field(np.float64),
+        )
         i, j = self._grids.finer_place(last, place)
         if i >= b.shape[1] or j >= b.shape[2] or self._grids.grid(last - 1).code[i, j] < 0:
             return found * (last + 1)

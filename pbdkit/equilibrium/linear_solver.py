@@ -16,7 +16,7 @@ from pbdkit.equilibrium.dissection import dissected
 from pbdkit.equilibrium.sparse_multigrid import SparseGrids
 from pbdkit.results.progress import Watch
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Preconditioner = Callable[[Floats], Floats]
 MOST_ITERATIONS = 400
 FINEST = 1e-14
@@ -87,7 +87,8 @@ class SparseLU(LinearSolver):
             how = {"diag_pivot_thresh": STURDY}
         if how:
             how["permc_spec"] = "MMD_AT_PLUS_A"
-            self._order = ground and dissected(matrix, ground.places.repeat(ground.axes, axis=0))
+            places = ground.places.repeat(ground.axes, axis=0) if ground else None
+            self._order = None if places is None else dissected(matrix, places)
         if self._order is not None:
             how["permc_spec"] = "NATURAL"
             matrix = matrix[self._order][:, self._order]

@@ -24,7 +24,7 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.intp]
 
 
@@ -153,7 +153,10 @@ class MatrixSystem(System):
             unsure = np.full(len(r), rounding)
             if stage.into is not None:
                 unsure += abs(stage.into).sum(axis=1) * bounds[1 - stage.axes[0]]
-            far = (part.farthest(r[some], float(unsure[some].max(initial=0.0))) for some, part in stage.parts)
+            far = (
+                part.farthest(r[some], float(unsure[some].max(initial=0.0)))
+                for some, part in stage.parts
+            )
             bounds[stage.axes] = max(far, default=0.0)
         return math.hypot(*bounds)
 

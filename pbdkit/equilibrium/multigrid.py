@@ -6,7 +6,6 @@ to them (Galerkin). Where one direction is much stiffer, only that one is made c
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from importlib.resources import files
 from types import SimpleNamespace
@@ -28,7 +27,7 @@ STIFFER = 3.0
 NARROW = 5
 """Places across, with the ring around, at which a grid is not made narrower."""
 SINGULAR = 1e-12
-"""Relative size of the smallest eigenvalue of the coarsest grid below which nothing holds a body."""
+"""Relative size of the smallest eigenvalue of the coarsest grid below which a body is not held."""
 
 
 @cache
@@ -82,7 +81,9 @@ class Grid:
 
     def coarser(self, halved: tuple[int, int]) -> Grid:
         """The next grid."""
-        shape = [(n - 2) // 2 + 3 if half else n for n, half in zip(self.code.shape, halved, strict=True)]
+        shape = [
+            (n - 2) // 2 + 3 if half else n for n, half in zip(self.code.shape, halved, strict=True)
+        ]
         kind, code = np.zeros(shape, np.int8), np.zeros(shape, np.int32)
         kernels().coarse_kinds(self.kind, halved, kind)
         count = kernels().coarse_codes(self.code, kind, halved, code)
@@ -116,9 +117,9 @@ def _coarse_stencil(stencils: Floats, halved: tuple[int, int]) -> Floats:
     """What one stencil everywhere makes of itself."""
     coarse = np.full((7, 7), -1, np.int32)
     coarse[3, 3] = 1
-    found = np.zeros((2, *stencils.shape[1:]))
+    found: Floats = np.zeros((2, *stencils.shape[1:]))
     kernels().galerkin(np.zeros((12, 12), np.int32), stencils, coarse, halved, found)
-    return found[1]
+    return np.asarray(found[1])
 
 
 class Multigrid:

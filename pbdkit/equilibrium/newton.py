@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.linearisation import linearised
@@ -16,7 +15,6 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
 
-Vectors = NDArray[np.float64]
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
 SHARE = 0.25
 """Of the tolerance, for linear systems."""
@@ -115,7 +113,7 @@ class _Search:
             ):
                 return
 
-    def _search_along(self, correction: Vectors) -> bool:
+    def _search_along(self, correction: Floats) -> bool:
         """Whether some share of the correction makes the moves smaller; takes it."""
         start, moves, share = self._state.u.copy(), self._left, 1.0
         while share >= SHORTEST:
@@ -159,11 +157,11 @@ class _Search:
         self._linearisations += 1
         return linearised(finder.scene, at, self._step, finder.method, finder.watch)
 
-    def _shift(self, correction: Vectors, share: float) -> None:
+    def _shift(self, correction: Floats, share: float) -> None:
         self._state.u += correction if share == 1.0 else share * correction
         self._left = self._moves()
 
-    def _moves(self) -> Vectors:
+    def _moves(self) -> Floats:
         return self._finder.moves.at(self._state, self._step)
 
     def _distance(self) -> float:
@@ -185,6 +183,6 @@ class _Search:
         return self._rounding() * math.sqrt(max(1, self._left.size))
 
 
-def _size(moves: Vectors) -> float:
+def _size(moves: Floats) -> float:
     with np.errstate(over="ignore"):
         return float(np.linalg.norm(moves))

@@ -69,7 +69,9 @@ class SparseGrids:
             restricts = hats.T.tocsr()
             self._levels.append(_Level(A, own, MARGIN * _largest(A, own), hats, restricts))
             A, places = (restricts @ (A @ hats)).tocsr(), points * spacing + origin
-        self._coarsest = np.linalg.pinv(A.toarray().astype(float), rcond=SINGULAR).astype(np.float32)
+        self._coarsest = np.linalg.pinv(A.toarray().astype(float), rcond=SINGULAR).astype(
+            np.float32
+        )
 
     def __call__(self, r: Floats) -> Floats:
         """One cycle from zero; r is scaled, for it may be tiny in single precision."""
@@ -95,7 +97,9 @@ def _spacing(places: Floats) -> Floats:
         apart = np.diff(np.unique(along.round(9)))
         found.append(float(apart.min(initial=np.inf)))
     spacing = np.array(found)
-    return np.where(np.isfinite(spacing), spacing, spacing.min(initial=1.0, where=np.isfinite(spacing)))
+    return np.where(
+        np.isfinite(spacing), spacing, spacing.min(initial=1.0, where=np.isfinite(spacing))
+    )
 
 
 def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
@@ -105,7 +109,9 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
     from scipy.sparse import csr_array, eye_array, kron
 
     low = np.floor(np.minimum(at.min(axis=0), led.min(axis=0, initial=0.0))).astype(int) - 1
-    shape = tuple((np.ceil(np.maximum(at.max(axis=0), led.max(axis=0, initial=0.0))) - low + 2).astype(int))
+    shape = tuple(
+        (np.ceil(np.maximum(at.max(axis=0), led.max(axis=0, initial=0.0))) - low + 2).astype(int)
+    )
     near, near_led = (_nearest(points, low, shape) for points in (at, led))
     kept = near <= near_led
     rows, points, values = [], [], []

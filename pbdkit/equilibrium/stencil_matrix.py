@@ -16,13 +16,13 @@ from pbdkit.analysis.couplings import frame_matrices
 from pbdkit.analysis.linear_response import Response, by_sublattice, respond
 from pbdkit.interfaces import Calibrated, Slot
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.leader_groups import kinds_at
+from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Integers = NDArray[np.signedinteger[Any]]
 WINDOW, OWN = 9, 4
 """Places of a stencil, and the one of the particle itself among them."""
@@ -61,8 +61,8 @@ class _Raster:
     """Primitive cells, with a ring of empty ones around: the flat place of each particle here from
     its place on the scene's raster; `shape` is (row, place)."""
 
-    shape: tuple[int, int]
-    low: tuple[int, int]
+    shape: Index
+    low: Index
     scene: Scene
 
     @classmethod
@@ -70,14 +70,18 @@ class _Raster:
         """None where bonds lead farther than to a primitive cell beside."""
         cell = scene.raster.lattice.cell()
         steps = [primitive_step(scene, slot) for slot in scene.neighbourhood.every]
-        if scene.axes != 2 or np.abs(steps).max() > 1 or abs(np.linalg.det(cell.primitive)) != len(
-            cell.sites
+        if (
+            scene.axes != 2
+            or np.abs(steps).max() > 1
+            or abs(np.linalg.det(cell.primitive)) != len(cell.sites)
         ):
             return None
         if len(cell.sites) == 1:
             return cls(scene.raster.shape[1:], scene.raster.first, scene)
         cells = np.array(scene.raster.shape[1:]) - 1
-        corners = np.array([(0, 0), (cells[0], 0), (0, cells[1]), tuple(cells)]) + scene.raster.first
+        corners = (
+            np.array([(0, 0), (cells[0], 0), (0, cells[1]), tuple(cells)]) + scene.raster.first
+        )
         ends = corners @ np.array(cell.primitive)
         sites = np.array([site.primitive for site in cell.sites])
         low = ends.min(axis=0) + sites.min(axis=0) - 1
@@ -99,17 +103,19 @@ class _Raster:
         whole = np.stack(cells, axis=-1) + raster.first
         sites = np.array([site.primitive for site in cell.sites])
         index = whole @ np.array(cell.primitive) + sites[s] - self.low
-        return np.ravel_multi_index(tuple(index.T), self.shape)
+        found: Indices = np.ravel_multi_index(tuple(index.T), self.shape)
+        return found
 
 
-def primitive_step(scene: Scene, slot: Slot) -> tuple[int, int]:
+def primitive_step(scene: Scene, slot: Slot) -> Index:
     """Where a slot leads in the primitive basis."""
     found = scene.raster.lattice.cell().offset(slot.source, slot.target, slot.cell)
     return found.primitive
 
 
 class _Assembly:
-    """Puts the stencils together, looking particles up by their flat place on the scene's raster."""
+    """Puts the stencils together; particles are looked up by their flat place on the scene's
+    raster."""
 
     def __init__(self, scene: Scene, state: State, step: int, grid: _Raster) -> None:
         self._scene, self._state, self._grid = scene, state, grid
@@ -223,7 +229,8 @@ def inverses(matrices: Floats) -> Floats:
     determinant = a * d - b * c
     some = np.abs(determinant) > SINGULAR * np.abs(matrices).max(axis=(-2, -1)) ** 2
     adjugate = np.moveaxis(np.array([[d, -b], [-c, a]]), (0, 1), (-2, -1))
-    return np.where(some, 1.0 / np.where(some, determinant, 1.0), 0.0)[..., None, None] * adjugate
+    factor = np.where(some, 1.0 / np.where(some, determinant, 1.0), 0.0)
+    return np.asarray(factor[..., None, None] * adjugate)
 
 
 def _most_first(

@@ -6,13 +6,14 @@ Moves and displacements are planes, (axis, sublattice, cell, cell), as in a stat
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.stepping.state import State
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 
 class System(ABC):
@@ -45,6 +46,7 @@ class System(ABC):
         """How far any follower is from the solution at most, given its moves and what rounding may
         have done to them."""
 
+    @abstractmethod
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """Raises ExperimentError where a part that nothing holds has moves left: only linear rules
         tell where it ends."""

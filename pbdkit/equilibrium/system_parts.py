@@ -24,7 +24,7 @@ from pbdkit.equilibrium.linear_solver import (
 )
 from pbdkit.results.progress import Watch
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 SAFETY = 3.0
 """What an estimate that may come out too small is multiplied with."""
 ACCURACY = 1e-9

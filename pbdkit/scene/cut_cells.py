@@ -11,10 +11,12 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
 from pbdkit.scene.places import Floats
 from pbdkit.scene.sites import Filling, rounding_of, sites_from, sublattices_from, trimmed, window
 
+Window = tuple[slice, ...]
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
 CELLS_AT_ONCE = 512
@@ -37,10 +39,10 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *cutter.shape))
     corner = np.zeros(cutter.shape, bool)
     for polygon in tiling.polygons:
-        i, j, found = cutter.shares(polygon)
-        share[polygon.kind, i, j] = found
-        for m, n in (at.site for at in polygon.corners):
-            corner[i + m, j + n] = True
+        there, found = cutter.shares(polygon)
+        share[polygon.kind][there] = found
+        for at in polygon.corners:
+            corner[_shifted(there, at.site)] |= found > 0.0
     if not (filling := trimmed(cutter.low, corner, share)):
         raise ExperimentError(
             "holds no cell of the lattice; make it larger, or take a frame that does not weigh "
@@ -65,28 +67,28 @@ class _Cutter:
         self._at, self._tolerance = sites.at, rounding_of(lattice.cell(), *sites.at)
         self._distance = self._signed(sites)
 
-    def shares(self, polygon: Polygon) -> tuple[Indices, Indices, Floats]:
-        """(i, j, share) of the cells of that shape with a share, by the place of their first corner
-        on the window."""
+    def shares(self, polygon: Polygon) -> tuple[Window, Floats]:
+        """(window, share) of all cells of that shape, by the place of their first corner: a part of
+        the whole window, and shares there, 0 where there is no cell."""
         steps = [corner.site for corner in polygon.corners]
         low, high = np.min(steps, axis=0), np.max(steps, axis=0)
-        ends = np.array(self.shape) - high
-        near = self._sublattice[-low[0] : ends[0], -low[1] : ends[1]] == polygon.source
-        i, j = (n - lowest for n, lowest in zip(np.nonzero(near), low, strict=True))
-        share, nearest = np.ones(len(i)), np.full(len(i), np.inf)
-        for m, n in steps:
-            distance = self._distance[i + m, j + n]
+        there: Window = tuple(map(slice, -low, np.array(self.shape) - high))
+        share = (self._sublattice[there] == polygon.source).astype(float)
+        nearest = np.full(share.shape, np.inf)
+        for step in steps:
+            distance = self._distance[_shifted(there, step)]
             share[distance > 0.0] = 0.0
-            nearest = np.minimum(nearest, np.abs(distance))
+            np.minimum(nearest, np.abs(distance), out=nearest)
         if not self._of_sites:
             reach = (1.0 if self._body.exaggerates() else NEAREST) * _width(polygon)
-            cut = np.flatnonzero(nearest <= reach)
+            near = (nearest <= reach) & (self._sublattice[there] == polygon.source)
+            cut = np.stack(np.nonzero(near), axis=1)
             for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
-                at = [(i[some] + m, j[some] + n) for m, n in steps]
-                x, y = (np.array([plane[there] for there in at]) for plane in self._at)
-                share[some] = self._cut_shares(x, y)
-        counted = share > SMALLEST
-        return i[counted], j[counted], share[counted]
+                at = [tuple((some - low + step).T) for step in steps]
+                x, y = (np.array([plane[where] for where in at]) for plane in self._at)
+                share[tuple(some.T)] = self._cut_shares(x, y)
+        share[share <= SMALLEST] = 0.0
+        return there, share
 
     def _cut_shares(self, x: Floats, y: Floats) -> Floats:
         """The share inside of cells with corners (corner, cell): the mean over its triangles, cut
@@ -109,6 +111,11 @@ class _Cutter:
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+
+
+def _shifted(window: Window, step: Index) -> Window:
+    """The window so many sites on."""
+    return tuple(slice(s.start + n, s.stop + n) for s, n in zip(window, step, strict=True))
 
 
 def _width(polygon: Polygon) -> float:
