@@ -59,7 +59,7 @@ class NetcdfFile:
         self.waiting |= waiting
         self.written |= written
         self._open("r+")
-        for name, count in self.written.items():
+        for name, count in written.items():
             if not (isinstance(count, int) and 0 <= count <= self._content[name].shape[0]):
                 raise StorageError(f"the store holds no {count!r} entries of '{name}'")
         self._batch = {name: self._content[name].chunks[0] for name in self.written}
