@@ -29,12 +29,12 @@ def averaging(nx, ny, upwind=0.0):
     return (sparse.eye_array(nx * ny) - mean / 4).tocsr()
 
 
-def solver_of(matrix, method="auto", shape=(40, 20)):
+def solver_of(matrix, method="auto", shape=(40, 20), **more):
     """With the unknowns on a sheet of that shape, held all round."""
     place = np.stack(np.unravel_index(np.arange(matrix.shape[0]), shape), axis=1).astype(float)
     around = np.array([(i, j) for i in (-1, shape[0]) for j in range(shape[1])], float)
     ground = Ground(1, place, around)
-    return linear_solver(matrix, method, symmetric=linear.is_symmetric(matrix), ground=ground)
+    return linear_solver(matrix, method, symmetric=linear.is_symmetric(matrix), ground=ground, **more)
 
 
 def test_the_method_follows_size_and_symmetry(monkeypatch):
@@ -158,7 +158,7 @@ def test_an_iteration_hears_of_it():
     asked = []
     matrix = averaging(30, 30)
     watch = Watch(lambda: len(asked) == 3, lambda what, share: asked.append(share))
-    solver = solver_of(matrix, "conjugate-gradients", watch=watch)
+    solver = solver_of(matrix, "conjugate-gradients", (30, 30), watch=watch)
     with pytest.raises(StoppedError):
         solver.solve(np.ones(900), 1e-9)
     assert solver.iterations == 4

@@ -40,7 +40,7 @@ def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
     corner = np.zeros(cutter.shape, bool)
     for polygon in tiling.polygons:
         there, found = cutter.shares(polygon)
-        share[polygon.kind][there] = found
+        share[polygon.kind][there] += found
         for at in polygon.corners:
             corner[_shifted(there, at.site)] |= found > 0.0
     if not (filling := trimmed(cutter.low, corner, share)):

@@ -156,6 +156,16 @@ class Raster:
         site = np.insert(np.stack(some, axis=1), axis, len(body) - 1 - end if last else end, axis=1)
         return self.rows_of_sites(site + self.low)
 
+    def ends_of_rows(self, sublattice: int) -> list[Indices]:
+        """The repeat cells, index by index, of the body's first and last particle of a sublattice
+        in every row of cells along the last axis: places rise or fall between them."""
+        body = self.kind[sublattice] == FOLLOWER
+        some = np.nonzero(body.any(axis=-1))
+        first = body.argmax(axis=-1)[some]
+        last = body.shape[-1] - 1 - body[..., ::-1].argmax(axis=-1)[some]
+        cells = [*(np.tile(index, 2) for index in some), np.concatenate([first, last])]
+        return [c + n for c, n in zip(cells, self.first, strict=True)]
+
     def body_block(self, sublattice: int) -> Block | None:
         """The smallest block that holds the body's particles of that sublattice, if any."""
         found = bounds(self.kind[sublattice] == FOLLOWER)

@@ -22,7 +22,7 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.places import Mask, distinct
+from pbdkit.scene.places import Mask, distinct, hull
 from pbdkit.scene.raster import Raster, positions
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
@@ -158,11 +158,13 @@ def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
 
 
 def body_box(raster: Raster) -> tuple[Components, Components]:
-    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0): along a
-    line of sites every component rises or falls."""
-    ends = [raster.ends_of_lines(raster.sites.ndim - 1, last=last) for last in (False, True)]
-    at = positions(raster.lattice.cell(), *raster.cells_of(np.concatenate(ends)))
-    return vector(float(x.min()) for x in at), vector(float(x.max()) for x in at)
+    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
+    ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
+    at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]
+    lower, upper = hull(
+        ([x.min() for x in here], [x.max() for x in here]) for here in at if here[0].size
+    )
+    return vector(map(float, lower)), vector(map(float, upper))
 
 
 def _doubts(
