@@ -34,11 +34,11 @@ def _status(output: Path) -> dict[str, Any]:
         step = steps if "finished" in facts else int(facts["step"])
         rate = float(facts.get("rate", 0.0))
         age = max(0.0, time.time() - float(facts.get("at", math.inf)))  # clocks are set back
+        remaining = max(0.0, (steps - step) / rate - age) if rate > 0.0 else None
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StorageError(f"{store_of(output)}: is damaged: {error}") from None
     finally:
         left.close()
-    remaining = max(0.0, (steps - step) / rate - age) if rate > 0.0 else None
     state = "running" if running else "stopped"
     found = {"step": step, "steps": steps, "rate": rate, "left_s": remaining, "age_s": age}
     return found | {"state": state}
