@@ -34,7 +34,9 @@ def solver_of(matrix, method="auto", shape=(40, 20), **more):
     place = np.stack(np.unravel_index(np.arange(matrix.shape[0]), shape), axis=1).astype(float)
     around = np.array([(i, j) for i in (-1, shape[0]) for j in range(shape[1])], float)
     ground = Ground(1, place, around)
-    return linear_solver(matrix, method, symmetric=linear.is_symmetric(matrix), ground=ground, **more)
+    return linear_solver(
+        matrix, method, symmetric=linear.is_symmetric(matrix), ground=ground, **more
+    )
 
 
 def test_the_method_follows_size_and_symmetry(monkeypatch):

@@ -26,6 +26,7 @@ from pbdkit.stepping.state import Floats, State
 WAYS = {
     "inverse": "the solution for what is left of the moves, and the inverse for their rounding",
     "solution": "the solution for what is left of the moves",
+    "iteration": "some iterations more, and how they fall",
     "energy": "some iterations more, and the energy of what they leave",
     "nothing to solve": "nobody follows",
 }

@@ -36,19 +36,21 @@ def around(x, i, lo, hi):
 
 
 @njit(**FAST)
-def of_row(c, n, x, y, j):
-    """What three places of a row do to the one in their middle: one component, from c[n] on."""
-    left, here = c[n] * x[j] + c[n + 1] * y[j], c[n + 4] * x[j + 1] + c[n + 5] * y[j + 1]
-    return left + here + c[n + 8] * x[j + 2] + c[n + 9] * y[j + 2]
+def of_row(c, x, y, j):
+    """What three places of a row do to the one in their middle, by 12 numbers."""
+    x0, y0, x1, y1, x2, y2 = x[j], y[j], x[j + 1], y[j + 1], x[j + 2], y[j + 2]
+    kx = (c[0] * x0 + c[1] * y0) + (c[4] * x1 + c[5] * y1) + (c[8] * x2 + c[9] * y2)
+    ky = (c[2] * x0 + c[3] * y0) + (c[6] * x1 + c[7] * y1) + (c[10] * x2 + c[11] * y2)
+    return kx, ky
 
 
 @njit(**FAST)
 def of_run(c, rows, j):
     """K x at place j of a run."""
-    xa, ya, xb, yb, xc, yc = rows
-    kx = of_row(c, 0, xa, ya, j) + of_row(c, 12, xb, yb, j) + of_row(c, 24, xc, yc, j)
-    ky = of_row(c, 2, xa, ya, j) + of_row(c, 14, xb, yb, j) + of_row(c, 26, xc, yc, j)
-    return kx, ky
+    ax, ay = of_row(c[0], rows[0], rows[1], j)
+    bx, by = of_row(c[1], rows[2], rows[3], j)
+    cx, cy = of_row(c[2], rows[4], rows[5], j)
+    return ax + bx + cx, ay + by + cy
 
 
 @njit(**FAST)
@@ -109,27 +111,27 @@ def residual(grid, i, b, x, out):
 
 
 @njit(**FAST)
-def solve_own(grid, i, r, weight, x, adds):
-    """x (+)= weight · D⁻¹ r at the places of a row, D the middles of the stencils."""
+def solve_own(grid, i, r, weight, x):
+    """x += weight · D⁻¹ r at the places of a row, D the middles of the stencils."""
     d = grid.inverse
     for e in range(grid.first[i], grid.first[i + 1]):
         lo, hi = grid.begin[e], grid.end[e]
         rx, ry, ox, oy = r[0, lo:hi], r[1, lo:hi], x[0, i, lo:hi], x[1, i, lo:hi]
-        if adds:
-            for j in range(hi - lo):
-                ox[j] += weight * (d[0] * rx[j] + d[1] * ry[j])
-                oy[j] += weight * (d[2] * rx[j] + d[3] * ry[j])
-        else:
-            for j in range(hi - lo):
-                ox[j] = weight * (d[0] * rx[j] + d[1] * ry[j])
-                oy[j] = weight * (d[2] * rx[j] + d[3] * ry[j])
+        for j in range(hi - lo):
+            ox[j] += weight * (d[0] * rx[j] + d[1] * ry[j])
+            oy[j] += weight * (d[2] * rx[j] + d[3] * ry[j])
     for e in range(grid.lone[i], grid.lone[i + 1]):
-        j, c = grid.place[e], grid.own_inverse[grid.which[e]]
-        u, v = (
-            weight * (c[0] * r[0, j] + c[1] * r[1, j]),
-            weight * (c[2] * r[0, j] + c[3] * r[1, j]),
-        )
-        x[0, i, j], x[1, i, j] = (x[0, i, j] + u, x[1, i, j] + v) if adds else (u, v)
+        j, k, c = grid.place[e], grid.which[e], grid.own_inverse
+        x[0, i, j] += weight * (c[k, 0] * r[0, j] + c[k, 1] * r[1, j])
+        x[1, i, j] += weight * (c[k, 2] * r[0, j] + c[k, 3] * r[1, j])
+
+
+@njit(**FAST)
+def clear(x, i):
+    """A row of zeros."""
+    for v in range(2):
+        for j in range(x.shape[2]):
+            x[v, i, j] = 0
 
 
 @njit(**FAST)
@@ -141,15 +143,18 @@ def relax(grid, b, x, row, weight, start, upwards):
         # Row i, and the row before it, for which both beside it are now done.
         if i < rows:
             if start:
-                row[0], row[1] = b[0, i], b[1, i]
+                clear(x, i)
+                for v in range(2):
+                    for j in range(row.shape[1]):
+                        row[v, j] = b[v, i, j]
             else:
                 residual(grid, i, b, x, row)
-            solve_own(grid, i, row, weight, x, not start)
+            solve_own(grid, i, row, weight, x)
         if i > 0:
             if start:
-                x[0, i - 1], x[1, i - 1] = 0, 0
+                clear(x, i - 1)
             residual(grid, i - 1, b, x, row)
-            solve_own(grid, i - 1, row, weight, x, True)
+            solve_own(grid, i - 1, row, weight, x)
 
 
 @njit(**FAST)
@@ -184,7 +189,9 @@ def restrict(grid, b, x, halved, code, out):
 @njit(**FAST)
 def whole_residual(grid, i, b, x, out):
     """The residual of a row, zero where nobody is free, and of a row that is not there."""
-    out[...] = 0
+    for v in range(2):
+        for j in range(out.shape[1]):
+            out[v, j] = 0
     if 0 <= i < grid.first.size - 1:
         residual(grid, i, b, x, out)
 
@@ -211,18 +218,18 @@ def prolong(grid, coarse, halved, x):
         if is_empty(grid, i):
             continue
         for v in range(2):
-            if not halved[0]:
-                line[:width] = coarse[v, i]
-            elif i % 2:
-                line[:width] = coarse[v, (i + 1) // 2]
-            else:
-                line[:width] = half * (coarse[v, i // 2] + coarse[v, i // 2 + 1])
+            low = (i + 1) // 2 if halved[0] else i
+            high = i // 2 + 1 if halved[0] else i
+            one, other = coarse[v, low], coarse[v, high]
+            for n in range(width):
+                line[n] = half * (one[n] + other[n])
             if halved[1]:
                 for n in range(width):
                     row[2 * n] = half * (line[n] + line[n + 1])
                     row[2 * n + 1] = line[n + 1]
             else:
-                row[:width] = line[:width]
+                for n in range(width):
+                    row[n] = line[n]
             for e in range(grid.first[i], grid.first[i + 1]):
                 lo, hi = grid.begin[e], grid.end[e]
                 to, of = x[v, i, lo:hi], row[lo:hi]
@@ -408,6 +415,37 @@ def asymmetry(code, own):
     return worst
 
 
+@njit(cache=KEPT)
+def balance(code, own, factor):
+    """Factors of rows, from place to place, with which as much of K as can be is symmetric; 1 for
+    the stencil of most. Returns how many places have none."""
+    left = 0
+    for i in range(code.shape[0]):
+        for j in range(code.shape[1]):
+            factor[i, j] = 1.0 if code[i, j] == 0 else 0.0
+            left += code[i, j] > 0
+    found = 1
+    while left and found:
+        found = 0
+        for i in range(1, code.shape[0] - 1):
+            for j in range(1, code.shape[1] - 1):
+                if code[i, j] <= 0 or factor[i, j] != 0.0:
+                    continue
+                both = square = 0.0
+                for s in range(9):
+                    a, b = i + s // 3 - 1, j + s % 3 - 1
+                    if s != 4 and code[a, b] >= 0 and factor[a, b] > 0.0:
+                        for e in range(4):
+                            mine = own[code[i, j], s, e]
+                            both += mine * factor[a, b] * own[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
+                            square += mine * mine
+                if square > 0.0 and both > 0.0:
+                    factor[i, j] = both / square
+                    found += 1
+        left -= found
+    return left
+
+
 def run():
     """Calls each of these once, so that all are compiled."""
     code = np.zeros((8, 8), np.int32)
@@ -423,9 +461,16 @@ def run():
     count = coarse_codes(code, coarse_kind, halved, coarse_code)
     galerkin(code, own, coarse_code, halved, np.zeros((count + 1, 9, 4)))
     asymmetry(code, own)
+    balance(code, own, np.zeros((8, 8)))
     r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
     rough, exact = (
-        Grid(*lists, (real(1.0),) * 36, own.astype(real), (real(1.0),) * 4, np.ones((2, 4), real))
+        Grid(
+            *lists,
+            ((real(1.0),) * 12,) * 3,
+            own.astype(real),
+            (real(1.0),) * 4,
+            np.ones((2, 4), real),
+        )
         for real in (np.float32, np.float64)
     )
     product(exact, r, r.copy())

@@ -11,13 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.conjugate_gradients import ConjugateGradients, Descent
+from pbdkit.equilibrium.lattice_krylov import (
+    BiconjugateGradients,
+    ConjugateGradients,
+    Descent,
+    Found,
+    Krylov,
+)
 from pbdkit.equilibrium.multigrid import FloatingError, Multigrid, kernels
 from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix, stencil_matrix
 from pbdkit.equilibrium.system import System
@@ -32,31 +39,33 @@ SAFETY = 2.0
 """By what λ is divided."""
 SAME = 1e-12
 """Relative difference up to which a matrix counts as symmetric."""
+DIGITS = 13
+"""Of factors of rows; rounding decides the others."""
+NEAR = 0.01
+"""The share of the first jump at which an iteration has found most of an error."""
 ENOUGH = 8
 """Iterations that tell how far a place gives way."""
 
 
 class LatticeSystem(System):
-    """The system by multigrid; for a matrix that is symmetric and holds all of the body.
-
-    Raises FloatingError where it does not.
-    """
-
-    methods = "multigrid, conjugate-gradients"
-    how = "energy"
+    """The system by multigrid. Raises FloatingError where leaders do not hold all of the body."""
 
     def __init__(self, matrix: StencilMatrix, shape: tuple[int, ...], watch: Watch) -> None:
         self._matrix, self._shape, self._watch = matrix, shape, watch
         self._grids = Multigrid(matrix)
-        self._solver = ConjugateGradients(self._grids)
+        self._symmetric = is_symmetric(matrix)
+        kind = ConjugateGradients if self._symmetric else BiconjugateGradients
+        self._solver: Krylov = kind(self._grids)
         self._smallest = 1.0
         self.iterations = 0
+        self.methods = f"multigrid, {self._solver.name}"
+        self.how = "energy" if self._symmetric else "iteration"
 
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
         """Until the jumps of the iteration say that no more than the tolerance is left. Nothing is
         owed: all is held."""
         self._watch.begin("solving")
-        found = self._descended(self._pull(moves), lambda d: d.ahead <= tolerance)
+        found = self._found(self._pull(moves), lambda d: d.ahead <= tolerance)
         return self._planes(found.x)
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
@@ -67,19 +76,29 @@ class LatticeSystem(System):
         return math.sqrt(kernel.dot(left, left) / kernel.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """The error that some iterations find, and the bound on what they leave; rounding counts as
+        """The error that some turns find, and the bound on what they leave; rounding counts as
         random."""
-        found = self._descended(self._pull(moves), lambda d: len(d.steps) >= LOOKS_AHEAD)
-        way = math.sqrt(float((found.x * found.x).sum(axis=0).max()))
-        return way + self._farthest(found.left) + rounding * self._spread
+        found, way = self._tracked(self._pull(moves))
+        return way + found + rounding * self._spread
+
+    def _tracked(self, r: Floats) -> tuple[float, float]:
+        """How far x with K x = r may still be from what some turns find, and how far that is."""
+        if self._symmetric:
+            found: Found = self._found(r, lambda d: len(d.jumps) >= LOOKS_AHEAD)
+            assert isinstance(found, Descent)
+            left = self._farthest(found.left)
+        else:
+            found = self._found(r, lambda d: d.ahead <= NEAR * d.jumps[0])
+            left = SAFETY * found.ahead if found.jumps else 0.0
+        return left, math.sqrt(float((found.x * found.x).sum(axis=0).max()))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """All is held."""
 
-    def _descended(self, r: Floats, done: Callable[[Descent], bool]) -> Descent:
-        found = self._solver.solve(r, done)
-        self.iterations += len(found.steps)
-        if len(found.steps) > 1:
+    def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
+        found: Found = self._solver.solve(r, done)
+        self.iterations += len(found.jumps)
+        if isinstance(found, Descent) and len(found.steps) > 1:
             self._smallest = min(self._smallest, found.smallest())
         return found
 
@@ -92,7 +111,9 @@ class LatticeSystem(System):
         """How far rounding of moves by up to 1 takes a place."""
         signs = np.random.default_rng(0).choice([-1.0, 1.0], self._shape)
         r = self._pull(signs)
-        return self._farthest(kernels().dot(r, self._grids.cycle(r.astype(np.float32))))
+        if self._symmetric:
+            return self._farthest(kernels().dot(r, self._grids.cycle(r.astype(np.float32))))
+        return SAFETY * sum(self._tracked(r))
 
     @cached_property
     def _compliance(self) -> float:
@@ -140,15 +161,41 @@ class LatticeSystem(System):
 def lattice_system(scene: Scene, state: State, step: int, watch: Watch) -> LatticeSystem | None:
     """The system of a scene; None where it has no such form, or leaders do not hold the body."""
     matrix = stencil_matrix(scene, state, step)
-    if matrix is None or not len(matrix.stencils):
-        return None
-    largest = float(np.abs(matrix.stencils).max())
-    if kernels().asymmetry(matrix.code, matrix.stencils) > SAME * largest or not is_held(matrix):
+    if matrix is None or not is_held(matrix):
         return None
     try:
-        return LatticeSystem(matrix, state.u.shape, watch)
+        return LatticeSystem(balanced(matrix), state.u.shape, watch)
     except FloatingError:
         return None
+
+
+def is_symmetric(matrix: StencilMatrix) -> bool:
+    """Up to rounding."""
+    largest = float(np.abs(matrix.stencils).max())
+    return bool(kernels().asymmetry(matrix.code, matrix.stencils) <= SAME * largest)
+
+
+def balanced(matrix: StencilMatrix) -> StencilMatrix:
+    """The matrix with its rows multiplied so that it is symmetric, where that can be: those of
+    particles with fewer neighbours, of which each has more weight."""
+    if is_symmetric(matrix):
+        return matrix
+    factor = np.empty(matrix.code.shape)
+    if kernels().balance(matrix.code, matrix.stencils, factor):
+        return matrix
+    lone = np.nonzero(matrix.code > 0)
+    pairs = np.stack([matrix.code[lone], factor[lone].round(DIGITS)], axis=1)
+    kinds, number = np.unique(pairs, axis=0, return_inverse=True)
+    row, times = kinds[:, 0].astype(int), kinds[:, 1, None]
+    code = matrix.code.copy()
+    code[lone] = 1 + number.ravel()
+    tables = (
+        np.concatenate([table[:1], table[row] * times.reshape(-1, *[1] * (table.ndim - 1))])
+        for table in (matrix.stencils, matrix.scale)
+    )
+    stencils, scale = tables
+    found = replace(matrix, code=code, stencils=stencils, scale=scale)
+    return found if is_symmetric(found) else matrix
 
 
 def is_held(matrix: StencilMatrix) -> bool:
@@ -162,7 +209,7 @@ def is_held(matrix: StencilMatrix) -> bool:
         there = matrix.kind[lone[0] + s // 3 - 1, lone[1] + s % 3 - 1] != OUTSIDE
         if (there & ~of_lone[:, s]).any():
             return False
-    pattern = bonds[0].reshape(3, 3)
+    pattern = (bonds[0] | bonds[0, ::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
     touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
     return bool(np.count_nonzero(touched) == count)

@@ -27,7 +27,8 @@ STIFFER = 3.0
 NARROW = 5
 """Places across, with the ring around, at which a grid is not made narrower."""
 SINGULAR = 1e-12
-"""Relative size of the smallest eigenvalue of the coarsest grid below which a body is not held."""
+"""One part of what the inverse of the coarsest grid may magnify; a body that is not held gives way
+without end."""
 
 
 @cache
@@ -60,10 +61,9 @@ class Grid:
     def given(self, precision: type[np.floating[Any]]) -> Any:
         """The grid as kernels take it."""
         middle = inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
-        same, own = (tuple(map(precision, v[0].ravel())) for v in (self.stencils, middle))
-        tables = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
-        stencils, inverse = tables
-        return kernels().Grid(*self._lists, same, stencils, own, inverse)
+        same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
+        own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
+        return kernels().Grid(*self._lists, same, own, tuple(map(precision, middle[0])), inverse)
 
     def field(self, precision: type[np.floating[Any]]) -> Floats:
         """Room for one number an axis and place."""
@@ -139,10 +139,12 @@ class Multigrid:
             self._levels[-1].halved = halved
             self._levels.append(_Level(grid, self.precision))
         self._at, K = grid.matrix()
-        values, modes = np.linalg.eigh(K)
-        if not values[0] > SINGULAR * values[-1]:
+        try:
+            inverse = np.linalg.inv(K)
+        except np.linalg.LinAlgError:
+            raise FloatingError from None
+        if not np.abs(inverse).max() * np.abs(K).max() * SINGULAR < 1.0:
             raise FloatingError
-        inverse = (modes / values) @ modes.T
         self._inverse, self._gives_way = inverse.astype(self.precision), inverse.diagonal()
 
     def __len__(self) -> int:

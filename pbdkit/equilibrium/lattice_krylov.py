@@ -1,0 +1,157 @@
+"""Iterations on a lattice's stencils, preconditioned by multigrid, and what their own numbers tell
+of the error.
+
+The cycle is made in single precision, all else in double; no iteration is lost by that.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.equilibrium.multigrid import Multigrid, kernels
+
+Floats = NDArray[np.floating[Any]]
+MOST = 400
+"""Turns of an iteration."""
+SLOWEST = 0.9
+"""The slowest fall of the jumps that is extrapolated."""
+
+
+class Found(ABC):
+    """An iteration's x with K x ≈ b; `jumps` are the largest ways made in each turn."""
+
+    x: Floats
+    jumps: list[float]
+
+    @property
+    def ahead(self) -> float:
+        """How far x still is from the solution, extrapolated from the last jumps."""
+        if len(self.jumps) < 3:
+            return math.inf
+        a, b, c = self.jumps[-3:]
+        fall = max(b / a, c / b) if a and b else 0.0
+        return c * fall / (1.0 - fall) if fall <= SLOWEST else math.inf
+
+
+@dataclass
+class Descent(Found):
+    """By conjugate gradients: `steps` and `turns` are their numbers α and β, `left` is rᵀ B r of
+    what is left, B the cycle."""
+
+    x: Floats
+    left: float = math.inf
+    jumps: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+    turns: list[float] = field(default_factory=list)
+
+    def smallest(self) -> float:
+        """The smallest eigenvalue of B K that the iteration has seen (Lanczos)."""
+        a, b = np.array(self.steps), np.array(self.turns)
+        diagonal = 1.0 / a
+        diagonal[1:] += b[1:] / a[:-1]
+        beside = np.sqrt(b[1:]) / a[:-1]
+        T = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        return float(np.linalg.eigvalsh(T)[0])
+
+
+class Krylov(ABC):
+    """Solves K x = b by the grids of K, or that of a coarser one."""
+
+    name: str
+
+    def __init__(self, grids: Multigrid, depth: int = 0) -> None:
+        self._grids, self._depth = grids, depth
+        self._grid = grids.grid(depth)
+        self.matrix = self._grid.given(np.float64)
+
+    @abstractmethod
+    def solve(self, b: Floats, done: Callable[[Any], bool], most: int = MOST) -> Found:
+        """Iterates until `done`, or as far as it gets. b is overwritten with what is left of it."""
+
+
+class ConjugateGradients(Krylov):
+    """For a symmetric positive K."""
+
+    name = "conjugate-gradients"
+
+    def solve(self, b: Floats, done: Callable[[Descent], bool], most: int = MOST) -> Descent:
+        """A cycle a turn."""
+        kernel, grid = kernels(), self._grid
+        found, r = Descent(grid.field(np.float64)), b
+        p, q, rounded = grid.field(np.float64), grid.field(np.float64), grid.field(np.float32)
+        size = math.sqrt(kernel.dot(r, r))
+        if not 0.0 < size < math.inf:
+            found.left = 0.0 if size == 0.0 else math.inf
+            return found
+        np.multiply(r, 1.0 / size, out=rounded, casting="same_kind")
+        while True:
+            z = self._grids.cycle(rounded, self._depth)
+            before, found.left = found.left, size * kernel.dot(r, z)
+            if len(found.steps) >= most or (found.steps and done(found)):
+                return found
+            turned = found.left / before if found.steps else 0.0
+            kernel.turn(size, z, turned, p)
+            bent = kernel.product(self.matrix, p, q)
+            if not bent > 0.0 or not math.isfinite(bent):
+                return found
+            step = found.left / bent
+            square, jump = kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded)
+            found.steps.append(step)
+            found.turns.append(turned)
+            found.jumps.append(jump)
+            if square == 0.0:
+                found.left = 0.0
+                return found
+
+
+@dataclass
+class Stabilised(Found):
+    """By the stabilised iteration of biconjugate gradients."""
+
+    x: Floats
+    jumps: list[float] = field(default_factory=list)
+
+
+class BiconjugateGradients(Krylov):
+    """For a K that is not symmetric (van der Vorst's BiCGStab)."""
+
+    name = "bicgstab"
+
+    def solve(self, b: Floats, done: Callable[[Found], bool], most: int = MOST) -> Stabilised:
+        """Two cycles a turn."""
+        kernel, r, found = kernels(), b, Stabilised(self._grid.field(np.float64))
+        shadow, p, q, t = r.copy(), r.copy(), np.empty_like(r), np.empty_like(r)
+        rho = kernel.dot(shadow, r)
+        while rho and math.isfinite(rho) and len(found.jumps) < most:
+            p_smooth = self._smoothed(p)
+            kernel.product(self.matrix, p_smooth, q)
+            step = rho / kernel.dot(shadow, q)
+            r -= step * q
+            r_smooth = self._smoothed(r)
+            kernel.product(self.matrix, r_smooth, t)
+            square = kernel.dot(t, t)
+            weight = kernel.dot(t, r) / square if square else 0.0
+            way = step * p_smooth + weight * r_smooth
+            found.x += way
+            r -= weight * t
+            found.jumps.append(float(np.abs(way).max()))
+            if done(found) or not weight:
+                break
+            before, rho = rho, kernel.dot(shadow, r)
+            p -= weight * q
+            p *= rho / before * step / weight
+            p += r
+        return found
+
+    def _smoothed(self, r: Floats) -> Floats:
+        """B r; r is scaled, for it may be tiny in single precision."""
+        size = math.sqrt(kernels().dot(r, r)) or 1.0
+        rounded = np.multiply(r, 1.0 / size).astype(np.float32)
+        return size * self._grids.cycle(rounded, self._depth).astype(np.float64)
