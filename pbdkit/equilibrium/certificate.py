@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import RenewsParticles
@@ -180,6 +180,10 @@ class Foresight:
         The distance is infinite where no bound is known: for what is pushed on for ever, and for
         parts that nothing holds under rules that are not linear.
         """
+        with one_thread():
+            return self._from(state)
+
+    def _from(self, state: State) -> Outlook:
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         here = replace(state, u=u, previous=previous)
         broken = broken_bonds(state)

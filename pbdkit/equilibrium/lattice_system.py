@@ -27,7 +27,7 @@ from pbdkit.equilibrium.lattice_krylov import (
 )
 from pbdkit.equilibrium.multigrid import FloatingError, Multigrid, kernels
 from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix, stencil_matrix
-from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system import StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -57,15 +57,30 @@ class LatticeSystem(System):
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids)
         self._smallest = 1.0
-        self.iterations = 0
-        self.methods = f"multigrid, {self._solver.name}"
-        self.how = "energy" if self._symmetric else "iteration"
+        self._iterations = 0
+
+    @property
+    def methods(self) -> str:
+        """Multigrid and an iteration around it."""
+        return f"multigrid, {self._solver.name}"
+
+    @property
+    def how(self) -> str:
+        """By energy where there is one."""
+        return "energy" if self._symmetric else "iteration"
+
+    @property
+    def iterations(self) -> int:
+        """Of all solutions and bounds together."""
+        return self._iterations
 
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
         """Until the jumps of the iteration say that no more than the tolerance is left. Nothing is
         owed: all is held."""
         self._watch.begin("solving")
         found = self._found(self._pull(moves), lambda d: d.ahead <= tolerance)
+        if found.jumps and not found.ahead <= tolerance:
+            raise StuckError
         return self._planes(found.x)
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
@@ -90,6 +105,8 @@ class LatticeSystem(System):
         else:
             found = self._found(r, lambda d: d.ahead <= NEAR * d.jumps[0])
             left = SAFETY * found.ahead if found.jumps else 0.0
+            if not math.isfinite(left):
+                raise StuckError
         return left, math.sqrt(float((found.x * found.x).sum(axis=0).max()))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
@@ -97,7 +114,7 @@ class LatticeSystem(System):
 
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
         found: Found = self._solver.solve(r, done)
-        self.iterations += len(found.jumps)
+        self._iterations += len(found.jumps)
         if isinstance(found, Descent) and len(found.steps) > 1:
             self._smallest = min(self._smallest, found.smallest())
         return found
@@ -161,12 +178,18 @@ class LatticeSystem(System):
 def lattice_system(scene: Scene, state: State, step: int, watch: Watch) -> LatticeSystem | None:
     """The system of a scene; None where it has no such form, or leaders do not hold the body."""
     matrix = stencil_matrix(scene, state, step)
-    if matrix is None or not is_held(matrix):
+    if matrix is None or leads_one_way(matrix) or not is_held(matrix):
         return None
     try:
         return LatticeSystem(balanced(matrix), state.u.shape, watch)
     except FloatingError:
         return None
+
+
+def leads_one_way(matrix: StencilMatrix) -> bool:
+    """Whether one axis moves the other and not the reverse: they are better solved in turn."""
+    couples = np.abs(matrix.stencils[..., 1:3]).max(axis=(0, 1)) > 0.0
+    return bool(couples[0] != couples[1])
 
 
 def is_symmetric(matrix: StencilMatrix) -> bool:

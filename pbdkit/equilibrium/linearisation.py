@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.util import find_spec
+from typing import TypeVar
 
 from pbdkit.equilibrium.matrix_system import MatrixSystem
-from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system import Floats, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-LARGEST_DIRECT = 5_000
-"""Particles up to which `auto` takes a direct solver."""
+LARGEST_DIRECT = 20_000
+"""Particles up to which `auto` takes a direct solver (measured: compiling what works on stencils,
+once a machine, takes longer)."""
+
+T = TypeVar("T")
 
 
 def linearised(scene: Scene, state: State, step: int, method: str, watch: Watch) -> System:
@@ -19,10 +24,65 @@ def linearised(scene: Scene, state: State, step: int, method: str, watch: Watch)
 
     Raises ExperimentError where there is no unique solution.
     """
+
+    def by_matrix() -> System:
+        return MatrixSystem(scene, state, method, watch, step)
+
     large = scene.raster.count > LARGEST_DIRECT
     if (method == "multigrid" or (method == "auto" and large)) and find_spec("numba"):
         from pbdkit.equilibrium.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch):
-            return system
-    return MatrixSystem(scene, state, method, watch, step)
+            return _Replaceable(system, by_matrix)
+    return by_matrix()
+
+
+class _Replaceable(System):
+    """A system until it gets stuck, then another."""
+
+    def __init__(self, system: System, otherwise: Callable[[], System]) -> None:
+        self._system, self._otherwise, self._past = system, otherwise, 0
+
+    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.solve(moves, tolerance, owed))
+
+    def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
+        """By the present one."""
+        return self._system.mismatch(c, before, after)
+
+    def distance(self, moves: Floats, rounding: float) -> float:
+        """By the first that can."""
+        return self._first_able(lambda system: system.distance(moves, rounding))
+
+    def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
+        """By the present one."""
+        self._system.refuse_moving_floats(moves, rounding)
+
+    def _first_able(self, does: Callable[[System], T]) -> T:
+        try:
+            return does(self._system)
+        except StuckError:
+            self._past += self._system.iterations
+            self._system = self._otherwise()
+            return does(self._system)
+
+    @property
+    def methods(self) -> str:
+        """Of the present one."""
+        return self._system.methods
+
+    @property
+    def how(self) -> str:
+        """Of the present one."""
+        return self._system.how
+
+    @property
+    def amplification(self) -> float:
+        """Of the present one."""
+        return self._system.amplification
+
+    @property
+    def iterations(self) -> int:
+        """Of both."""
+        return self._past + self._system.iterations

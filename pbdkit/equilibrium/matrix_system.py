@@ -44,7 +44,7 @@ class MatrixSystem(System):
     def __init__(
         self, scene: Scene, state: State, method: str, watch: Watch, step: int | None = None
     ) -> None:
-        self._shape = state.u.shape
+        self._shape, self._amplification = state.u.shape, 1.0
         self._operator = operator = step_operator(scene, state, step)
         self._method, self._watch = method, watch
         self._X = scene.raster.reference(operator.followers)
@@ -62,19 +62,24 @@ class MatrixSystem(System):
             self._stages.append(self._following(first))
 
     @property
-    def methods(self) -> str:  # type: ignore[override]
+    def amplification(self) -> float:
+        """By the largest entry of the diagonal."""
+        return self._amplification
+
+    @property
+    def methods(self) -> str:
         """The names of the methods used."""
         names = {part.name for stage in self._stages for _, part in stage.parts}
         return ", ".join(sorted(names)) or "nothing to solve"
 
     @property
-    def how(self) -> str:  # type: ignore[override]
+    def how(self) -> str:
         """By the solution; its rounding by the inverse itself where that is at hand."""
         ways = {part.how for stage in self._stages for _, part in stage.parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
     @property
-    def iterations(self) -> int:  # type: ignore[override]
+    def iterations(self) -> int:
         """Of all linear solvers together."""
         parts = {id(part): part for stage in self._stages for _, part in stage.parts}
         return sum(part.iterations for part in parts.values())
@@ -178,7 +183,7 @@ class MatrixSystem(System):
     def _stage(self, axes: list[int]) -> _Stage:
         matrix = one_minus(self._both.entries(axes).matrix())
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
-        self.amplification = max(self.amplification, largest)
+        self._amplification = max(self._amplification, largest)
         led = self._operator.couplings_led.entries(axes)
         count, label = connected(matrix, strongly=False)
         held = np.zeros(count, bool)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
@@ -54,7 +54,8 @@ class Finder:
         the moves would grow). Raises ExperimentError where a part of the body has no equilibrium,
         UnconvergedError, and StoppedError.
         """
-        return _Search(self, state, step).run()
+        with one_thread():
+            return _Search(self, state, step).run()
 
 
 class _Search:

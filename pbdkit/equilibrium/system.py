@@ -6,27 +6,57 @@ Moves and displacements are planes, (axis, sublattice, cell, cell), as in a stat
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
 
 
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Libraries of linear algebra work on one thread meanwhile: on how many they work decides the
+    order of their sums, and the last digits."""
+    found: AbstractContextManager[object] = _libraries().limit(limits=1, user_api="blas")
+    return found
+
+
+class StuckError(Exception):
+    """An iteration got nowhere."""
+
+
 class System(ABC):
     """A c = move for the followers of a scene, linearised at a state with the roles of a step."""
 
-    methods: str
-    """The names of the methods used."""
-    how: str
-    """How the distance from the solution is obtained."""
-    iterations = 0
-    """Of all linear solvers together."""
-    amplification = 1.0
-    """How much larger moves are, in rounding too, than the displacements that make them."""
+    @property
+    @abstractmethod
+    def methods(self) -> str:
+        """The names of the methods used."""
+
+    @property
+    @abstractmethod
+    def how(self) -> str:
+        """How the distance from the solution is obtained."""
+
+    @property
+    @abstractmethod
+    def iterations(self) -> int:
+        """Of all linear solvers together."""
+
+    @property
+    def amplification(self) -> float:
+        """How much larger moves are, in rounding too, than the displacements that make them."""
+        return 1.0
 
     @abstractmethod
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:

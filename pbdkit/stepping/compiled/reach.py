@@ -51,7 +51,7 @@ class Reach:
 
     def begin(self, state: State) -> None:
         """A state that did not come from here: what has moved is known only where nothing has."""
-        self._known = self._rests and state.step == 0
+        self._known = self._rests and state.step == 0 and not state.u.any()
         self._keep_to(np.zeros_like(self._bond) if self._known else self._everything)
 
     def before(self, led: Led, count: int) -> int:
