@@ -47,8 +47,6 @@ def certificate(ds):
 @pytest.mark.parametrize("method", ["lu", "multigrid", "conjugate-gradients"])
 @pytest.mark.parametrize("size", [10, 60])
 def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size):
-    if method == "multigrid":
-        pytest.importorskip("pyamg")
     ds = run(sheet(size, size, solver=STRAIGHT | {"method": method, "tolerance": 1e-10}))
     exact = ds.reference.isel(axis=0) / (size - 1)
     body = ds.kind.isel(time=-1) < 2

@@ -9,18 +9,14 @@ from typing import Any
 import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
+from pbdkit.equilibrium.moves import Moves, rounding
 from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.solvers import Stepping
-from pbdkit.interfaces import RenewsParticles
 from pbdkit.results.progress import Watch
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.choice import Choice, make_engine, obstacle
-from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guard import way_of
-from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
 
 WAYS = {
@@ -81,54 +77,6 @@ def spacing_of(scene: Scene) -> float:
 def broken_bonds(state: State) -> int:
     """How many bonds are broken."""
     return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step >= 0))
-
-
-LARGEST_BY_NUMPY = 100_000
-"""Particles beyond which moves are evaluated by the compiled engine."""
-ROUNDING = 4 * float(np.finfo(float).eps)
-
-
-class Moves:
-    """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
-    frame standing where the body tells it to."""
-
-    def __init__(self, scene: Scene) -> None:
-        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
-        self._scene = scene
-        self._engine: Engine | None = None
-        renews = isinstance(scene.experiment.rule, RenewsParticles)
-        if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
-            experiment = scene.experiment.model_copy(update={"solver": stepping})
-            stepped = replace(scene, experiment=experiment)
-            choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
-            self._engine, _ = make_engine(stepped, choice)
-        self._followers = None if self._engine else SlotFollowers(scene, stepping)
-
-    def at(self, state: State, step: int) -> Floats:
-        """Planes, zero where nobody follows in that step; brings the state's frame into line."""
-        u, frame = state.u, self._scene.frame
-        flat = u.reshape(len(u), -1)
-        if frame:
-            frame.follow(flat, flat)
-        if self._engine:
-            here = replace(state, step=step - 1, previous=np.zeros_like(u))
-            moves = self._engine.advance(here).u
-        else:
-            assert self._followers
-            moves = u.astype(float)
-            with np.errstate(all="ignore"):
-                self._followers.move(u, moves, state)
-        with np.errstate(all="ignore"):
-            moves -= u
-        still = [led.place for led in self._scene.leading if led.group.leads(step)]
-        for place in [*still, *([frame.place] if frame else [])]:
-            moves.reshape(len(u), -1)[:, place] = 0.0
-        return moves
-
-
-def rounding(u: Floats) -> float:
-    """How far rounding alone may put a move off at displacements u."""
-    return ROUNDING * float(np.abs(u).max())
 
 
 LINEAR = 1e-9

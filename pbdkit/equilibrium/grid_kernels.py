@@ -67,12 +67,6 @@ def of_lone(grid, e, x, i):
 
 
 @njit(**FAST)
-def is_empty(grid, i):
-    """Whether nobody is free in a row."""
-    return grid.first[i] == grid.first[i + 1] and grid.lone[i] == grid.lone[i + 1]
-
-
-@njit(**FAST)
 def product(grid, x, out):
     """out = K x; returns x · K x."""
     whole = 0.0
@@ -210,78 +204,6 @@ def add_rows(sums, row, share, anew):
 
 
 @njit(**FAST)
-def prolong(grid, coarse, halved, x):
-    """x += P coarse at free places."""
-    half, width = x.dtype.type(0.5), coarse.shape[2]
-    line, row = np.zeros(width + 1, x.dtype), np.zeros(2 * width + 2, x.dtype)
-    for i in range(grid.first.size - 1):
-        if is_empty(grid, i):
-            continue
-        for v in range(2):
-            low = (i + 1) // 2 if halved[0] else i
-            high = i // 2 + 1 if halved[0] else i
-            one, other = coarse[v, low], coarse[v, high]
-            for n in range(width):
-                line[n] = half * (one[n] + other[n])
-            if halved[1]:
-                for n in range(width):
-                    row[2 * n] = half * (line[n] + line[n + 1])
-                    row[2 * n + 1] = line[n + 1]
-            else:
-                for n in range(width):
-                    row[n] = line[n]
-            for e in range(grid.first[i], grid.first[i + 1]):
-                lo, hi = grid.begin[e], grid.end[e]
-                to, of = x[v, i, lo:hi], row[lo:hi]
-                for j in range(hi - lo):
-                    to[j] += of[j]
-            for e in range(grid.lone[i], grid.lone[i + 1]):
-                x[v, i, grid.place[e]] += row[grid.place[e]]
-
-
-@njit(**FAST)
-def descend(a, p, q, x, r, share, out):
-    """x += a p, r -= a q; out = share · r in its precision; returns r · r and the largest |a p|."""
-    whole, most = 0.0, 0.0
-    for v in range(2):
-        for i in range(x.shape[1]):
-            xs, rs, ps, qs, os = x[v, i], r[v, i], p[v, i], q[v, i], out[v, i]
-            part = 0.0
-            for j in range(xs.size):
-                xs[j] += a * ps[j]
-                rs[j] -= a * qs[j]
-                os[j] = share * rs[j]
-                part += rs[j] * rs[j]
-                most = max(most, abs(ps[j]))
-            whole += part
-    return whole, abs(a) * most
-
-
-@njit(**FAST)
-def turn(share, z, beta, p):
-    """p = share · z + beta p."""
-    for v in range(2):
-        for i in range(p.shape[1]):
-            zs, ps = z[v, i], p[v, i]
-            for j in range(ps.size):
-                ps[j] = share * zs[j] + beta * ps[j]
-
-
-@njit(**FAST)
-def dot(a, b):
-    """a · b."""
-    whole = 0.0
-    for v in range(2):
-        for i in range(a.shape[1]):
-            one, other = a[v, i], b[v, i]
-            part = 0.0
-            for j in range(one.size):
-                part += one[j] * other[j]
-            whole += part
-    return whole
-
-
-@njit(**FAST)
 def scaled(grid, same, own, moves, out):
     """out = S moves at free places, S by stencil as 4 numbers."""
     for i in range(grid.first.size - 1):
@@ -296,189 +218,18 @@ def scaled(grid, same, own, moves, out):
             out[0, i, j], out[1, i, j] = c[0] * u + c[1] * v, c[2] * u + c[3] * v
 
 
-@njit(cache=KEPT)
-def runs(code, first, begin, end, lone, place, which):
-    """Fills the lists of a grid; returns how many runs and lone places there are. Lists without
-    room are not filled."""
-    r = s = 0
-    for i in range(code.shape[0]):
-        first[i], lone[i] = r, s
-        j = 0
-        while j < code.shape[1]:
-            start = j
-            while j < code.shape[1] and code[i, j] == 0:
-                j += 1
-            if j > start:
-                if r < begin.size:
-                    begin[r], end[r] = start, j
-                r += 1
-                continue
-            if code[i, j] > 0:
-                if s < place.size:
-                    place[s], which[s] = j, code[i, j]
-                s += 1
-            j += 1
-    first[code.shape[0]], lone[code.shape[0]] = r, s
-    return r, s
-
-
-@njit(cache=KEPT)
-def coarse_kinds(kind, halved, out):
-    """0 outside, 1 free, 2 led, of the next grid: a place outside on which free ones hang is free,
-    unless led ones are nearer."""
-    a1, b1 = halved
-    for n in range(1, out.shape[0] - 1):
-        for m in range(1, out.shape[1] - 1):
-            i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
-            here = kind[i, j] if i < kind.shape[0] and j < kind.shape[1] else 0
-            for ring in (1, 2):
-                if here:
-                    break
-                for a in range(max(-a1, -i), min(a1, kind.shape[0] - 1 - i) + 1):
-                    for b in range(max(-b1, -j), min(b1, kind.shape[1] - 1 - j) + 1):
-                        near = kind[i + a, j + b]
-                        if abs(a) + abs(b) == ring and near and here != 1:
-                            here = near
-            out[n, m] = here
-
-
-@njit(cache=KEPT)
-def coarse_codes(code, kind, halved, out):
-    """Of the next grid: -1 where nobody is free, 0 where all stencils around are the one of most,
-    so that this one's is too; others are numbered from 1. Returns the last number."""
-    count = 0
-    a1, b1 = halved
-    for n in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            out[n, m] = -1
-            if kind[n, m] != 1:
-                continue
-            i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
-            plain = i > a1 and j > b1 and i + a1 + 1 < code.shape[0] and j + b1 + 1 < code.shape[1]
-            if plain:
-                for a in range(-a1 - 1, a1 + 2):
-                    for b in range(-b1 - 1, b1 + 2):
-                        c = code[i + a, j + b]
-                        if c < 0 or (c > 0 and abs(a) <= a1 and abs(b) <= b1):
-                            plain = False
-            count += 0 if plain else 1
-            out[n, m] = 0 if plain else count
-    return count
-
-
-@njit(cache=KEPT)
-def galerkin(code, own, coarse, halved, out):
-    """out[k] = the stencil of Pᵀ K P at the place of the next grid that is numbered k."""
-    a1, b1 = halved
-    for n in range(1, coarse.shape[0] - 1):
-        for m in range(1, coarse.shape[1] - 1):
-            k = coarse[n, m]
-            if k <= 0:
-                continue
-            for a in range(-a1, a1 + 1):
-                for b in range(-b1, b1 + 1):
-                    i, j = (2 * n - 1 if a1 else n) + a, (2 * m - 1 if b1 else m) + b
-                    if i >= code.shape[0] or j >= code.shape[1] or code[i, j] < 0:
-                        continue
-                    hangs = (1.0 - 0.5 * abs(a)) * (1.0 - 0.5 * abs(b))
-                    for s in range(9):
-                        da, db = s // 3 - 1, s % 3 - 1
-                        if code[i + da, j + db] < 0:
-                            continue
-                        for t in range(9):
-                            # How far the place at s lies from place t of the next grid.
-                            fa = abs(a + da - (a1 + 1) * (t // 3 - 1)) / (a1 + 1)
-                            fb = abs(b + db - (b1 + 1) * (t % 3 - 1)) / (b1 + 1)
-                            if fa < 1.0 and fb < 1.0:
-                                w = hangs * (1.0 - fa) * (1.0 - fb)
-                                for e in range(4):
-                                    out[k, t, e] += w * own[code[i, j], s, e]
-
-
-@njit(cache=KEPT)
-def asymmetry(code, own):
-    """The largest entry of K - Kᵀ."""
-    worst = 0.0
-    for s in range(9):
-        for e in range(4):
-            worst = max(worst, abs(own[0, s, e] - own[0, 8 - s, (0, 2, 1, 3)[e]]))
-    for i in range(1, code.shape[0] - 1):
-        for j in range(1, code.shape[1] - 1):
-            if code[i, j] <= 0:
-                continue
-            for s in range(9):
-                there = code[i + s // 3 - 1, j + s % 3 - 1]
-                if there >= 0:
-                    one, other = own[code[i, j], s], own[there, 8 - s]
-                    for e in range(4):
-                        worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))
-    return worst
-
-
-@njit(cache=KEPT)
-def balance(code, own, factor):
-    """Factors of rows, from place to place, with which as much of K as can be is symmetric; 1 for
-    the stencil of most. Returns how many places have none."""
-    left = 0
-    for i in range(code.shape[0]):
-        for j in range(code.shape[1]):
-            factor[i, j] = 1.0 if code[i, j] == 0 else 0.0
-            left += code[i, j] > 0
-    found = 1
-    while left and found:
-        found = 0
-        for i in range(1, code.shape[0] - 1):
-            for j in range(1, code.shape[1] - 1):
-                if code[i, j] <= 0 or factor[i, j] != 0.0:
-                    continue
-                both = square = 0.0
-                for s in range(9):
-                    a, b = i + s // 3 - 1, j + s % 3 - 1
-                    if s != 4 and code[a, b] >= 0 and factor[a, b] > 0.0:
-                        for e in range(4):
-                            mine = own[code[i, j], s, e]
-                            both += mine * factor[a, b] * own[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
-                            square += mine * mine
-                if square > 0.0 and both > 0.0:
-                    factor[i, j] = both / square
-                    found += 1
-        left -= found
-    return left
-
-
 def run():
     """Calls each of these once, so that all are compiled."""
-    code = np.zeros((8, 8), np.int32)
-    code[0] = code[-1] = code[:, 0] = code[:, -1] = -1
-    code[2, 2] = 1
-    kind = (code >= 0).astype(np.int8)
-    own, halved = np.ones((2, 9, 4)), (1, 1)
     lists = np.zeros(9, np.int64), np.zeros(7, np.int32), np.zeros(7, np.int32)
     lists += np.zeros(9, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
-    runs(code, *lists)
-    coarse_kind, coarse_code = np.zeros((6, 6), np.int8), np.zeros((6, 6), np.int32)
-    coarse_kinds(kind, halved, coarse_kind)
-    count = coarse_codes(code, coarse_kind, halved, coarse_code)
-    galerkin(code, own, coarse_code, halved, np.zeros((count + 1, 9, 4)))
-    asymmetry(code, own)
-    balance(code, own, np.zeros((8, 8)))
-    r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
-    rough, exact = (
-        Grid(
-            *lists,
-            ((real(1.0),) * 12,) * 3,
-            own.astype(real),
-            (real(1.0),) * 4,
-            np.ones((2, 4), real),
-        )
-        for real in (np.float32, np.float64)
-    )
+    grids, own = [], np.ones((2, 9, 4))
+    for real in (np.float32, np.float64):
+        same, middle = ((real(1.0),) * 12,) * 3, (real(1.0),) * 4
+        grids.append(Grid(*lists, same, own.astype(real), middle, np.ones((2, 4), real)))
+    rough, exact = grids
+    r, z, half = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32), np.float32(0.5)
     product(exact, r, r.copy())
-    relax(rough, z, z.copy(), np.zeros((2, 8), np.float32), np.float32(0.5), True, False)
-    restrict(rough, z, z, halved, coarse_code, out := np.zeros((2, 6, 6), np.float32))
-    prolong(rough, out, halved, z.copy())
+    relax(rough, z, z.copy(), np.zeros((2, 8), np.float32), half, True, False)
+    coarse, code = np.zeros((2, 6, 6), np.float32), np.zeros((6, 6), np.int32)
+    restrict(rough, z, z, (1, 1), code, coarse)
     scaled(exact, (1.0,) * 4, np.ones((2, 4)), r, r)
-    descend(0.0, r, r, r.copy(), r.copy(), 1.0, z)
-    turn(1.0, z, 0.0, r)
-    dot(r, z)
-    dot(r, r)

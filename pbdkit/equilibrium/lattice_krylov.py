@@ -32,7 +32,7 @@ class Found(ABC):
 
     @property
     def ahead(self) -> float:
-        """How far x still is from the solution, extrapolated from the last jumps."""
+        """About how far x still is from the solution, extrapolated from the last jumps."""
         if len(self.jumps) < 3:
             return math.inf
         a, b, c = self.jumps[-3:]
@@ -113,10 +113,15 @@ class ConjugateGradients(Krylov):
 
 @dataclass
 class Stabilised(Found):
-    """By the stabilised iteration of biconjugate gradients."""
+    """By the stabilised iteration of biconjugate gradients. Its jumps waver."""
 
     x: Floats
     jumps: list[float] = field(default_factory=list)
+
+    @property
+    def ahead(self) -> float:
+        """The larger of the last two jumps."""
+        return max(self.jumps[-2:]) if len(self.jumps) > 1 else math.inf
 
 
 class BiconjugateGradients(Krylov):
@@ -127,7 +132,7 @@ class BiconjugateGradients(Krylov):
     def solve(self, b: Floats, done: Callable[[Found], bool], most: int = MOST) -> Stabilised:
         """Two cycles a turn."""
         kernel, r, found = kernels(), b, Stabilised(self._grid.field(np.float64))
-        shadow, p, q, t = r.copy(), r.copy(), np.empty_like(r), np.empty_like(r)
+        shadow, p, q, t = r.copy(), r.copy(), np.zeros_like(r), np.zeros_like(r)
         rho = kernel.dot(shadow, r)
         while rho and math.isfinite(rho) and len(found.jumps) < most:
             p_smooth = self._smoothed(p)

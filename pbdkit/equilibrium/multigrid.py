@@ -33,9 +33,12 @@ without end."""
 
 @cache
 def kernels() -> SimpleNamespace:
-    """The compiled functions of one grid."""
-    source = files("pbdkit.equilibrium").joinpath("grid_kernels.py").read_text(encoding="utf-8")
-    return SimpleNamespace(**load_kernel(source, {}, ()).__globals__)
+    """The compiled functions: how grids are made, what is done on one, and with whole fields."""
+    found: dict[str, Any] = {}
+    for name in ("coarsening", "grid", "field"):
+        file = files("pbdkit.equilibrium").joinpath(f"{name}_kernels.py")
+        found |= load_kernel(file.read_text(encoding="utf-8"), {}, ()).__globals__
+    return SimpleNamespace(**found)
 
 
 class FloatingError(Exception):
@@ -55,7 +58,7 @@ class Grid:
         begin, end = (np.empty(run_count, np.int32) for _ in range(2))
         place, which = (np.empty(lone_count, np.int32) for _ in range(2))
         kernels().runs(code, first, begin, end, lone, place, which)
-        self._lists = first, begin, end, lone, place, which
+        self.lists = first, begin, end, lone, place, which
         self.unknowns = 2 * (int((end - begin).sum()) + lone_count)
 
     def given(self, precision: type[np.floating[Any]]) -> Any:
@@ -63,7 +66,7 @@ class Grid:
         middle = inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
         same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
         own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
-        return kernels().Grid(*self._lists, same, own, tuple(map(precision, middle[0])), inverse)
+        return kernels().Grid(*self.lists, same, own, tuple(map(precision, middle[0])), inverse)
 
     def field(self, precision: type[np.floating[Any]]) -> Floats:
         """Room for one number an axis and place."""
@@ -182,7 +185,8 @@ class Multigrid:
         weight, below = self.precision(WEIGHT), self._levels[depth + 1]
         kernel.relax(level.given, b, level.x, level.row, weight, True, False)
         kernel.restrict(level.given, b, level.x, level.halved, below.grid.code, below.b)
-        kernel.prolong(level.given, self._cycled(depth + 1, below.b), level.halved, level.x)
+        coarse = self._cycled(depth + 1, below.b)
+        kernel.prolong(*level.grid.lists[:5], coarse, level.halved, level.x)
         kernel.relax(level.given, b, level.x, level.row, weight, False, True)
         return level.x
 

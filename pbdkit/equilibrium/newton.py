@@ -8,8 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, Moves, rounding
+from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate
 from pbdkit.equilibrium.linearisation import linearised
+from pbdkit.equilibrium.moves import Moves, rounding
 from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene

@@ -67,8 +67,8 @@ class Equilibrium(Solver):
 
     `tolerance` is the largest distance from equilibrium, as a share of the largest prescribed
     displacement. Where bonds can break, the leaders' way is made in so many `increments`, each
-    settled before the next. `method` solves the linear systems: lu, multigrid (algebraic, with
-    Krylov's iteration around it), conjugate-gradients alone, or what serves their size.
+    settled before the next. `method` solves the linear systems: lu, multigrid (with an iteration
+    around it), conjugate-gradients alone, or what serves their size.
     """
 
     makes_steps: ClassVar[bool] = False

@@ -1,0 +1,92 @@
+"""What iterations do with whole fields, (axis, row, place), compiled. Sums are made row by row."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+KEPT = globals().get("KEPT", False)
+FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
+
+
+@njit(**FAST)
+def descend(a, p, q, x, r, share, out):
+    """x += a p, r -= a q; out = share · r in its precision; returns r · r and the largest |a p|."""
+    whole, most = 0.0, 0.0
+    for v in range(2):
+        for i in range(x.shape[1]):
+            xs, rs, ps, qs, os = x[v, i], r[v, i], p[v, i], q[v, i], out[v, i]
+            part = 0.0
+            for j in range(xs.size):
+                xs[j] += a * ps[j]
+                rs[j] -= a * qs[j]
+                os[j] = share * rs[j]
+                part += rs[j] * rs[j]
+                most = max(most, abs(ps[j]))
+            whole += part
+    return whole, abs(a) * most
+
+
+@njit(**FAST)
+def turn(share, z, beta, p):
+    """p = share · z + beta p."""
+    for v in range(2):
+        for i in range(p.shape[1]):
+            zs, ps = z[v, i], p[v, i]
+            for j in range(ps.size):
+                ps[j] = share * zs[j] + beta * ps[j]
+
+
+@njit(**FAST)
+def dot(a, b):
+    """a · b."""
+    whole = 0.0
+    for v in range(2):
+        for i in range(a.shape[1]):
+            one, other = a[v, i], b[v, i]
+            part = 0.0
+            for j in range(one.size):
+                part += one[j] * other[j]
+            whole += part
+    return whole
+
+
+@njit(**FAST)
+def prolong(first, begin, end, lone, place, coarse, halved, x):
+    """x += P coarse at the free places of a grid: its runs and lone places by row."""
+    half, width = x.dtype.type(0.5), coarse.shape[2]
+    line, row = np.zeros(width + 1, x.dtype), np.zeros(2 * width + 2, x.dtype)
+    for i in range(first.size - 1):
+        if first[i] == first[i + 1] and lone[i] == lone[i + 1]:
+            continue
+        for v in range(2):
+            low = (i + 1) // 2 if halved[0] else i
+            high = i // 2 + 1 if halved[0] else i
+            one, other = coarse[v, low], coarse[v, high]
+            for n in range(width):
+                line[n] = half * (one[n] + other[n])
+            if halved[1]:
+                for n in range(width):
+                    row[2 * n] = half * (line[n] + line[n + 1])
+                    row[2 * n + 1] = line[n + 1]
+            else:
+                for n in range(width):
+                    row[n] = line[n]
+            for e in range(first[i], first[i + 1]):
+                lo, hi = begin[e], end[e]
+                to, of = x[v, i, lo:hi], row[lo:hi]
+                for j in range(hi - lo):
+                    to[j] += of[j]
+            for e in range(lone[i], lone[i + 1]):
+                x[v, i, place[e]] += row[place[e]]
+
+
+def run():
+    """Calls each of these once, so that all are compiled."""
+    r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
+    descend(0.0, r, r, r.copy(), r.copy(), 1.0, z)
+    turn(1.0, z, 0.0, r)
+    dot(r, z)
+    dot(r, r)
+    rows, some = np.zeros(9, np.int64), np.zeros(1, np.int32)
+    prolong(rows, some, some, rows, some, np.zeros((2, 6, 6), np.float32), (1, 1), z)

@@ -1,0 +1,179 @@
+"""Equilibria on grids: any linear rule, how few iterations it takes, and what is certified."""
+
+import json
+from typing import ClassVar, Literal
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium import linear_solver, linearisation
+from pbdkit.equilibrium.increments import settle
+from pbdkit.interfaces import FollowerRule, Vector
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+
+pytest.importorskip("numba")
+CHEBYSHEV = {"type": "chebyshev", "shells": 1}
+HEXAGONAL = {
+    "lattice": {"type": "hexagonal", "a": 1.0},
+    "neighbours": {"type": "coordination", "shells": 1},
+}
+PULL = [
+    {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+    {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [1.0, 0.4]}},
+]
+
+
+class Skew(FollowerRule):
+    """Leans to the right-hand neighbours, and lets x move y: a linear rule of its own."""
+
+    type: Literal["skew"] = "skew"
+    lean: float = 0.2
+
+    linear: ClassVar[bool] = True
+
+    @staticmethod
+    def gather(d, r, w, p):
+        """Weights by the direction of the bond."""
+        weight = 1.0 + p.lean * r.x
+        return weight * d, weight
+
+    @staticmethod
+    def apply(total, here, p):
+        """The weighted mean, and a share of x in y."""
+        move = total[0] / total[1]
+        return Vector(move.x + 0.1 * move.y, move.y - 0.1 * move.x)
+
+
+def elastic(poisson_ratio=0.3, **more):
+    return {"type": "elastic", "poisson_ratio": poisson_ratio} | more
+
+
+def sheet(n=40, rows=None, **parts):
+    return {
+        "version": 1,
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": n, "rows": rows or n - 9},
+        "neighbours": CHEBYSHEV,
+        "rule": elastic(),
+        "frame": {"type": "natural"},
+        "leaders": PULL,
+        "steps": 1,
+    } | parts
+
+
+def disc(**parts):
+    select = [{"box": [x, -20.0, x + 3.0, 20.0]} for x in (-14.2, 11.2)]
+    motions = ({"type": "hold"}, {"type": "displace", "displacement": [0.6, 0.3]})
+    leaders = [{"select": s, "motion": m} for s, m in zip(select, motions, strict=True)]
+    body = {"type": "ring", "inner": 5.3, "outer": 14.1, "centre": [0.0, 0.0]}
+    return sheet(**{"body": body, "leaders": leaders} | parts)
+
+
+SCENES = {
+    "elastic": sheet(),
+    "auxetic": sheet(rule=elastic(-0.5)),
+    "nearly incompressible": sheet(rule=elastic(0.45)),
+    "rectangular": sheet(lattice={"type": "rectangular", "a": 3.0, "b": 1.0}),
+    "hexagonal": sheet(**HEXAGONAL),
+    "cut cells": disc(),
+    "barycentre": sheet(rule={"type": "barycentre"}, frame={"type": "mean"}, neighbours={
+        "type": "coordination", "shells": 1}),
+    "barycentre of eight, free": sheet(rule={"type": "barycentre"}, frame={"type": "none"}),
+    "oblique": sheet(
+        lattice={"type": "oblique", "a": 1.0, "b": 0.9, "angle": 65.0},
+        rule={"type": "mean-displacement"},
+        frame={"type": "first"},
+    ),
+    "copying frame": sheet(frame={"type": "mean"}),
+    "mirror": sheet(frame={"type": "mirror"}),
+    "a rule of one's own": sheet(rule={"type": "skew"}, frame={"type": "none"}),
+}  # fmt: skip
+
+
+def solved(given, method="multigrid", tolerance=1e-8):
+    """(u, certificate) of followers and leaders."""
+    given = given | {"diagnostics": [{"type": "displacement"}]}
+    given |= {"solver": {"type": "equilibrium", "method": method, "tolerance": tolerance}}
+    found = pbdkit.run(given, components=[Skew], progress=False)
+    return found.u.values[-1], json.loads(found.attrs["certificate"])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_few_iterations_lead_within_what_is_certified(name):
+    """The certificate is never below the true error, and near it; the same comes out again, to the
+    bit."""
+    exact, _ = solved(SCENES[name], "lu", 1e-11)
+    for tolerance in (1e-3, 1e-8):
+        u, certificate = solved(SCENES[name], tolerance=tolerance)
+        error = np.hypot(*(u - exact).T).max()
+        assert certificate["method"].startswith("multigrid, ")
+        assert error <= certificate["distance"] <= tolerance * 1.1
+        assert certificate["inner_iterations"] <= (24 if "conj" in certificate["method"] else 60)
+    again, _ = solved(SCENES[name], tolerance=tolerance)
+    assert again.tobytes() == u.tobytes()
+
+
+MORE = {
+    "second neighbours": sheet(
+        rule={"type": "barycentre"},
+        neighbours={"type": "chebyshev", "shells": 2},
+        frame={"type": "none"},
+    ),
+    "strain gradient": sheet(rule={"type": "strain-gradient", "poisson_ratio": 0.3, "length": 1.0}),
+    "traction-free": sheet(frame={"type": "traction-free"}),
+}
+
+
+@pytest.mark.parametrize("name", [*SCENES, *MORE])
+def test_without_numba_grids_of_hats_serve(name, monkeypatch):
+    given = (SCENES | MORE)[name]
+    exact, _ = solved(given, "lu", 1e-11)
+    monkeypatch.setattr(linearisation, "find_spec", lambda name: None)
+    u, certificate = solved(given)
+    assert certificate["method"].startswith("multigrid, ")
+    assert np.hypot(*(u - exact).T).max() <= certificate["distance"]
+
+
+def cracked(n, cracks):
+    """1 - P of a sheet of springs between four neighbours, held at both ends, without the bonds
+    across cracks, each (row, first, last)."""
+    sparse = pytest.importorskip("scipy.sparse")
+    at = np.arange(n * n).reshape(n, n)
+    bonds = [
+        np.stack([at[:-1].ravel(), at[1:].ravel()]),
+        np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()]),
+    ]
+    for row, first, last in cracks:
+        across = np.isin(bonds[0][0], at[row, first:last])
+        bonds[0] = bonds[0][:, ~across]
+    i, j = np.concatenate(bonds, axis=1)
+    held = np.bincount(at[:, [0, -1]].ravel(), minlength=n * n)
+    ones = np.ones(len(i))
+    graph = sparse.coo_array((ones, (i, j)), (n * n, n * n))
+    graph = (graph + graph.T).tocsr()
+    return (sparse.diags_array(graph.sum(axis=1) + held) - graph).tocsr(), at
+
+
+@pytest.mark.parametrize("cracks", ["half", "seven"])
+def test_hats_do_not_bridge_cracks(cracks):
+    n = 90
+    rows = [n // 2] if cracks == "half" else range(10, 80, 10)
+    matrix, at = cracked(n, [(row, 0, n // 2 if cracks == "half" else n - 8) for row in rows])
+    places = np.stack(np.unravel_index(at.ravel(), at.shape), axis=1).astype(float)
+    led = np.array([(i, j) for i in range(n) for j in (-1.0, float(n))])
+    ground = linear_solver.Ground(1, places, led)
+    solver = linear_solver.linear_solver(matrix, "multigrid", symmetric=True, ground=ground)
+    b = np.random.default_rng(0).normal(size=n * n)
+    x = solver.solve(b, 1e-8)
+    assert np.linalg.norm(b - matrix @ x) <= 1e-7 * np.linalg.norm(b)
+    assert solver.iterations <= 35
+
+
+def test_the_method_follows_the_size():
+    for n, method in ((12, "lu"), (160, "multigrid, conjugate-gradients")):
+        scene = build_scene(pbdkit.Experiment(**sheet(n, n)))
+        assert (scene.raster.count > linearisation.LARGEST_DIRECT) == (n > 100)
+        assert settle(scene, initial_state(scene)).method == method
