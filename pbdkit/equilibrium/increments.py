@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator
 
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
+from pbdkit.equilibrium.load_path import moments
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
@@ -14,7 +16,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.prescription import last_event, place, prescribe
+from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 VALUES_A_CALL = 200_000_000
@@ -23,16 +25,18 @@ MOST_SETTLINGS = 2000
 """So often bonds may change in an increment, one after the other or little by little."""
 
 
-Way = Generator[State, None, Certificate]
+Way = Generator[float, None, Certificate]
 
 
-def increments(scene: Scene, state: State, watch: Watch) -> Way:
-    """Takes a scene, in place, from its initial state, or one given out on the way, to the
-    equilibrium of its last step. Gives out what decides all that follows.
+def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> Way:
+    """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
+    moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
+    the state decide all that follows.
 
     Until the roles change for the last time steps are made, so that leaders start, and parts that
     nothing holds remain, where stepping has them. Where bonds can break, the leaders' way is made
-    in increments instead: settle, break what is too long, settle again until nothing breaks.
+    in increments instead, within steps too: settle, break what is too long, settle again until
+    nothing breaks.
     Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
     the watch says so: then the state is the last that had been reached.
     """
@@ -44,10 +48,10 @@ def increments(scene: Scene, state: State, watch: Watch) -> Way:
                 "{type: stepping}, or a motion that ends",
                 ("leaders", n, "motion"),
             )
-    scale = scale_of(scene, initial_state(scene) if state.step else state)
+    scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture:
-        return (yield from _load(scene, state, finder, asked.increments))
+        return (yield from _load(scene, state, finder, asked.increments, since))
     if (last := _last_change_of_roles(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
@@ -71,7 +75,7 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
-def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[State]:
+def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[float]:
     """Steps, in calls short enough for interruptions to be heard."""
     watch.begin("stepping until the roles change")
     first = state.step
@@ -80,53 +84,54 @@ def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[
         reached = engine.advance(state, min(a_call, last - state.step))
         state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
         state.step = reached.step
-        yield state
+        yield state.step
         watch.look((state.step - first) / (last - first))
 
 
-def _settle_at(scene: Scene, state: State, finder: Finder, step: int) -> Certificate:
-    before = state.u.copy(), state.starts
-    led, state.starts = prescribe(scene, state, step)
+def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
+    before, step = (state.u.copy(), state.starts), math.ceil(moment)
+    led, state.starts = prescribe(scene, state, moment)
     place(state.u, led)
     try:
         certificate = finder.find(state, step)
     except StoppedError:
         state.u[...], state.starts = before
         raise
-    state.step = step
+    state.step = math.floor(moment)
     state.previous[...] = state.u
     return certificate
 
 
-def _load(scene: Scene, state: State, finder: Finder, most: int) -> Way:
+def _load(scene: Scene, state: State, finder: Finder, count: int, since: float) -> Way:
     """In increments up to the last motion or change of roles, breaking bonds on the way."""
-    steps, last = scene.experiment.steps, last_event(scene)
-    count = min(most, last)
     certificate: Certificate | None = None
-    planned = np.unique(np.linspace(1, last, count).round().astype(int))
-    for step in planned[planned > state.step].tolist():
-        finder.watch.load, before = f"step {step} of {last}, ", state.copy()
+    every = moments(scene, count)
+    planned = [moment for moment in every if moment > since] or every[-1:]
+    for moment in planned:
+        finder.watch.load = f"step {moment:.6g} of {planned[-1]:g}, "
+        before = state.copy()
         try:
-            certificate = _settle_bonds_at(scene, state, finder, step)
+            certificate = _settle_bonds_at(scene, state, finder, moment)
         except StoppedError:
             vars(state).update(vars(before))
             raise
-        if step < last:
-            yield state
-    state.step = steps
+        if moment < planned[-1]:
+            yield moment
+    state.step = scene.experiment.steps
     assert certificate is not None
     return certificate
 
 
-def _settle_bonds_at(scene: Scene, state: State, finder: Finder, step: int) -> Certificate:
+def _settle_bonds_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
     """Until no bond changes any more."""
     fracturing = Fracturing(scene)
     for _ in range(MOST_SETTLINGS):
-        certificate = _settle_at(scene, state, finder, step)
-        if not _bonds_change(scene, fracturing, state, step):
+        certificate = _settle_at(scene, state, finder, moment)
+        if not _bonds_change(scene, fracturing, state, math.ceil(moment)):
             return certificate
     raise UnconvergedError(
-        f"bonds still change after they settled {MOST_SETTLINGS} times in step {step}", certificate
+        f"bonds still change after they settled {MOST_SETTLINGS} times at step {moment:.6g}",
+        certificate,
     )
 
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pbdkit.experiment.leaders import Hold
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import RenewsParticles
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import SlotFollowers
@@ -30,7 +32,7 @@ class Moves:
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            stepped = replace(scene, experiment=experiment)
+            stepped = replace(scene, experiment=experiment, leading=_resting(scene))
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
         self._followers = None if self._engine else SlotFollowers(scene, stepping)
@@ -42,7 +44,8 @@ class Moves:
         if frame:
             frame.follow(flat, flat)
         if self._engine:
-            here = replace(state, step=step - 1, previous=np.zeros_like(u))
+            none = (None,) * len(self._scene.leading)
+            here = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)
             moves = self._engine.advance(here).u
         else:
             assert self._followers
@@ -55,6 +58,13 @@ class Moves:
         for place in [*still, *([frame.place] if frame else [])]:
             moves.reshape(len(u), -1)[:, place] = 0.0
         return moves
+
+
+def _resting(scene: Scene) -> tuple[Leading, ...]:
+    """The leader groups, holding."""
+    groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
+    pairs = zip(scene.leading, groups, strict=True)
+    return tuple(replace(leading, group=group) for leading, group in pairs)
 
 
 def rounding(u: Floats) -> float:

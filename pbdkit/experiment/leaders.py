@@ -30,8 +30,9 @@ class Motion(Component):
     """Whether the motion ends, at the last of its knots."""
 
     @abstractmethod
-    def offset(self, n: int, start: Floats) -> Floats:
-        """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1.
+    def offset(self, n: float, start: Floats) -> Floats:
+        """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1;
+        on the way to an equilibrium also between two steps, n > 0.
 
         `start` are the positions at which the motion found them, (particle, axis); so is what is
         returned, or (axis,) where it is the same for all.
@@ -52,7 +53,7 @@ class Hold(Motion):
 
     type: Literal["hold"] = "hold"
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """None."""
         return np.zeros(start.shape[1])
 
@@ -64,7 +65,7 @@ class Velocity(Motion):
     velocity: Pair
     steps: Steps
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """velocity · min(n, steps)."""
         return np.array(self.velocity) * min(n, self.steps)
 
@@ -79,9 +80,9 @@ class Displace(Motion):
     type: Literal["displace"] = "displace"
     displacement: Pair
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """The displacement, from the first step on."""
-        return np.array(self.displacement)
+        return np.array(self.displacement) * min(n, 1)
 
     def knots(self) -> tuple[int, ...]:
         """The first step."""
@@ -107,7 +108,7 @@ class Path(Motion):
             raise ValueError(f"steps must increase, got {brief(self.steps)}")
         return self
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """Linear interpolation; beyond the last step its displacement."""
         k = min(bisect_left(self.steps, n), len(self.steps) - 1)
         begin, before = (self.steps[k - 1], self.displacements[k - 1]) if k else (0, (0.0, 0.0))
@@ -127,7 +128,7 @@ class Rotation(Motion):
     angle: Annotated[float, Field(ge=-1e6, le=1e6)]
     steps: Steps
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """(Q - 1)(start - centre), Q the rotation by angle · min(n, steps)."""
         turned = math.radians(self.angle * min(n, self.steps))
         # 1 - cos without cancellation, so that small turns keep their digits.
@@ -148,7 +149,7 @@ class Oscillation(Motion):
     amplitude: Pair
     period: Annotated[float, Field(ge=1e-6, le=1e12)]
 
-    def offset(self, n: int, start: Floats) -> Floats:
+    def offset(self, n: float, start: Floats) -> Floats:
         """amplitude · sin(2πn / period)."""
         return np.array(self.amplitude) * math.sin(2 * math.pi * n / self.period)
 

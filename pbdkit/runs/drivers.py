@@ -15,6 +15,7 @@ from pbdkit.stepping.guard import Guard
 from pbdkit.stepping.state import State
 
 if TYPE_CHECKING:
+    from pbdkit.equilibrium.certificate import Certificate
     from pbdkit.equilibrium.settlement import Settling
 
 States = Generator[State, None, Outcome]
@@ -176,25 +177,26 @@ class Straight(Driver):
     the equilibrium."""
 
     choice = Choice("equilibrium", 1, "asked for")
+    moment = 0.0
+    """What of the load's way has been reached, in steps."""
 
     def standing(self) -> dict[str, Any]:
-        """The state: each increment begins anew from it."""
-        return {"state": self.state}
+        """The state and the moment: each increment begins anew from them."""
+        return {"state": self.state, "moment": self.moment}
 
     def take_up(self, standing: Mapping[str, Any]) -> None:
         """From the last that was reached."""
-        self.state = standing["state"]
+        self.state, self.moment = standing["state"], float(standing["moment"])
 
     def states(self) -> States:
         """Interrupted, it gives out how far it had come."""
         # Loaded by those who look for an equilibrium, and by nobody else.
-        from pbdkit.equilibrium.increments import increments
         from pbdkit.equilibrium.newton import UnconvergedError
 
         state, steps = self.state, self.scene.experiment.steps
         yield state
         try:
-            certificate = yield from increments(self.scene, state, self.watch)
+            certificate = yield from self._on_the_way(state)
             outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
         except UnconvergedError as error:
             found = error.certificate
@@ -210,3 +212,15 @@ class Straight(Driver):
         if self.rejection:
             return Outcome("unconverged", f"{self.rejection} left all bounds", steps)
         return outcome
+
+    def _on_the_way(self, state: State) -> Generator[State, None, Certificate]:
+        from pbdkit.equilibrium.increments import increments
+
+        way = increments(self.scene, state, self.watch, self.moment)
+        while True:
+            try:
+                self.moment = next(way)
+            except StopIteration as end:
+                certificate: Certificate = end.value
+                return certificate
+            yield state

@@ -63,6 +63,7 @@ def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) 
         coming = [guard["next_look"], pace.next_look if pace else now, steps]
         whole = all(isinstance(step, int) for step in (now, *past, *coming))
         in_order = min(past) >= -1 and max(past) <= now <= min(coming)
+        in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
         return whole and in_order and (now < guard["next_look"] or now == steps)
     except (KeyError, TypeError, AttributeError):
         return False

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pbdkit.errors import ExperimentError
@@ -15,15 +17,17 @@ Led = list[tuple[Indices, Floats]]
 Starts = tuple[Floats | None, ...]
 
 
-def prescribe(scene: Scene, state: State, step: int) -> tuple[Led, Starts]:
-    """The leaders of a step with their displacements, and where each motion has started."""
+def prescribe(scene: Scene, state: State, moment: float) -> tuple[Led, Starts]:
+    """The leaders of a step with their displacements at its end, or at a moment within it, and
+    where each motion has started."""
     led: Led = []
     starts: list[Floats | None] = []
+    step = math.ceil(moment)
     for leading, begun in zip(scene.leading, state.starts, strict=True):
         if leading.group.leads(step):
             if begun is None:
                 begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
-            n_th = step - leading.group.from_ + 1
+            n_th = moment - leading.group.from_ + 1
             offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
             led.append((leading.place, begun + np.atleast_2d(offset).T))
         starts.append(begun)
