@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
-from pbdkit.scene.leader_groups import kinds_at
-from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.guard import way_of
 from pbdkit.stepping.state import Floats, State
@@ -193,10 +191,6 @@ class Foresight:
         """Whether followers put elsewhere, at random and as far as the body has come, move by what
         the linearisation at rest says."""
         size = float(np.abs(here.u).max()) or spacing_of(self._scene)
-        put, steps = np.zeros_like(here.u), self._scene.experiment.steps
-        kinds = kinds_at(self._scene.raster, self._scene.leading, steps)
-        at = self._scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
-        random = np.random.default_rng(0).uniform(-size, size, (len(put), len(at)))
-        put.reshape(len(put), -1)[:, at] = random
+        put, steps = random_displacements(self._scene, size), self._scene.experiment.steps
         moves, moved = (self._moves.at(replace(here, u=u), steps) for u in (here.u, here.u + put))
         return known.mismatch(put, moves, moved) <= LINEAR

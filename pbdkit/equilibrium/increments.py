@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator
+from contextlib import suppress
 
 import numpy as np
 
@@ -25,6 +26,11 @@ MOST_SETTLINGS = 2000
 """So often bonds may change in an increment, one after the other or little by little."""
 
 
+TINY, SMALLEST = 1e-9, 2.0**-12
+"""The last part of a way is taken with what is left of it; no part is smaller than the other share
+of its increment."""
+MOST_ROUNDS, STEPS_A_ROUND = 40, 50
+"""Of steps, where an equilibrium cannot be followed."""
 Way = Generator[float, None, Certificate]
 
 
@@ -34,9 +40,9 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     the state decide all that follows.
 
     Until the roles change for the last time steps are made, so that leaders start, and parts that
-    nothing holds remain, where stepping has them. Where bonds can break, the leaders' way is made
-    in increments instead, within steps too: settle, break what is too long, settle again until
-    nothing breaks.
+    nothing holds remain, where stepping has them. Where bonds can break, and for rules that are not
+    linear, the leaders' way is made in increments instead, within steps too: settle, break what is
+    too long, settle again until nothing breaks.
     Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
     the watch says so: then the state is the last that had been reached.
     """
@@ -50,8 +56,9 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
             )
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
-    if scene.has_fracture:
-        return (yield from _load(scene, state, finder, asked.increments, since))
+    if scene.has_fracture or not finder.linear:
+        count = asked.increments if scene.has_fracture else 1
+        return (yield from _load(scene, state, finder, moments(scene, count), since))
     if (last := _last_change_of_roles(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
@@ -102,19 +109,19 @@ def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Cer
     return certificate
 
 
-def _load(scene: Scene, state: State, finder: Finder, count: int, since: float) -> Way:
+def _load(scene: Scene, state: State, finder: Finder, every: list[float], since: float) -> Way:
     """In increments up to the last motion or change of roles, breaking bonds on the way."""
     certificate: Certificate | None = None
-    every = moments(scene, count)
     planned = [moment for moment in every if moment > since] or every[-1:]
     for moment in planned:
         finder.watch.load = f"step {moment:.6g} of {planned[-1]:g}, "
         before = state.copy()
         try:
-            certificate = _settle_bonds_at(scene, state, finder, moment)
+            certificate = _settle_bonds_at(scene, state, finder, since, moment)
         except StoppedError:
             vars(state).update(vars(before))
             raise
+        since = moment
         if moment < planned[-1]:
             yield moment
     state.step = scene.experiment.steps
@@ -122,16 +129,71 @@ def _load(scene: Scene, state: State, finder: Finder, count: int, since: float) 
     return certificate
 
 
-def _settle_bonds_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
+def _settle_bonds_at(
+    scene: Scene, state: State, finder: Finder, since: float, moment: float
+) -> Certificate:
     """Until no bond changes any more."""
-    fracturing = Fracturing(scene)
+    fracturing = Fracturing(scene) if scene.has_fracture else None
     for _ in range(MOST_SETTLINGS):
-        certificate = _settle_at(scene, state, finder, moment)
-        if not _bonds_change(scene, fracturing, state, math.ceil(moment)):
+        if finder.linear:
+            certificate = _settle_at(scene, state, finder, moment)
+        else:
+            certificate = _follow(scene, state, finder, since, moment)
+        if not fracturing or not _bonds_change(scene, fracturing, state, math.ceil(moment)):
             return certificate
+        since = moment
     raise UnconvergedError(
         f"bonds still change after they settled {MOST_SETTLINGS} times at step {moment:.6g}",
         certificate,
+    )
+
+
+def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
+    """From the equilibrium of a moment to that of a later one, in parts as large as keep to one
+    way; where none is small enough, since the body snaps or bonds broke, by steps."""
+    here, part = since, moment - since
+    while True:
+        target = moment if here + part > moment - TINY * part else here + part
+        before = state.copy()
+        led, state.starts = prescribe(scene, state, target)
+        place(state.u, led)
+        try:
+            certificate = finder.follow(state, math.ceil(target), before)
+        except UnconvergedError as error:
+            vars(state).update(vars(before))
+            part /= 2.0
+            if part > (moment - since) * SMALLEST:
+                continue
+            certificate = _stepped(scene, state, finder, target, error)
+        here = target
+        state.step = math.floor(target)
+        state.previous[...] = state.u
+        if here >= moment:
+            return certificate
+        part = min(2.0 * part, moment - here)
+
+
+def _stepped(
+    scene: Scene, state: State, finder: Finder, moment: float, failed: UnconvergedError
+) -> Certificate:
+    """As stepping goes on with leaders where they are at a moment, until an equilibrium is near.
+    Raises UnconvergedError where none comes near that is stable."""
+    led, state.starts = prescribe(scene, state, moment)
+    place(state.u, led)
+    for _ in range(MOST_ROUNDS):
+        for _ in range(STEPS_A_ROUND):
+            state.u += finder.moves.at(state, math.ceil(moment))
+        if not np.isfinite(state.u).all():
+            break
+        found = state.copy()
+        with suppress(UnconvergedError):
+            certificate = finder.follow(found, math.ceil(moment), found.copy())
+            vars(state).update(vars(found))
+            return certificate
+    raise UnconvergedError(
+        f"at step {moment:.6g} the load leads no further: several equilibria meet there, as where "
+        f"a body buckles, and rounding would decide between them ({failed})",
+        failed.certificate,
     )
 
 

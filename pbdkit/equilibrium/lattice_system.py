@@ -112,6 +112,10 @@ class LatticeSystem(System):
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """All is held."""
 
+    def is_stable(self) -> bool:
+        """Conjugate gradients get stuck at a negative eigenvalue, and others are not looked for."""
+        return self._smallest > 0.0
+
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
         found: Found = self._solver.solve(r, done)
         self._iterations += len(found.jumps)

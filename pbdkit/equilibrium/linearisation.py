@@ -59,6 +59,10 @@ class _Replaceable(System):
         """By the present one."""
         self._system.refuse_moving_floats(moves, rounding)
 
+    def is_stable(self) -> bool:
+        """By the present one."""
+        return self._system.is_stable()
+
     def _first_able(self, does: Callable[[System], T]) -> T:
         try:
             return does(self._system)

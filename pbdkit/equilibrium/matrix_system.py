@@ -165,6 +165,10 @@ class MatrixSystem(System):
             bounds[stage.axes] = max(far, default=0.0)
         return math.hypot(*bounds)
 
+    def is_stable(self) -> bool:
+        """Part by part."""
+        return all(part.is_stable() for stage in self._stages for _, part in stage.parts)
+
     def _named(self, stage: _Stage, unknowns: Indices) -> str:
         numbers = np.unique(self._operator.followers[unknowns // len(stage.axes)]) + 1
         return f"{len(numbers)} particles (with number {numbers[0]})"

@@ -9,7 +9,8 @@ import numpy as np
 from pbdkit.experiment.leaders import Hold
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import RenewsParticles
-from pbdkit.scene.leader_groups import Leading
+from pbdkit.scene.leader_groups import Leading, kinds_at
+from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import SlotFollowers
@@ -70,3 +71,13 @@ def _resting(scene: Scene) -> tuple[Leading, ...]:
 def rounding(u: Floats) -> float:
     """How far rounding alone may put a move off at displacements u."""
     return ROUNDING * float(np.abs(u).max())
+
+
+def random_displacements(scene: Scene, size: float) -> Floats:
+    """Planes with followers of the last step put elsewhere, up to that far along each axis."""
+    kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
+    place = scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
+    put: Floats = np.zeros((scene.axes, *scene.raster.shape))
+    random = np.random.default_rng(0).uniform(-size, size, (len(put), len(place)))
+    put.reshape(len(put), -1)[:, place] = random
+    return put

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,17 +11,22 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import Floats, State, initial_state
 
-MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 60
+MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 12
+CONTRACTION = 0.25
+"""What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
+iteration leads there (Deuflhard)."""
+NEAR = 1e-3
+"""How accurately corrections are solved for, as a share of the last or of the leaders' way."""
+NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
 SHARE = 0.25
 """Of the tolerance, for linear systems."""
-SHORTEST = 2.0**-14
-"""The shortest share of a correction that is tried."""
+UNSTABLE = "what is found is not stable"
 
 
 class UnconvergedError(Exception):
@@ -47,88 +53,62 @@ class Finder:
         """Of the scene's followers."""
         return Moves(self.scene)
 
-    def find(self, state: State, step: int) -> Certificate:
-        """Moves the followers of `state`, in place, to where they rest, with the roles of `step`.
+    @cached_property
+    def linear(self) -> bool:
+        """Whether the rule is: it says so, or followers put elsewhere, at random and as far as the
+        load goes, move by what the linearisation at rest says."""
+        scene, steps = self.scene, self.scene.experiment.steps
+        if scene.experiment.rule.linear:
+            return True
+        with one_thread():
+            rest = replace(initial_state(scene), u=np.zeros_like(initial_state(scene).u))
+            system = linearised(scene, rest, steps, self.method, self.watch)
+            put = random_displacements(scene, self.scale)
+            moves = [self.moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
+            return system.mismatch(put, *moves) <= LINEAR
 
-        The first linearisation is that of the scene at rest, exact for linear rules. Others are
-        linearised anew where they have come to (Newton's iteration, with shorter corrections where
-        the moves would grow). Raises ExperimentError where a part of the body has no equilibrium,
-        UnconvergedError, and StoppedError.
+    def find(self, state: State, step: int) -> Certificate:
+        """Moves the followers of `state`, in place, to where they rest, with the roles of `step`,
+        by the linearisation of the scene at rest, exact for linear rules.
+
+        Raises ExperimentError where a part of the body has no equilibrium, UnconvergedError and
+        StoppedError.
         """
         with one_thread():
-            return _Search(self, state, step).run()
+            return _Linear(self, state, step).run()
+
+    def follow(self, state: State, step: int, before: State) -> Certificate:
+        """The same for rules that are not linear, from the equilibrium `before` the leaders went on
+        a little: by Newton's iteration, as long as each correction is much smaller than the last,
+        so that no other equilibrium is nearer. What is found is stable."""
+        with one_thread():
+            return _Newton(self, state, step, before).run()
 
 
-class _Search:
-    def __init__(self, finder: Finder, state: State, step: int) -> None:
+class _Search(ABC):
+    _linear = False
+
+    def __init__(self, finder: Finder, state: State, step: int, at: State, what: str) -> None:
         self._finder, self._state, self._step = finder, state, step
         self._linearisations = self._inner = 0
-        self._linear = False
-        at_rest = replace(state, u=np.zeros_like(state.u))
-        self._system = self._linearised(at_rest, "assembling")
-        self._owed: State | None = state.copy()
+        self._system = self._linearised(at, what)
         self._left = self._moves()
         self._known: tuple[float, Floats | None, System | None] = math.inf, None, None
         """The last distance, of which moves, by which system."""
 
+    @abstractmethod
     def run(self) -> Certificate:
-        if not self._left.any() and not self._state.u.any() and not self._state.previous.any():
-            self._linear = True  # nothing is prescribed but rest
-            return self._certified()
-        start, moves = self._state.u.copy(), self._left
-        if self._correct_linearly():
-            return self._certified()
-        if not self._linear:
-            if not _size(self._left) < _size(moves):
-                self._state.u[...], self._left = start, moves
-            self._correct_anew()
-        return self._certified()
-
-    def _correct_linearly(self) -> bool:
-        """Corrections by the first system; whether the tolerance is reached, or the rule is known
-        not to be linear."""
-        for n in range(MOST_CORRECTIONS):
-            moves, before = self._left, _size(self._left)
-            correction = self._system.solve(moves, self._wanted, self._owed)
-            self._shift(correction, 1.0)
-            self._owed = None
-            after, floor = _size(self._left), self._floor()
-            if n == 0 and before > 1e3 * floor:
-                mismatch = self._system.mismatch(correction, moves, self._left)
-                self._linear = mismatch <= LINEAR + floor / before
-            if not self._linear or not math.isfinite(after):
-                return False
-            if self._distance() <= self._finder.tolerance:
-                return True
-            if after > 0.5 * before:
-                return False
-        return False
-
-    def _correct_anew(self) -> None:
-        """Newton's iteration."""
-        while self._linearisations < MOST_LINEARISATIONS:
-            what = f"linearising for the {self._linearisations + 1}. time"
-            self._system = self._linearised(self._state, what)
-            self._system.refuse_moving_floats(self._left, self._rounding())
-            if self._distance() <= self._finder.tolerance or not self._search_along(
-                self._system.solve(self._left, self._wanted)
-            ):
-                return
-
-    def _search_along(self, correction: Floats) -> bool:
-        """Whether some share of the correction makes the moves smaller; takes it."""
-        start, moves, share = self._state.u.copy(), self._left, 1.0
-        while share >= SHORTEST:
-            self._shift(correction, share)
-            if _size(self._left) < (1.0 - 1e-4 * share) * _size(moves):
-                return True
-            self._state.u[...], self._left = start, moves
-            share /= 2.0
-        return False
+        """To the equilibrium."""
 
     def _certified(self) -> Certificate:
+        certificate = self._certificate()
+        if not certificate.distance <= self._finder.tolerance:
+            raise UnconvergedError(self._why(), certificate)
+        return certificate
+
+    def _certificate(self) -> Certificate:
         distance = self._distance()
-        certificate = Certificate(
+        return Certificate(
             method=self._system.methods,
             iterations=self._linearisations,
             inner_iterations=self._inner + self._system.iterations,
@@ -138,17 +118,12 @@ class _Search:
             bound=self._system.how,
             linearised=not self._linear,
         )
-        if not distance <= self._finder.tolerance:
-            raise UnconvergedError(self._why(), certificate)
-        return certificate
 
     def _why(self) -> str:
         if not np.isfinite(self._left).all():
             return "it left the finite numbers"
         if self._left.size and np.abs(self._left).max() <= 8 * self._rounding():
             return "rounding alone allows no better"
-        if self._linearisations >= MOST_LINEARISATIONS:
-            return f"{MOST_LINEARISATIONS} linearisations did not get there"
         return "no correction makes the moves smaller"
 
     def _linearised(self, at: State, what: str) -> System:
@@ -159,8 +134,8 @@ class _Search:
         self._linearisations += 1
         return linearised(finder.scene, at, self._step, finder.method, finder.watch)
 
-    def _shift(self, correction: Floats, share: float) -> None:
-        self._state.u += correction if share == 1.0 else share * correction
+    def _shift(self, correction: Floats) -> None:
+        self._state.u += correction
         self._left = self._moves()
 
     def _moves(self) -> Floats:
@@ -183,6 +158,70 @@ class _Search:
 
     def _floor(self) -> float:
         return self._rounding() * math.sqrt(max(1, self._left.size))
+
+
+class _Linear(_Search):
+    """By one linearisation."""
+
+    def __init__(self, finder: Finder, state: State, step: int) -> None:
+        at_rest = replace(state, u=np.zeros_like(state.u))
+        super().__init__(finder, state, step, at_rest, "assembling")
+        self._owed: State | None = state.copy()
+
+    def run(self) -> Certificate:
+        """Corrects until the tolerance is reached."""
+        moves = self._left.any() or self._state.u.any() or self._state.previous.any()
+        self._linear = True
+        if moves:  # else nothing is prescribed but rest
+            self._correct()
+        return self._certified()
+
+    def _correct(self) -> None:
+        for n in range(MOST_CORRECTIONS):
+            moves, before = self._left, _size(self._left)
+            correction = self._system.solve(moves, self._wanted, self._owed)
+            self._shift(correction)
+            self._owed = None
+            after, floor = _size(self._left), self._floor()
+            if n == 0 and before > 1e3 * floor:
+                mismatch = self._system.mismatch(correction, moves, self._left)
+                if not mismatch <= LINEAR + floor / before:
+                    raise UnconvergedError(NOT_LINEAR, self._certificate())
+            if not after <= 0.5 * before or self._distance() <= self._finder.tolerance:
+                return
+
+
+class _Newton(_Search):
+    """By linearisations at each state it comes to, from an equilibrium nearby."""
+
+    def __init__(self, finder: Finder, state: State, step: int, before: State) -> None:
+        super().__init__(finder, state, step, before, "following the load")
+        self._way = float(np.abs(state.u - before.u).max())
+        """How far leaders went on."""
+
+    def run(self) -> Certificate:
+        """Raises UnconvergedError where corrections do not become smaller fast, or where what they
+        lead to is not stable."""
+        size = math.inf
+        for n in range(MOST_LINEARISATIONS):
+            if n:
+                self._system = self._linearised(self._state, "following the load")
+                self._system.refuse_moving_floats(self._left, self._rounding())
+                if self._distance() <= self._finder.tolerance:
+                    break
+            accuracy = max(self._wanted, NEAR * min(self._way, size))
+            correction = self._system.solve(self._left, accuracy)
+            before, size = size, float(np.abs(correction).max(initial=0.0))
+            if n and not size <= CONTRACTION * before:
+                raise UnconvergedError("corrections do not become smaller", self._unconverged())
+            self._shift(correction)
+        certificate = self._certified()
+        if not self._system.is_stable():
+            raise UnconvergedError(UNSTABLE, certificate)
+        return certificate
+
+    def _unconverged(self) -> Certificate:
+        return replace(self._certificate(), distance=math.inf, share=math.inf)
 
 
 def _size(moves: Floats) -> float:

@@ -80,3 +80,8 @@ class System(ABC):
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """Raises ExperimentError where a part that nothing holds has moves left: only linear rules
         tell where it ends."""
+
+    @abstractmethod
+    def is_stable(self) -> bool:
+        """Whether no eigenvalue of A, as far as they are looked at, is negative: a small
+        disturbance of the solution then dies away, with a relaxation that is small enough."""

@@ -31,6 +31,8 @@ ACCURACY = 1e-9
 """Of solutions, relative; corrections are corrected where more is wanted."""
 ROUGH = 1e-3
 """The relative accuracy of solutions that only serve a bound."""
+TURNS = 20
+"""Of inverse iteration."""
 SINGULAR = 1e-10
 """Relative size below which a singular value counts as zero."""
 SHIFT, MOST_MODES = 1e-11, 6
@@ -79,6 +81,20 @@ class Part(ABC):
     def how(self) -> str:
         """How the bound is obtained."""
         return "inverse" if isinstance(self._solver, Dense) else "solution"
+
+    def is_stable(self) -> bool:
+        """Whether no eigenvalue is negative: of small matrices none at all, of others none of those
+        nearest to 0, through which they pass as the load goes on."""
+        if self._solver is None or self._borders:
+            return True
+        if isinstance(self._solver, Dense):
+            eigenvalues = np.linalg.eigvals(self._solver.inverse)
+            return bool((eigenvalues.real > 0.0).all())
+        v: Floats = np.random.default_rng(0).normal(size=self._size)
+        for _ in range(TURNS):
+            w = self._inverted(v / np.linalg.norm(v))
+            v, before = w, v
+        return bool(v @ before > 0.0)
 
     def _inverted(self, r: Floats) -> Floats:
         """A⁻¹ r, roughly."""
