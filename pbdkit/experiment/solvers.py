@@ -66,9 +66,10 @@ class Equilibrium(Solver):
     roles of the last step.
 
     `tolerance` is the largest distance from equilibrium, as a share of the largest prescribed
-    displacement. Where bonds can break, the leaders' way is made in so many `increments`, each
-    settled before the next. `method` solves the linear systems: lu, multigrid (with an iteration
-    around it), conjugate-gradients alone, or what serves their size.
+    displacement. Where bonds can break, the leaders' way is made in so many `increments`, within
+    steps too, each settled before the next; for rules that are not linear in as many as it takes.
+    `method` solves the linear systems: lu, multigrid (with an iteration around it),
+    conjugate-gradients alone, or what serves their size.
     """
 
     makes_steps: ClassVar[bool] = False

@@ -1,0 +1,130 @@
+"""Where the way of the load decides: rules that are not linear, bonds that break, events."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scene_strategies import samples
+
+import pbdkit
+from pbdkit.equilibrium.load_path import events, moments
+from pbdkit.scene.scene import build_scene
+
+HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+STRAIGHT = {"type": "equilibrium"}
+
+
+def moving(**motion):
+    return {"select": {"edge": "right"}, "motion": motion}
+
+
+def springs(displacement, columns=12, rows=4, **parts):
+    return {
+        "version": 1,
+        "name": "springs",
+        "lattice": {"type": "hexagonal", "a": 1.0},
+        "body": {"type": "grid", "columns": columns, "rows": rows},
+        "neighbours": {"type": "coordination", "shells": 1},
+        "rule": {"type": "springs"},
+        "frame": {"type": "natural"},
+        "leaders": [HOLD, moving(type="displace", displacement=displacement)],
+        "steps": 1,
+        "diagnostics": [{"type": "displacement"}, {"type": "smallest-cell-area"}],
+        "solver": STRAIGHT,
+    } | parts
+
+
+def sheet(leaders, **parts):
+    return {
+        "version": 1,
+        "name": "sheet",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": 6, "rows": 5},
+        "rule": {"type": "barycentre"},
+        "leaders": leaders,
+        "diagnostics": [{"type": "displacement"}],
+        "solver": STRAIGHT,
+    } | parts
+
+
+def run(experiment):
+    return pbdkit.run(experiment, progress=False)
+
+
+@pytest.mark.parametrize(
+    "displacement", [[0, 2.0], [0, 1.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str
+)
+def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
+    found = run(springs(displacement))
+    steps = 200
+    velocity = [along / steps for along in displacement]
+    slow = springs(
+        None,
+        leaders=[HOLD, moving(type="velocity", velocity=velocity, steps=steps)],
+        steps=20_000,
+        record={"every": 20_000},
+        solver={"type": "stepping", "settle": {"tolerance": 1e-7}},
+    )
+    assert np.abs(found.u[-1] - run(slow).u[-1]).max() < 1e-6 * np.hypot(*displacement) + 1e-6
+    assert found.smallest_cell_area[-1] > 0.0
+    assert json.loads(found.attrs["certificate"])["distance"] <= 1e-8 * np.hypot(*displacement)
+
+
+def test_a_body_that_buckles_is_no_equilibrium():
+    """Pressed along its axis, a strip can give way to either side."""
+    with pytest.raises(pbdkit.DivergedError, match="several equilibria meet there"):
+        run(springs([-2.0, 0.0]))
+
+
+@samples(12)
+@given(
+    st.integers(4, 7),
+    st.integers(3, 6),
+    st.floats(1.2, 2.0),
+    st.tuples(st.floats(-4, 4), st.floats(-1, 1)),
+    st.integers(5, 40),
+)
+def test_the_same_load_in_the_same_parts_breaks_the_same_bonds(
+    columns, rows, threshold, way, parts
+):
+    """At once and cut into increments, or slowly, one step an increment."""
+    more = {
+        "body": {"type": "grid", "columns": columns, "rows": rows},
+        "fracture": {"type": "threshold", "thresholds": [threshold]},
+        "solver": STRAIGHT | {"increments": parts},
+    }
+    velocity = [along / parts for along in way]
+    at_once = sheet([HOLD, moving(type="displace", displacement=way)], steps=1, **more)
+    slowly = [HOLD, moving(type="velocity", velocity=velocity, steps=parts)]
+    ends = [run(at_once), run(sheet(slowly, steps=parts, **more))]
+    broken = [(ds.broken_step.values >= 0).tolist() for ds in ends]
+    assert broken[0] == broken[1]
+    assert np.abs(ends[0].u[-1] - ends[1].u[-1]).max() < 1e-6
+
+
+def path_of(*leaders, steps=60):
+    return build_scene(pbdkit.Experiment(**sheet(list(leaders), steps=steps, version=1)))
+
+
+def test_increments_are_equal_parts_of_the_way_and_events_end_them():
+    there_and_back = moving(type="path", steps=[10, 20], displacements=[[2.0, 0.0], [0.0, 0.0]])
+    late = {"select": {"edge": "top"}, "motion": {"type": "hold"}, "from": 41, "until": 50}
+    scene = path_of(HOLD, there_and_back, late)
+    assert events(scene) == [0, 10, 20, 40, 50, 51]
+    found = moments(scene, 40)
+    assert set(events(scene)[1:]) <= set(found)
+    assert len([moment for moment in found if moment <= 20]) == 40
+    parts = {round(b - a, 9) for a, b in pairwise([0.0, *found]) if b <= 20}
+    assert parts == {0.5}
+
+
+def test_a_motion_between_two_increments_is_not_skipped():
+    """Once there and back within a step's reach of one increment: bonds break all the same."""
+    pulled = moving(type="path", steps=[1, 2], displacements=[[9.0, 0.0], [0.0, 0.0]])
+    fracture = {"type": "threshold", "thresholds": [1.5]}
+    solver = STRAIGHT | {"increments": 1}
+    torn = run(sheet([HOLD, pulled], steps=60, fracture=fracture, solver=solver))
+    assert (torn.broken_step.values >= 0).any()
