@@ -149,7 +149,7 @@ class _Followers:
     def __init__(
         self, scene: Scene, state: State, sublattice: int, place: Indices, answer: str
     ) -> None:
-        self._evaluator = Evaluator(scene)
+        self._evaluator, self._name = Evaluator(scene), answer
         self._answer = {"move": self._evaluator.move, "force": self._evaluator.force}[answer]
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
         u = state.u.astype(float, copy=False)
@@ -165,7 +165,7 @@ class _Followers:
         answer = np.stack([np.broadcast_to(part, shape) for part in found], axis=-1)
         own, neighbours = self._derivative(None), {s: self._derivative(s) for s in self._slots}
         if finite and not all(np.isfinite(v).all() for v in (answer, own, *neighbours.values())):
-            raise ValueError("its answer at rest, or a derivative of it, is not finite")
+            raise ValueError(f"its {self._name} at rest, or a derivative of it, is not finite")
         return Response(kinds, own, neighbours, answer)
 
     def _derivative(self, mover: Slot | None) -> Floats:

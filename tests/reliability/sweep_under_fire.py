@@ -69,7 +69,7 @@ def under_fire(folder: Path, members: int, kills: int, workers: int) -> dict[str
     path.write_text(json.dumps(sweep))
     line = [sys.executable, "-m", "pbdkit", "sweep", str(path), "-o", str(folder / "fire")]
     running = subprocess.Popen([*line, "--workers", str(workers), "--quiet"])
-    killed, due = 0, sorted(chance.sample(range(int(0.9 * members)), kills))
+    killed, due = 0, sorted(chance.sample(range(members // 2), kills))
     while running.poll() is None and killed < kills:
         time.sleep(chance.uniform(0, 2 * PATIENCE_S))
         if held(folder / "fire") < due[killed]:
