@@ -114,21 +114,19 @@ def galerkin(code, own, coarse, halved, out):
 
 @njit(cache=KEPT)
 def asymmetry(code, own):
-    """The largest entry of K - Kᵀ."""
-    worst = 0.0
-    for s in range(9):
-        for e in range(4):
-            worst = max(worst, abs(own[0, s, e] - own[0, 8 - s, (0, 2, 1, 3)[e]]))
+    """The largest entry of K - Kᵀ. Of places with the stencil of most one pair a direction is
+    enough."""
+    worst, seen = 0.0, np.zeros(9, np.bool_)
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
-            if code[i, j] <= 0:
-                continue
             for s in range(9):
-                there = code[i + s // 3 - 1, j + s % 3 - 1]
-                if there >= 0:
-                    one, other = own[code[i, j], s], own[there, 8 - s]
-                    for e in range(4):
-                        worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))
+                here, there = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
+                if here < 0 or there < 0 or (here == 0 and there == 0 and seen[s]):
+                    continue
+                seen[s] = seen[s] or (here == 0 and there == 0)
+                one, other = own[here, s], own[there, 8 - s]
+                for e in range(4):
+                    worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))
     return worst
 
 

@@ -37,7 +37,7 @@ LOOKS_AHEAD = 2
 """Iterations that a bound takes."""
 SAFETY = 2.0
 """By what λ is divided."""
-SAME = 1e-12
+SAME = 1e-9
 """Relative difference up to which a matrix counts as symmetric."""
 DIGITS = 13
 """Of factors of rows; rounding decides the others."""

@@ -18,7 +18,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State, initial_state
 
 MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 12
-CONTRACTION = 0.25
+CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
 NEAR = 1e-3
