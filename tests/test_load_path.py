@@ -117,6 +117,7 @@ def test_increments_are_equal_parts_of_the_way_and_events_end_them():
     found = moments(scene, 40)
     assert set(events(scene)[1:]) <= set(found)
     assert len([moment for moment in found if moment <= 20]) == 40
+    assert set(range(1, 21)) <= set(found)
     parts = {round(b - a, 9) for a, b in pairwise([0.0, *found]) if b <= 20}
     assert parts == {0.5}
 

@@ -36,7 +36,8 @@ def moments(scene: Scene, count: int) -> list[float]:
     whole, found = sum(ways), list[float]()
     for (begin, end), way in zip(intervals, ways, strict=True):
         parts = max(1, round(count * way / whole)) if whole > 0.0 else 1
-        found += [begin + (end - begin) * (n + 1) / parts for n in range(parts)]
+        # Whole steps come out whole.
+        found += [begin + (n + 1) * (end - begin) / parts for n in range(parts)]
     return found
 
 
