@@ -28,16 +28,21 @@ def events(scene: Scene) -> list[int]:
 
 
 def moments(scene: Scene, count: int) -> list[float]:
-    """The ends of `count` increments, equal parts of the way that the leaders go, and every event:
-    where nobody moves there is one increment."""
+    """The ends of about `count` increments, equal parts of the way that the leaders go, and every
+    event. An increment is some whole steps, or a step some whole increments; where nobody moves
+    there is one."""
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
     ways = [_way(scene, *interval) for interval in intervals]
     whole, found = sum(ways), list[float]()
     for (begin, end), way in zip(intervals, ways, strict=True):
-        parts = max(1, round(count * way / whole)) if whole > 0.0 else 1
-        # Whole steps come out whole.
-        found += [begin + (n + 1) * (end - begin) / parts for n in range(parts)]
+        parts = count * way / whole if whole > 0.0 else 1.0
+        a_step = round(parts / (end - begin))
+        if a_step > 0:
+            found += [begin + (n + 1) / a_step for n in range(a_step * (end - begin))]
+        else:
+            marks = np.linspace(begin, end, max(1, round(parts)) + 1).round().astype(int)
+            found += np.unique(marks)[1:].tolist()
     return found
 
 
