@@ -89,7 +89,7 @@ def assembled(n: int) -> tuple[Any, Any, Any]:
     lam, mu = plane_stress(1.0, 0.3)
 
     @BilinearForm
-    def stiffness(u, v, _):  # type: ignore[no-untyped-def]
+    def stiffness(u, v, _):
         strain = sym_grad(u)
         return ddot(lam * eye(trace(strain), 2) + 2.0 * mu * strain, sym_grad(v))
 

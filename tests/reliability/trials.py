@@ -17,9 +17,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent)]
 
 import h5netcdf  # noqa: F401  # the children find all that is heavy loaded
-import h5py  # noqa: F401
+import h5py  # noqa: F401  # as above
 import numpy as np
-import xarray  # noqa: F401
+import xarray  # noqa: F401  # as above
 
 import pbdkit
 import pbdkit.analysis.forecast
