@@ -146,7 +146,8 @@ def test_an_interrupted_search_keeps_the_start(call, monkeypatch, what):
 
 def test_an_interrupted_load_keeps_the_last_increment_that_settled(call, monkeypatch):
     fracture = {"type": "threshold", "thresholds": [9.0]}
-    Path("s.json").write_text(json.dumps(sheet(fracture=fracture)))
+    solver = {"type": "equilibrium", "increments": 4}
+    Path("s.json").write_text(json.dumps(sheet(fracture=fracture, solver=solver)))
     stopping_at(monkeypatch, "solving", "step 4 of 4")
     assert call("run", "s.json").code == 130
     ds = pbdkit.open("sheet.nc")
