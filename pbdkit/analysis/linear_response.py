@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.stencil import derivative
+from pbdkit.analysis.stencil import array_of, derivative
 from pbdkit.interfaces import Components, Slot, Softens
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
@@ -160,9 +160,7 @@ class _Followers:
 
     def response(self, kinds: Indices, finite: bool) -> Response:
         """Of followers of these kinds, `finite` or refused."""
-        found = self._applied(self._still, self._here.u)
-        shape = self._here.u.x.shape
-        answer = np.stack([np.broadcast_to(part, shape) for part in found], axis=-1)
+        answer = self._standing.T
         own, neighbours = self._derivative(None), {s: self._derivative(s) for s in self._slots}
         if finite and not all(np.isfinite(v).all() for v in (answer, own, *neighbours.values())):
             raise ValueError(f"its {self._name} at rest, or a derivative of it, is not finite")
@@ -172,8 +170,16 @@ class _Followers:
         """∂answer/∂u_k through a slot or, for None, ∂answer/∂u_j with all neighbours where they
         are; (place, axis of the answer, axis of u)."""
         shape, axes = self._here.u.x.shape, np.eye(len(self._here.u))
-        columns = [derivative(partial(self._moved, mover, e), shape) for e in axes]
+        if self._evaluator.rule.linear:
+            columns = [array_of(self._moved(mover, e, 1.0), shape) - self._standing for e in axes]
+        else:
+            columns = [derivative(partial(self._moved, mover, e), shape) for e in axes]
         return np.moveaxis(np.array(columns), (0, 1), (2, 1))
+
+    @cached_property
+    def _standing(self) -> Floats:
+        """(axis of the answer, place): the answers as they are."""
+        return array_of(self._applied(self._still, self._here.u), self._here.u.x.shape)
 
     def _moved(self, mover: Slot | None, along: Floats, step: complex) -> Any:
         """The answers (place) after a step of the neighbour at a slot, or of one's own."""

@@ -37,10 +37,10 @@ Moved = Callable[[complex], tuple[Any, Any]]
 def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
     """(component, *shape): the derivative at a step of zero."""
     with np.errstate(all="ignore"):
-        ahead, behind = _array(moved(SMALL), shape), _array(moved(-SMALL), shape)
+        ahead, behind = array_of(moved(SMALL), shape), array_of(moved(-SMALL), shape)
         difference: NDArray[np.float64] = (ahead - behind).real / (2 * SMALL)
         try:
-            exact: NDArray[np.float64] = _array(moved(1j * TINY), shape).imag / TINY
+            exact: NDArray[np.float64] = array_of(moved(1j * TINY), shape).imag / TINY
         except (TypeError, ValueError):  # a function that takes no complex numbers
             return difference
     known = np.isfinite(exact) & np.isfinite(difference)
@@ -49,7 +49,8 @@ def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]
     return exact if off <= 1e-4 * scale else difference
 
 
-def _array(components: tuple[Any, Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def array_of(components: tuple[Any, ...], shape: tuple[int, ...]) -> NDArray[Any]:
+    """(component, *shape) of components that may be the same everywhere."""
     return np.array([np.broadcast_to(component, shape) for component in components])
 
 

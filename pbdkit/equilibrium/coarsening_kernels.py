@@ -131,6 +131,21 @@ def asymmetry(code, own):
 
 
 @njit(cache=KEPT)
+def symmetrise(code, own):
+    """(K + Kᵀ) / 2, where places have stencils of their own."""
+    for i in range(1, code.shape[0] - 1):
+        for j in range(1, code.shape[1] - 1):
+            for s in range(5):
+                here, there = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
+                if here < 0 or there < 0:
+                    continue
+                for e in range(4):
+                    t = (0, 2, 1, 3)[e]
+                    mean = (own[here, s, e] + own[there, 8 - s, t]) / 2
+                    own[here, s, e] = own[there, 8 - s, t] = mean
+
+
+@njit(cache=KEPT)
 def balance(code, own, factor):
     """Factors of rows, from place to place, with which as much of K as can be is symmetric; 1 for
     the stencil of most. Returns how many places have none."""
@@ -175,4 +190,5 @@ def run():
     count = coarse_codes(code, coarse_kind, halved, coarse_code)
     galerkin(code, own, coarse_code, halved, np.zeros((count + 1, 9, 4)))
     asymmetry(code, own)
+    symmetrise(code, own)
     balance(code, own, np.zeros((8, 8)))

@@ -50,6 +50,8 @@ class Descent(Found):
     jumps: list[float] = field(default_factory=list)
     steps: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
+    indefinite: bool = False
+    """Whether a way was met that does not lead uphill."""
 
     def smallest(self) -> float:
         """The smallest eigenvalue of B K that the iteration has seen (Lanczos)."""
@@ -99,7 +101,8 @@ class ConjugateGradients(Krylov):
             turned = found.left / before if found.steps else 0.0
             kernel.turn(size, z, turned, p)
             bent = kernel.product(self.matrix, p, q)
-            if not bent > 0.0 or not math.isfinite(bent):
+            if not 0.0 < bent < math.inf:
+                found.indefinite = bent <= 0.0
                 return found
             step = found.left / bent
             square, jump = kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded)

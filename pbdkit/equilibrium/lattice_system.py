@@ -25,9 +25,19 @@ from pbdkit.equilibrium.lattice_krylov import (
     Found,
     Krylov,
 )
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.multigrid import FloatingError, Multigrid, kernels
-from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix, stencil_matrix
-from pbdkit.equilibrium.system import StuckError, System
+from pbdkit.equilibrium.stencil_matrix import (
+    FREE,
+    LED,
+    NUDGE,
+    OUTSIDE,
+    StencilMatrix,
+    differenced_matrix,
+    stencil_matrix,
+)
+from pbdkit.equilibrium.symmetry import DIFFERENCED, EXACT, balanced, is_symmetric
+from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -37,10 +47,8 @@ LOOKS_AHEAD = 2
 """Iterations that a bound takes."""
 SAFETY = 2.0
 """By what λ is divided."""
-SAME = 1e-9
-"""Relative difference up to which a matrix counts as symmetric."""
-DIGITS = 13
-"""Of factors of rows; rounding decides the others."""
+FAITHFUL = 1e-3
+"""The share of what all moves at once are by which stencils from differences may be off."""
 NEAR = 0.01
 """The share of the first jump at which an iteration has found most of an error."""
 ENOUGH = 8
@@ -113,14 +121,24 @@ class LatticeSystem(System):
         """All is held."""
 
     def is_stable(self) -> bool:
-        """Conjugate gradients get stuck at a negative eigenvalue, and others are not looked for."""
-        return self._smallest > 0.0
+        """Conjugate gradients see a negative eigenvalue, from the load and from a random one; those
+        of a matrix that is not symmetric are not looked at."""
+        if self._symmetric:
+            random = np.random.default_rng(0).uniform(-1.0, 1.0, self._shape)
+            try:
+                self._found(self._pull(random), lambda d: len(d.jumps) >= ENOUGH)
+            except IndefiniteError:
+                return False
+        return True
 
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
         found: Found = self._solver.solve(r, done)
         self._iterations += len(found.jumps)
-        if isinstance(found, Descent) and len(found.steps) > 1:
-            self._smallest = min(self._smallest, found.smallest())
+        if isinstance(found, Descent):
+            if len(found.steps) > 1:
+                self._smallest = min(self._smallest, found.smallest())
+            if found.indefinite or found.left < 0.0 or self._smallest <= 0.0:
+                raise IndefiniteError
         return found
 
     def _farthest(self, left: float) -> float:
@@ -179,15 +197,28 @@ class LatticeSystem(System):
         return planes
 
 
-def lattice_system(scene: Scene, state: State, step: int, watch: Watch) -> LatticeSystem | None:
-    """The system of a scene; None where it has no such form, or leaders do not hold the body."""
-    matrix = stencil_matrix(scene, state, step)
+def lattice_system(
+    scene: Scene, state: State, step: int, watch: Watch, moves: Moves | None = None
+) -> LatticeSystem | None:
+    """The system of a scene, by the moves of its followers where these are compiled and the state
+    is not at rest; None where it has no such form, or leaders do not hold the body."""
+    if moves and moves.is_compiled and state.u.any():
+        matrix = differenced_matrix(scene, state, step, moves)
+        alike = DIFFERENCED
+    else:
+        matrix, alike, moves = stencil_matrix(scene, state, step), EXACT, None
     if matrix is None or leads_one_way(matrix) or not is_held(matrix):
         return None
     try:
-        return LatticeSystem(balanced(matrix), state.u.shape, watch)
+        system = LatticeSystem(balanced(matrix, alike), state.u.shape, watch)
     except FloatingError:
         return None
+    if moves:
+        put = random_displacements(scene, NUDGE)
+        there = replace(state, u=state.u + put)
+        if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
+            return None
+    return system
 
 
 def leads_one_way(matrix: StencilMatrix) -> bool:
@@ -196,47 +227,19 @@ def leads_one_way(matrix: StencilMatrix) -> bool:
     return bool(couples[0] != couples[1])
 
 
-def is_symmetric(matrix: StencilMatrix) -> bool:
-    """Up to rounding."""
-    largest = float(np.abs(matrix.stencils).max())
-    return bool(kernels().asymmetry(matrix.code, matrix.stencils) <= SAME * largest)
-
-
-def balanced(matrix: StencilMatrix) -> StencilMatrix:
-    """The matrix with its rows multiplied so that it is symmetric, where that can be: those of
-    particles with fewer neighbours, of which each has more weight."""
-    if is_symmetric(matrix):
-        return matrix
-    factor = np.empty(matrix.code.shape)
-    if kernels().balance(matrix.code, matrix.stencils, factor):
-        return matrix
-    lone = np.nonzero(matrix.code > 0)
-    pairs = np.stack([matrix.code[lone], factor[lone].round(DIGITS)], axis=1)
-    kinds, number = np.unique(pairs, axis=0, return_inverse=True)
-    row, times = kinds[:, 0].astype(int), kinds[:, 1, None]
-    code = matrix.code.copy()
-    code[lone] = 1 + number.ravel()
-    tables = (
-        np.concatenate([table[:1], table[row] * times.reshape(-1, *[1] * (table.ndim - 1))])
-        for table in (matrix.stencils, matrix.scale)
-    )
-    stencils, scale = tables
-    found = replace(matrix, code=code, stencils=stencils, scale=scale)
-    return found if is_symmetric(found) else matrix
-
-
 def is_held(matrix: StencilMatrix) -> bool:
     """Whether every connected part of the body touches a leader, and no neighbours are apart."""
     from scipy.ndimage import binary_dilation, label
 
-    bonds = np.abs(matrix.stencils).max(axis=-1) > 0.0
+    bonds = np.any(matrix.stencils, axis=-1)
     lone = np.nonzero(matrix.code > 0)
     of_lone = bonds[matrix.code[lone]]
-    for s in np.flatnonzero(bonds[0]):
+    known = bonds.any(axis=0)
+    for s in np.flatnonzero(known):
         there = matrix.kind[lone[0] + s // 3 - 1, lone[1] + s % 3 - 1] != OUTSIDE
         if (there & ~of_lone[:, s]).any():
             return False
-    pattern = (bonds[0] | bonds[0, ::-1]).reshape(3, 3)
+    pattern = (known | known[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
     touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
     return bool(np.count_nonzero(touched) == count)

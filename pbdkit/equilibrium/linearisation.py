@@ -7,7 +7,8 @@ from importlib.util import find_spec
 from typing import TypeVar
 
 from pbdkit.equilibrium.matrix_system import MatrixSystem
-from pbdkit.equilibrium.system import Floats, StuckError, System
+from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -19,8 +20,16 @@ once a machine, takes longer)."""
 T = TypeVar("T")
 
 
-def linearised(scene: Scene, state: State, step: int, method: str, watch: Watch) -> System:
-    """The system of a scene at a state with the roles of a step, by one of the solver's methods.
+def linearised(
+    scene: Scene,
+    state: State,
+    step: int,
+    method: str,
+    watch: Watch,
+    moves: Moves | None = None,
+) -> System:
+    """The system of a scene at a state with the roles of a step, by one of the solver's methods;
+    `moves`, where known, serve it.
 
     Raises ExperimentError where there is no unique solution.
     """
@@ -32,16 +41,18 @@ def linearised(scene: Scene, state: State, step: int, method: str, watch: Watch)
     if (method == "multigrid" or (method == "auto" and large)) and find_spec("numba"):
         from pbdkit.equilibrium.lattice_system import lattice_system
 
-        if system := lattice_system(scene, state, step, watch):
-            return _Replaceable(system, by_matrix)
+        if system := lattice_system(scene, state, step, watch, moves):
+            return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
 
 
 class _Replaceable(System):
-    """A system until it gets stuck, then another."""
+    """A system until it gets stuck, then another; but for a body that is not stable where it is
+    put, which is better put elsewhere."""
 
-    def __init__(self, system: System, otherwise: Callable[[], System]) -> None:
+    def __init__(self, system: System, otherwise: Callable[[], System], *, at_rest: bool) -> None:
         self._system, self._otherwise, self._past = system, otherwise, 0
+        self._at_rest = at_rest
 
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
         """By the first that can."""
@@ -66,7 +77,9 @@ class _Replaceable(System):
     def _first_able(self, does: Callable[[System], T]) -> T:
         try:
             return does(self._system)
-        except StuckError:
+        except StuckError as error:
+            if isinstance(error, IndefiniteError) and not self._at_rest:
+                raise
             self._past += self._system.iterations
             self._system = self._otherwise()
             return does(self._system)

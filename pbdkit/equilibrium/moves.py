@@ -17,7 +17,7 @@ from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
 
-LARGEST_BY_NUMPY = 100_000
+LARGEST_BY_NUMPY = 20_000
 """Particles beyond which moves are evaluated by the compiled engine."""
 ROUNDING = 4 * float(np.finfo(float).eps)
 
@@ -37,6 +37,11 @@ class Moves:
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
         self._followers = None if self._engine else SlotFollowers(scene, stepping)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether evaluating them is cheap."""
+        return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, step: int) -> Floats:
         """Planes, zero where nobody follows in that step; brings the state's frame into line."""

@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
-from pbdkit.equilibrium.system import System, one_thread
+from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State, initial_state
@@ -22,8 +22,10 @@ CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
 NEAR = 1e-3
-"""How accurately corrections are solved for, as a share of the last or of the leaders' way."""
+"""How accurately corrections are solved for at least, as a share of themselves."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
+NUDGE = 1e-6
+"""By so much leaders are moved to see what their way does to others."""
 SHARE = 0.25
 """Of the tolerance, for linear systems."""
 UNSTABLE = "what is found is not stable"
@@ -101,13 +103,12 @@ class _Search(ABC):
         """To the equilibrium."""
 
     def _certified(self) -> Certificate:
-        certificate = self._certificate()
+        certificate = self._certificate(self._distance())
         if not certificate.distance <= self._finder.tolerance:
             raise UnconvergedError(self._why(), certificate)
         return certificate
 
-    def _certificate(self) -> Certificate:
-        distance = self._distance()
+    def _certificate(self, distance: float) -> Certificate:
         return Certificate(
             method=self._system.methods,
             iterations=self._linearisations,
@@ -132,7 +133,7 @@ class _Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return linearised(finder.scene, at, self._step, finder.method, finder.watch)
+        return linearised(finder.scene, at, self._step, finder.method, finder.watch, finder.moves)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
@@ -186,7 +187,7 @@ class _Linear(_Search):
             if n == 0 and before > 1e3 * floor:
                 mismatch = self._system.mismatch(correction, moves, self._left)
                 if not mismatch <= LINEAR + floor / before:
-                    raise UnconvergedError(NOT_LINEAR, self._certificate())
+                    raise UnconvergedError(NOT_LINEAR, self._certificate(self._distance()))
             if not after <= 0.5 * before or self._distance() <= self._finder.tolerance:
                 return
 
@@ -196,32 +197,49 @@ class _Newton(_Search):
 
     def __init__(self, finder: Finder, state: State, step: int, before: State) -> None:
         super().__init__(finder, state, step, before, "following the load")
-        self._way = float(np.abs(state.u - before.u).max())
+        self._before, self._led = before, state.u - before.u
+        self._way = float(np.abs(self._led).max())
         """How far leaders went on."""
 
     def run(self) -> Certificate:
         """Raises UnconvergedError where corrections do not become smaller fast, or where what they
         lead to is not stable."""
-        size = math.inf
-        for n in range(MOST_LINEARISATIONS):
-            if n:
-                self._system = self._linearised(self._state, "following the load")
-                self._system.refuse_moving_floats(self._left, self._rounding())
-                if self._distance() <= self._finder.tolerance:
-                    break
-            accuracy = max(self._wanted, NEAR * min(self._way, size))
-            correction = self._system.solve(self._left, accuracy)
-            before, size = size, float(np.abs(correction).max(initial=0.0))
-            if n and not size <= CONTRACTION * before:
-                raise UnconvergedError("corrections do not become smaller", self._unconverged())
-            self._shift(correction)
-        certificate = self._certified()
-        if not self._system.is_stable():
+        try:
+            self._go_ahead()
+            self._correct()
+            certificate = self._certified()
+            stable = self._system.is_stable()
+        except IndefiniteError:
+            stable, certificate = False, self._certificate(math.inf)
+        if not stable:
             raise UnconvergedError(UNSTABLE, certificate)
         return certificate
 
-    def _unconverged(self) -> Certificate:
-        return replace(self._certificate(), distance=math.inf, share=math.inf)
+    def _go_ahead(self) -> None:
+        """As far as the equilibrium before says, leaders their whole way: by what moves a small
+        part of it makes."""
+        moves, part = self._finder.moves, min(1.0, NUDGE / self._way) if self._way else 1.0
+        here = moves.at(self._before, self._step)
+        nudged = replace(self._before, u=self._before.u + part * self._led)
+        pull = here + (moves.at(nudged, self._step) - here) / part
+        self._shift(self._system.solve(pull, max(self._wanted, NEAR * self._way)))
+
+    def _correct(self) -> None:
+        far, size = self._way, math.inf
+        for _ in range(MOST_LINEARISATIONS):
+            self._system = self._linearised(self._state, "following the load")
+            self._system.refuse_moving_floats(self._left, self._rounding())
+            farther, far = far, self._distance()
+            if far <= self._finder.tolerance or not math.isfinite(far):
+                return
+            # Solved as well as it is linear (Eisenstat and Walker).
+            share = min(NEAR, (far / farther) ** 2) if farther else NEAR
+            correction = self._system.solve(self._left, max(self._wanted, share * far))
+            before, size = size, float(np.abs(correction).max(initial=0.0))
+            if not size <= CONTRACTION * min(before, self._way or math.inf):
+                reason = "corrections do not become smaller"
+                raise UnconvergedError(reason, self._certificate(math.inf))
+            self._shift(correction)
 
 
 def _size(moves: Floats) -> float:

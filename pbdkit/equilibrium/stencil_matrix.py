@@ -6,7 +6,7 @@ K = -∂force/∂u, or -∂move/∂u, of the followers: most have the same stenc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import frame_matrices
 from pbdkit.analysis.linear_response import Response, by_sublattice, respond
-from pbdkit.interfaces import Calibrated, Slot
+from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.primitive_raster import PrimitiveRaster, primitive_step
+from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
@@ -27,6 +28,11 @@ Integers = NDArray[np.signedinteger[Any]]
 WINDOW, OWN = 9, 4
 """Places of a stencil, and the one of the particle itself among them."""
 OUTSIDE, FREE, LED = 0, 1, 2
+NUDGE = 1e-7
+"""By which differences are taken, in lattice units: rounding and curvature do some 1e-7 to them,
+for displacements of up to a hundred."""
+NOISE = 1e-5
+"""The share of the largest entry below which there is no bond."""
 SINGULAR, SAME = 1e-14, 1e-12
 """Relative sizes below which a determinant counts as zero, and two stencils as one."""
 
@@ -50,80 +56,75 @@ def stencil_matrix(scene: Scene, state: State, step: int) -> StencilMatrix | Non
     """The matrix at a state with the roles of a step; None where it has no such form: in space, on
     lattices of several sites a primitive cell, for longer bonds, rules that apply twice and frames
     whose points show particles far away."""
-    grid = _Raster.of(scene)
+    grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
         return None
     return _Assembly(scene, state, step, grid).matrix()
 
 
-@dataclass(frozen=True)
-class _Raster:
-    """Primitive cells, with a ring of empty ones around: the flat place of each particle here from
-    its place on the scene's raster; `shape` is (row, place)."""
+def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> StencilMatrix | None:
+    """The same by differences of the moves, many particles at once: nine groups, of particles three
+    places apart, do not meet in anybody's stencil. Followers have stencils of their own.
 
-    shape: Index
-    low: Index
-    scene: Scene
-
-    @classmethod
-    def of(cls, scene: Scene) -> _Raster | None:
-        """None where bonds lead farther than to a primitive cell beside."""
-        cell = scene.raster.lattice.cell()
-        steps = [primitive_step(scene, slot) for slot in scene.neighbourhood.every]
-        if (
-            scene.axes != 2
-            or np.abs(steps).max() > 1
-            or abs(np.linalg.det(cell.primitive)) != len(cell.sites)
-        ):
-            return None
-        if len(cell.sites) == 1:
-            return cls(scene.raster.shape[1:], scene.raster.first, scene)
-        cells = np.array(scene.raster.shape[1:]) - 1
-        corners = (
-            np.array([(0, 0), (cells[0], 0), (0, cells[1]), tuple(cells)]) + scene.raster.first
-        )
-        ends = corners @ np.array(cell.primitive)
-        sites = np.array([site.primitive for site in cell.sites])
-        low = ends.min(axis=0) + sites.min(axis=0) - 1
-        high = ends.max(axis=0) + sites.max(axis=0) + 1
-        return cls(tuple((high - low + 1).tolist()), tuple(low.tolist()), scene)
-
-    @property
-    def is_the_scenes(self) -> bool:
-        """Whether places here are places there."""
-        return len(self.scene.raster.lattice.cell().sites) == 1
-
-    def places(self, place: Indices) -> Indices:
-        """The flat places here of some on the scene's raster."""
-        if self.is_the_scenes:
-            return place
-        raster = self.scene.raster
-        cell = raster.lattice.cell()
-        s, *cells = np.unravel_index(place, raster.shape)
-        whole = np.stack(cells, axis=-1) + raster.first
-        sites = np.array([site.primitive for site in cell.sites])
-        index = whole @ np.array(cell.primitive) + sites[s] - self.low
-        found: Indices = np.ravel_multi_index(tuple(index.T), self.shape)
-        return found
+    Who is moved by others farther away has a wrong one: to be compared with moves.
+    """
+    grid, kind = PrimitiveRaster.of(scene), _kinds(scene, step)
+    if grid is None:
+        return None
+    place = np.flatnonzero(kind == FOLLOWER)
+    body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
+    index, code = grid.index(place), np.full(kind.size, -1, np.int32)
+    of_body = grid.index(body) % 3
+    stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
+    nudged = replace(state, u=state.u.copy())
+    still = moves.at(nudged, step).reshape(2, -1)[:, place]
+    for group in np.ndindex(3, 3):
+        some = body[(of_body == group).all(axis=1)]
+        number = _number((np.array(group) - index + 1).T % 3 - 1)
+        for axis in range(2):
+            nudged.u[...] = state.u
+            nudged.u.reshape(2, -1)[axis, some] += NUDGE
+            moved = moves.at(nudged, step).reshape(2, -1)[:, place]
+            stencils[every, number, :, axis] = ((still - moved) / NUDGE).T
+    sizes = np.maximum.reduce(np.abs(stencils).reshape(-1, 4).T).reshape(-1, WINDOW)
+    stencils[sizes <= NOISE * sizes.max()] = 0.0
+    code[place] = np.where(stencils[:, OWN].any(axis=(1, 2)), every, -1)
+    scale = np.broadcast_to(np.eye(2).ravel(), (len(place), 4))
+    return _on(grid, code, kind == LEADER, stencils.reshape(-1, WINDOW, 4), scale.copy())
 
 
-def primitive_step(scene: Scene, slot: Slot) -> Index:
-    """Where a slot leads in the primitive basis."""
-    found = scene.raster.lattice.cell().offset(slot.source, slot.target, slot.cell)
-    return found.primitive
+def _kinds(scene: Scene, step: int) -> NDArray[np.int8]:
+    """Of flat places, with the roles of a step."""
+    kind = scene.raster.kind.ravel().copy()
+    for leading in scene.leading:
+        if leading.group.leads(step):
+            kind[leading.place] = LEADER
+    return kind
+
+
+def _on(
+    grid: PrimitiveRaster, code: Integers, led: Any, stencils: Floats, scale: Floats
+) -> StencilMatrix:
+    """The matrix on a raster, of what is known by flat places of the scene's."""
+    kind = np.select([code >= 0, led], [FREE, LED], OUTSIDE).astype(np.int8)
+    if grid.is_the_scenes:
+        shape = grid.shape
+        return StencilMatrix(code.reshape(shape), kind.reshape(shape), stencils, scale, None, None)
+    place = np.flatnonzero(kind != OUTSIDE)
+    at = grid.places(place)
+    codes, kinds = np.full(grid.shape, -1, np.int32), np.zeros(grid.shape, np.int8)
+    codes.ravel()[at], kinds.ravel()[at] = code[place], kind[place]
+    free = kind[place] == FREE
+    return StencilMatrix(codes, kinds, stencils, scale, at[free], place[free])
 
 
 class _Assembly:
     """Puts the stencils together; particles are looked up by their flat place on the scene's
     raster."""
 
-    def __init__(self, scene: Scene, state: State, step: int, grid: _Raster) -> None:
+    def __init__(self, scene: Scene, state: State, step: int, grid: PrimitiveRaster) -> None:
         self._scene, self._state, self._grid = scene, state, grid
-        raster = scene.raster
-        self._kind = raster.kind.ravel().copy()
-        for leading in scene.leading:
-            if leading.group.leads(step):
-                self._kind[leading.place] = LEADER
+        self._kind = _kinds(scene, step)
         self._followers = np.flatnonzero(self._kind == FOLLOWER)
         self._code = np.full(self._kind.size, -1, np.int32)
         self._stencils, self._scale = list[Floats](), list[Floats]()
@@ -141,19 +142,7 @@ class _Assembly:
             self._code, np.concatenate(self._stencils), np.concatenate(self._scale)
         )
         stencils, scale = (v.reshape(*v.shape[:-2], 4) for v in (stencils, scale))
-        kind = np.select([code >= 0, self._kind == LEADER], [FREE, LED], OUTSIDE).astype(np.int8)
-        if self._grid.is_the_scenes:
-            shape = self._grid.shape
-            return StencilMatrix(
-                code.reshape(shape), kind.reshape(shape), stencils, scale, None, None
-            )
-        place = np.flatnonzero(kind != OUTSIDE)
-        at = self._grid.places(place)
-        codes = np.full(self._grid.shape, -1, np.int32)
-        kinds = np.zeros(self._grid.shape, np.int8)
-        codes.ravel()[at], kinds.ravel()[at] = code[place], kind[place]
-        free = kind[place] == FREE
-        return StencilMatrix(codes, kinds, stencils, scale, at[free], place[free])
+        return _on(self._grid, code, self._kind == LEADER, stencils, scale)
 
     def _add(self, place: Indices, responses: list[Response]) -> bool:
         """Takes the stencils of one sublattice in; False where they do not fit."""

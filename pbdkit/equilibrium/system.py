@@ -35,6 +35,10 @@ class StuckError(Exception):
     """An iteration got nowhere."""
 
 
+class IndefiniteError(StuckError):
+    """Some way does not lead uphill: the body is not stable there."""
+
+
 class System(ABC):
     """A c = move for the followers of a scene, linearised at a state with the roles of a step."""
 

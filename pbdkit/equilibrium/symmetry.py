@@ -1,0 +1,52 @@
+"""Whether a matrix of stencils is symmetric, and rows multiplied so that it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pbdkit.equilibrium.multigrid import kernels
+from pbdkit.equilibrium.stencil_matrix import StencilMatrix
+
+EXACT, DIFFERENCED = 1e-9, 1e-5
+"""Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
+differences."""
+DIGITS = 13
+"""Of factors of rows; rounding decides the others."""
+
+
+def is_symmetric(matrix: StencilMatrix, alike: float = EXACT) -> bool:
+    """Up to a share of its largest entry."""
+    largest = float(np.abs(matrix.stencils).max())
+    return bool(kernels().asymmetry(matrix.code, matrix.stencils) <= alike * largest)
+
+
+def balanced(matrix: StencilMatrix, alike: float = EXACT) -> StencilMatrix:
+    """The matrix with its rows multiplied so that it is symmetric, where that can be: those of
+    particles with fewer neighbours, of which each has more weight. What is left of a difference is
+    shared by both sides."""
+    if is_symmetric(matrix):
+        return matrix
+    factor = np.empty(matrix.code.shape)
+    if kernels().balance(matrix.code, matrix.stencils, factor):
+        return matrix
+    lone = np.nonzero(matrix.code > 0)
+    row, times = matrix.code[lone], factor[lone]
+    number = np.arange(len(row))
+    if len(row) >= len(matrix.stencils):
+        pairs = np.stack([row, times.round(DIGITS)], axis=1)
+        kinds, number = np.unique(pairs, axis=0, return_inverse=True)
+        row, times = kinds[:, 0].astype(int), kinds[:, 1]
+    code = matrix.code.copy()
+    code[lone] = 1 + number.ravel()
+    stencils, scale = (
+        np.concatenate([table[:1], table[row] * times.reshape(-1, *[1] * (table.ndim - 1))])
+        for table in (matrix.stencils, matrix.scale)
+    )
+    found = replace(matrix, code=code, stencils=stencils, scale=scale)
+    if not is_symmetric(found, alike):
+        return matrix
+    if alike > EXACT:
+        kernels().symmetrise(code, stencils)
+    return found
