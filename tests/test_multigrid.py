@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import linear_solver, linearisation
+from pbdkit.equilibrium import increments, linear_solver, linearisation, moves
 from pbdkit.equilibrium.increments import settle
 from pbdkit.interfaces import FollowerRule, Vector
 from pbdkit.scene.scene import build_scene
@@ -177,3 +177,30 @@ def test_the_method_follows_the_size():
         scene = build_scene(pbdkit.Experiment(**sheet(n, n)))
         assert (scene.raster.count > linearisation.LARGEST_DIRECT) == (n > 100)
         assert settle(scene, initial_state(scene)).method == method
+
+
+NOT_LINEAR = {
+    "springs": sheet(20, rule={"type": "springs"}, **HEXAGONAL),
+    "distance-weighted": sheet(20, rule={"type": "distance-weighted"}, frame={"type": "mean"}),
+}
+
+
+@pytest.mark.parametrize("name", NOT_LINEAR)
+def test_rules_that_are_not_linear_are_followed_on_grids(name, monkeypatch):
+    """By differences of compiled moves: where the direct solver leads."""
+    exact, _ = solved(NOT_LINEAR[name], "lu", 1e-10)
+    monkeypatch.setattr(moves, "LARGEST_BY_NUMPY", 0)
+    u, certificate = solved(NOT_LINEAR[name], tolerance=1e-7)
+    assert certificate["method"].startswith("multigrid, ")
+    assert np.hypot(*(u - exact).T).max() <= certificate["distance"] <= 1.1e-7
+    assert certificate["iterations"] <= 6
+
+
+def test_grids_tell_a_body_that_buckles(monkeypatch):
+    monkeypatch.setattr(moves, "LARGEST_BY_NUMPY", 0)
+    monkeypatch.setattr(increments, "MOST_ROUNDS", 2)
+    push = {"type": "displace", "displacement": [-4.0, 0.0]}
+    leaders = [PULL[0], {"select": {"edge": "right"}, "motion": push}]
+    pressed = sheet(20, 5, rule={"type": "springs"}, leaders=leaders, **HEXAGONAL)
+    with pytest.raises(pbdkit.DivergedError, match="several equilibria meet there"):
+        solved(pressed)

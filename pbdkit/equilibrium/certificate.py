@@ -59,6 +59,19 @@ class Certificate:
         )
 
 
+UNKNOWN = Certificate(
+    method="nothing to solve",
+    iterations=0,
+    inner_iterations=0,
+    residual=math.inf,
+    distance=math.inf,
+    share=math.inf,
+    bound="nothing to solve",
+    linearised=True,
+)
+"""Where a search did not even begin."""
+
+
 def scale_of(scene: Scene, start: State) -> float:
     """The largest prescribed displacement: of the leaders, or of the start; the lattice's spacing
     where nothing is prescribed but rest."""

@@ -64,6 +64,8 @@ class LatticeSystem(System):
         self._symmetric = is_symmetric(matrix)
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids)
+        self.may_be_stable = not self._symmetric or self._grids.is_definite()
+        """Not where coarse ways already lead downhill."""
         self._smallest = 1.0
         self._iterations = 0
 
@@ -126,7 +128,7 @@ class LatticeSystem(System):
         if self._symmetric:
             random = np.random.default_rng(0).uniform(-1.0, 1.0, self._shape)
             try:
-                self._found(self._pull(random), lambda d: len(d.jumps) >= ENOUGH)
+                self._found(self._pull(random), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
             except IndefiniteError:
                 return False
         return True
@@ -143,6 +145,8 @@ class LatticeSystem(System):
 
     def _farthest(self, left: float) -> float:
         """How far any place moves by what has this rᵀ B r."""
+        if min(left, self._compliance) < 0.0:
+            raise IndefiniteError
         return math.sqrt(SAFETY / self._smallest * self._compliance * left)
 
     @cached_property
@@ -212,6 +216,10 @@ def lattice_system(
     try:
         system = LatticeSystem(balanced(matrix, alike), state.u.shape, watch)
     except FloatingError:
+        return None
+    if not system.may_be_stable:
+        if state.u.any():
+            raise IndefiniteError
         return None
     if moves:
         put = random_displacements(scene, NUDGE)

@@ -148,7 +148,16 @@ class Multigrid:
             raise FloatingError from None
         if not np.abs(inverse).max() * np.abs(K).max() * SINGULAR < 1.0:
             raise FloatingError
+        self._coarsest = K
         self._inverse, self._gives_way = inverse.astype(self.precision), inverse.diagonal()
+
+    def is_definite(self) -> bool:
+        """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
+        tell: one that is not there is not on the finest either."""
+        own = self.grid().stencils[:, OWN].reshape(-1, 2, 2)
+        K = (self._coarsest + self._coarsest.T) / 2.0
+        alone = (own[:, 0, 0] > 0.0) & (np.linalg.det(own) > 0.0)
+        return bool(alone.all()) and bool(np.linalg.eigvalsh(K)[0] > 0.0)
 
     def __len__(self) -> int:
         """How many grids there are."""

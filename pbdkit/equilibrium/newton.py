@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate
+from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, UNKNOWN, Certificate
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
@@ -84,7 +84,11 @@ class Finder:
         a little: by Newton's iteration, as long as each correction is much smaller than the last,
         so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
-            return _Newton(self, state, step, before).run()
+            try:
+                search = _Newton(self, state, step, before)
+            except IndefiniteError:
+                raise UnconvergedError(UNSTABLE, UNKNOWN) from None
+            return search.run()
 
 
 class _Search(ABC):
