@@ -84,6 +84,15 @@ def coarse_codes(code, kind, halved, out):
 
 
 @njit(cache=KEPT)
+def beside(q, half):
+    """The places of the next grid between which a place lies that is q away from one of them, and
+    the share of the first: numbers of a stencil, -1, 0 or 1."""
+    if not half:
+        return q, q, 1.0
+    return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
+
+
+@njit(cache=KEPT)
 def galerkin(code, own, coarse, halved, out):
     """out[k] = the stencil of Pᵀ K P at the place of the next grid that is numbered k."""
     a1, b1 = halved
@@ -102,28 +111,33 @@ def galerkin(code, own, coarse, halved, out):
                         da, db = s // 3 - 1, s % 3 - 1
                         if code[i + da, j + db] < 0:
                             continue
-                        for t in range(9):
-                            # How far the place at s lies from place t of the next grid.
-                            fa = abs(a + da - (a1 + 1) * (t // 3 - 1)) / (a1 + 1)
-                            fb = abs(b + db - (b1 + 1) * (t % 3 - 1)) / (b1 + 1)
-                            if fa < 1.0 and fb < 1.0:
-                                w = hangs * (1.0 - fa) * (1.0 - fb)
-                                for e in range(4):
-                                    out[k, t, e] += w * own[code[i, j], s, e]
+                        row, next_row, of_row = beside(a + da, a1)
+                        place, next_place, of_place = beside(b + db, b1)
+                        for ta, wa in ((row, of_row), (next_row, 1.0 - of_row)):
+                            for tb, wb in ((place, of_place), (next_place, 1.0 - of_place)):
+                                w = hangs * wa * wb
+                                if w > 0.0:
+                                    for e in range(4):
+                                        out[k, 3 * ta + tb + 4, e] += w * own[code[i, j], s, e]
 
 
 @njit(cache=KEPT)
 def asymmetry(code, own):
     """The largest entry of K - Kᵀ. Of places with the stencil of most one pair a direction is
     enough."""
-    worst, seen = 0.0, np.zeros(9, np.bool_)
+    worst, seen, unseen = 0.0, np.zeros(9, np.bool_), 9
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
+            here = code[i, j]
+            if here < 0 or (here == 0 and not unseen):
+                continue
             for s in range(9):
-                here, there = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
-                if here < 0 or there < 0 or (here == 0 and there == 0 and seen[s]):
+                there = code[i + s // 3 - 1, j + s % 3 - 1]
+                if there < 0 or (here == 0 and (there > 0 or seen[s])):
                     continue
-                seen[s] = seen[s] or (here == 0 and there == 0)
+                if here == 0:
+                    seen[s] = True
+                    unseen -= 1
                 one, other = own[here, s], own[there, 8 - s]
                 for e in range(4):
                     worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))

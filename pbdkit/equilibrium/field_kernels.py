@@ -81,6 +81,15 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
                 x[v, i, place[e]] += row[place[e]]
 
 
+@njit(**FAST)
+def differences(still, moved, place, number, share, axis, out):
+    """share · (still - moved) at flat places, into place `number` of each one's stencil, as what
+    moves along an axis do."""
+    for n in range(place.size):
+        for v in range(2):
+            out[n, number[n], v, axis] = share * (still[v, place[n]] - moved[v, place[n]])
+
+
 def run():
     """Calls each of these once, so that all are compiled."""
     r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
@@ -88,5 +97,7 @@ def run():
     turn(1.0, z, 0.0, r)
     dot(r, z)
     dot(r, r)
+    differences(r.reshape(2, -1), r.reshape(2, -1), np.zeros(1, int), np.zeros(1, int), 1.0, 0,
+                np.zeros((1, 9, 2, 2)))  # fmt: skip
     rows, some = np.zeros(9, np.int64), np.zeros(1, np.int32)
     prolong(rows, some, some, rows, some, np.zeros((2, 6, 6), np.float32), (1, 1), z)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.multigrid import Multigrid, kernels
+from pbdkit.equilibrium.grid_functions import kernels
+from pbdkit.equilibrium.multigrid import Multigrid
 
 Floats = NDArray[np.floating[Any]]
 MOST = 400

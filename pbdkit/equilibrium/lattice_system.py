@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grid_functions import kernels
 from pbdkit.equilibrium.lattice_krylov import (
     BiconjugateGradients,
     ConjugateGradients,
@@ -26,7 +27,7 @@ from pbdkit.equilibrium.lattice_krylov import (
     Krylov,
 )
 from pbdkit.equilibrium.moves import Moves, random_displacements
-from pbdkit.equilibrium.multigrid import FloatingError, Multigrid, kernels
+from pbdkit.equilibrium.multigrid import FloatingError, Multigrid
 from pbdkit.equilibrium.stencil_matrix import (
     FREE,
     LED,
@@ -231,15 +232,14 @@ def lattice_system(
 
 def leads_one_way(matrix: StencilMatrix) -> bool:
     """Whether one axis moves the other and not the reverse: they are better solved in turn."""
-    couples = np.abs(matrix.stencils[..., 1:3]).max(axis=(0, 1)) > 0.0
-    return bool(couples[0] != couples[1])
+    return bool(matrix.stencils[..., 1].any() != matrix.stencils[..., 2].any())
 
 
 def is_held(matrix: StencilMatrix) -> bool:
     """Whether every connected part of the body touches a leader, and no neighbours are apart."""
     from scipy.ndimage import binary_dilation, label
 
-    bonds = np.any(matrix.stencils, axis=-1)
+    bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
     lone = np.nonzero(matrix.code > 0)
     of_lone = bonds[matrix.code[lone]]
     known = bonds.any(axis=0)

@@ -6,16 +6,13 @@ to them (Galerkin). Where one direction is much stiffer, only that one is made c
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.resources import files
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grid_functions import kernels
 from pbdkit.equilibrium.stencil_matrix import OWN, StencilMatrix, inverses
-from pbdkit.stepping.compiled.kernel_cache import load_kernel
 
 Floats = NDArray[np.floating[Any]]
 COARSEST = 200
@@ -29,16 +26,6 @@ NARROW = 5
 SINGULAR = 1e-12
 """One part of what the inverse of the coarsest grid may magnify; a body that is not held gives way
 without end."""
-
-
-@cache
-def kernels() -> SimpleNamespace:
-    """The compiled functions: how grids are made, what is done on one, and with whole fields."""
-    found: dict[str, Any] = {}
-    for name in ("coarsening", "grid", "field"):
-        file = files("pbdkit.equilibrium").joinpath(f"{name}_kernels.py")
-        found |= load_kernel(file.read_text(encoding="utf-8"), {}, ()).__globals__
-    return SimpleNamespace(**found)
 
 
 class FloatingError(Exception):

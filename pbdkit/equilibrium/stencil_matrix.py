@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import frame_matrices
 from pbdkit.analysis.linear_response import Response, by_sublattice, respond
+from pbdkit.equilibrium.grid_functions import kernels
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.primitive_raster import PrimitiveRaster, primitive_step
 from pbdkit.interfaces import Calibrated
@@ -73,19 +74,21 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
         return None
     place = np.flatnonzero(kind == FOLLOWER)
     body = np.flatnonzero((kind == FOLLOWER) | (kind == LEADER))
-    index, code = grid.index(place), np.full(kind.size, -1, np.int32)
-    of_body = grid.index(body) % 3
+    code = np.full(kind.size, -1, np.int32)
+    group, groups = (_number(grid.index(some).T % 3 - 1) for some in (place, body))
+    # Where in a stencil the particles of one group lie, seen from those of another.
+    ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
+    numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
     nudged = replace(state, u=state.u.copy())
-    still = moves.at(nudged, step).reshape(2, -1)[:, place]
-    for group in np.ndindex(3, 3):
-        some = body[(of_body == group).all(axis=1)]
-        number = _number((np.array(group) - index + 1).T % 3 - 1)
+    still = moves.at(nudged, step).reshape(2, -1).copy()
+    for n in range(WINDOW):
+        some, number = body[groups == n], numbers[n][group]
         for axis in range(2):
             nudged.u[...] = state.u
             nudged.u.reshape(2, -1)[axis, some] += NUDGE
-            moved = moves.at(nudged, step).reshape(2, -1)[:, place]
-            stencils[every, number, :, axis] = ((still - moved) / NUDGE).T
+            moved = moves.at(nudged, step).reshape(2, -1)
+            kernels().differences(still, moved, place, number, 1.0 / NUDGE, axis, stencils)
     sizes = np.maximum.reduce(np.abs(stencils).reshape(-1, 4).T).reshape(-1, WINDOW)
     stencils[sizes <= NOISE * sizes.max()] = 0.0
     code[place] = np.where(stencils[:, OWN].any(axis=(1, 2)), every, -1)

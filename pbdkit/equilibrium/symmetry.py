@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbdkit.equilibrium.multigrid import kernels
+from pbdkit.equilibrium.grid_functions import kernels
 from pbdkit.equilibrium.stencil_matrix import StencilMatrix
 
 EXACT, DIFFERENCED = 1e-9, 1e-5

@@ -1,0 +1,20 @@
+"""The compiled functions of grids, loaded when first used."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from types import SimpleNamespace
+from typing import Any
+
+from pbdkit.stepping.compiled.kernel_cache import load_kernel
+
+
+@cache
+def kernels() -> SimpleNamespace:
+    """The compiled functions: how grids are made, what is done on one, and with whole fields."""
+    found: dict[str, Any] = {}
+    for name in ("coarsening", "grid", "field"):
+        file = files("pbdkit.equilibrium").joinpath(f"{name}_kernels.py")
+        found |= load_kernel(file.read_text(encoding="utf-8"), {}, ()).__globals__
+    return SimpleNamespace(**found)
