@@ -69,7 +69,7 @@ UNKNOWN = Certificate(
     bound="nothing to solve",
     linearised=True,
 )
-"""Where a search did not even begin."""
+"""Where a search met a body that is not stable."""
 
 
 def scale_of(scene: Scene, start: State) -> float:

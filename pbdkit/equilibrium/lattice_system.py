@@ -29,15 +29,19 @@ from pbdkit.equilibrium.lattice_krylov import (
 from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.multigrid import FloatingError, Multigrid
 from pbdkit.equilibrium.stencil_matrix import (
-    FREE,
-    LED,
     NUDGE,
-    OUTSIDE,
     StencilMatrix,
     differenced_matrix,
     stencil_matrix,
 )
-from pbdkit.equilibrium.symmetry import DIFFERENCED, EXACT, balanced, is_symmetric
+from pbdkit.equilibrium.stencil_properties import (
+    DIFFERENCED,
+    EXACT,
+    balanced,
+    is_held,
+    is_symmetric,
+    leads_one_way,
+)
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -52,6 +56,8 @@ FAITHFUL = 1e-3
 """The share of what all moves at once are by which stencils from differences may be off."""
 NEAR = 0.01
 """The share of the first jump at which an iteration has found most of an error."""
+TURNS = 6
+"""Of inverse iteration."""
 ENOUGH = 8
 """Iterations that tell how far a place gives way."""
 
@@ -124,15 +130,20 @@ class LatticeSystem(System):
         """All is held."""
 
     def is_stable(self) -> bool:
-        """Conjugate gradients see a negative eigenvalue, from the load and from a random one; those
-        of a matrix that is not symmetric are not looked at."""
+        """Conjugate gradients see a negative eigenvalue, from the load and from a random one. Where
+        the matrix is not symmetric, those nearest to 0 are looked at."""
+        v: Floats = np.random.default_rng(0).uniform(-1.0, 1.0, self._shape)
         if self._symmetric:
-            random = np.random.default_rng(0).uniform(-1.0, 1.0, self._shape)
             try:
-                self._found(self._pull(random), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
+                self._found(self._pull(v), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
             except IndefiniteError:
                 return False
-        return True
+            return True
+        before = v
+        for _ in range(TURNS):
+            found = self._found(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
+            before, v = v, self._planes(found.x / (np.abs(found.x).max() or 1.0))
+        return bool((v * before).sum() > 0.0)
 
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
         found: Found = self._solver.solve(r, done)
@@ -228,26 +239,3 @@ def lattice_system(
         if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
             return None
     return system
-
-
-def leads_one_way(matrix: StencilMatrix) -> bool:
-    """Whether one axis moves the other and not the reverse: they are better solved in turn."""
-    return bool(matrix.stencils[..., 1].any() != matrix.stencils[..., 2].any())
-
-
-def is_held(matrix: StencilMatrix) -> bool:
-    """Whether every connected part of the body touches a leader, and no neighbours are apart."""
-    from scipy.ndimage import binary_dilation, label
-
-    bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
-    lone = np.nonzero(matrix.code > 0)
-    of_lone = bonds[matrix.code[lone]]
-    known = bonds.any(axis=0)
-    for s in np.flatnonzero(known):
-        there = matrix.kind[lone[0] + s // 3 - 1, lone[1] + s % 3 - 1] != OUTSIDE
-        if (there & ~of_lone[:, s]).any():
-            return False
-    pattern = (known | known[::-1]).reshape(3, 3)
-    parts, count = label(matrix.kind == FREE, structure=pattern)
-    touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
-    return bool(np.count_nonzero(touched) == count)

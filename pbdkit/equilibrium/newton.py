@@ -85,10 +85,9 @@ class Finder:
         so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
             try:
-                search = _Newton(self, state, step, before)
+                return _Newton(self, state, step, before).run()
             except IndefiniteError:
                 raise UnconvergedError(UNSTABLE, UNKNOWN) from None
-            return search.run()
 
 
 class _Search(ABC):
@@ -208,14 +207,10 @@ class _Newton(_Search):
     def run(self) -> Certificate:
         """Raises UnconvergedError where corrections do not become smaller fast, or where what they
         lead to is not stable."""
-        try:
-            self._go_ahead()
-            self._correct()
-            certificate = self._certified()
-            stable = self._system.is_stable()
-        except IndefiniteError:
-            stable, certificate = False, self._certificate(math.inf)
-        if not stable:
+        self._go_ahead()
+        self._correct()
+        certificate = self._certified()
+        if not self._system.is_stable():
             raise UnconvergedError(UNSTABLE, certificate)
         return certificate
 

@@ -1,4 +1,4 @@
-"""Whether a matrix of stencils is symmetric, and rows multiplied so that it is."""
+"""What a matrix of stencils is: symmetric, perhaps once rows are multiplied; held by leaders."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pbdkit.equilibrium.grid_functions import kernels
-from pbdkit.equilibrium.stencil_matrix import StencilMatrix
+from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
 
 EXACT, DIFFERENCED = 1e-9, 1e-5
 """Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
@@ -50,3 +50,26 @@ def balanced(matrix: StencilMatrix, alike: float = EXACT) -> StencilMatrix:
     if alike > EXACT:
         kernels().symmetrise(code, stencils)
     return found
+
+
+def leads_one_way(matrix: StencilMatrix) -> bool:
+    """Whether one axis moves the other and not the reverse: they are better solved in turn."""
+    return bool(matrix.stencils[..., 1].any() != matrix.stencils[..., 2].any())
+
+
+def is_held(matrix: StencilMatrix) -> bool:
+    """Whether every connected part of the body touches a leader, and no neighbours are apart."""
+    from scipy.ndimage import binary_dilation, label
+
+    bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
+    lone = np.nonzero(matrix.code > 0)
+    of_lone = bonds[matrix.code[lone]]
+    known = bonds.any(axis=0)
+    for s in np.flatnonzero(known):
+        there = matrix.kind[lone[0] + s // 3 - 1, lone[1] + s % 3 - 1] != OUTSIDE
+        if (there & ~of_lone[:, s]).any():
+            return False
+    pattern = (known | known[::-1]).reshape(3, 3)
+    parts, count = label(matrix.kind == FREE, structure=pattern)
+    touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
+    return bool(np.count_nonzero(touched) == count)
