@@ -6,7 +6,6 @@ value a component. They use + - * /, the functions of numpy, and choose with `wh
 
 from __future__ import annotations
 
-import operator
 from collections import namedtuple
 from collections.abc import Callable, Iterable
 from typing import Any, Self
@@ -35,25 +34,28 @@ class Components(tuple[Any, ...]):
 
     def each(self, function: Callable[..., Any], *others: Iterable[Any]) -> Self:
         """The vector of function(component, ...), component by component."""
-        return type(self)(*(function(*parts) for parts in zip(self, *others, strict=True)))
+        return self._of([function(*parts) for parts in zip(self, *others, strict=True)])
+
+    def _of(self, components: list[Any]) -> Self:
+        return tuple.__new__(type(self), components)
 
     def __add__(self, other: Any) -> Self:
-        return self.each(operator.add, other)
+        return self._of([a + b for a, b in zip(self, other, strict=True)])
 
     def __sub__(self, other: Any) -> Self:
-        return self.each(operator.sub, other)
+        return self._of([a - b for a, b in zip(self, other, strict=True)])
 
     def __neg__(self) -> Self:
-        return self.each(operator.neg)
+        return self._of([-component for component in self])
 
     def __mul__(self, factor: Any) -> Self:
-        return type(self)(*(component * factor for component in self))
+        return self._of([component * factor for component in self])
 
     def __rmul__(self, factor: Any) -> Self:
-        return type(self)(*(factor * component for component in self))
+        return self._of([factor * component for component in self])
 
     def __truediv__(self, divisor: Any) -> Self:
-        return type(self)(*(component / divisor for component in self))
+        return self._of([component / divisor for component in self])
 
 
 class Vector(namedtuple("Vector", ("x", "y")), Components):
