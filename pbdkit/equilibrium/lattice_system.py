@@ -39,7 +39,6 @@ from pbdkit.equilibrium.stencil_properties import (
     EXACT,
     balanced,
     is_held,
-    is_symmetric,
     leads_one_way,
 )
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
@@ -65,10 +64,12 @@ ENOUGH = 8
 class LatticeSystem(System):
     """The system by multigrid. Raises FloatingError where leaders do not hold all of the body."""
 
-    def __init__(self, matrix: StencilMatrix, shape: tuple[int, ...], watch: Watch) -> None:
+    def __init__(
+        self, matrix: StencilMatrix, symmetric: bool, shape: tuple[int, ...], watch: Watch
+    ) -> None:
         self._matrix, self._shape, self._watch = matrix, shape, watch
         self._grids = Multigrid(matrix)
-        self._symmetric = is_symmetric(matrix)
+        self._symmetric = symmetric
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()
@@ -226,7 +227,7 @@ def lattice_system(
     if matrix is None or leads_one_way(matrix) or not is_held(matrix):
         return None
     try:
-        system = LatticeSystem(balanced(matrix, alike), state.u.shape, watch)
+        system = LatticeSystem(*balanced(matrix, alike), state.u.shape, watch)
     except FloatingError:
         return None
     if not system.may_be_stable:

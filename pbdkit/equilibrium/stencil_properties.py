@@ -18,19 +18,19 @@ DIGITS = 13
 
 def is_symmetric(matrix: StencilMatrix, alike: float = EXACT) -> bool:
     """Up to a share of its largest entry."""
-    largest = float(np.abs(matrix.stencils).max())
+    largest = max(float(matrix.stencils.max()), -float(matrix.stencils.min()))
     return bool(kernels().asymmetry(matrix.code, matrix.stencils) <= alike * largest)
 
 
-def balanced(matrix: StencilMatrix, alike: float = EXACT) -> StencilMatrix:
-    """The matrix with its rows multiplied so that it is symmetric, where that can be: those of
-    particles with fewer neighbours, of which each has more weight. What is left of a difference is
-    shared by both sides."""
+def balanced(matrix: StencilMatrix, alike: float = EXACT) -> tuple[StencilMatrix, bool]:
+    """The matrix with its rows multiplied so that it is symmetric, and whether that can be: those
+    of particles with fewer neighbours, of which each has more weight. What is left of a difference
+    is shared by both sides."""
     if is_symmetric(matrix):
-        return matrix
+        return matrix, True
     factor = np.empty(matrix.code.shape)
     if kernels().balance(matrix.code, matrix.stencils, factor):
-        return matrix
+        return matrix, False
     lone = np.nonzero(matrix.code > 0)
     row, times = matrix.code[lone], factor[lone]
     number = np.arange(len(row))
@@ -46,10 +46,10 @@ def balanced(matrix: StencilMatrix, alike: float = EXACT) -> StencilMatrix:
     )
     found = replace(matrix, code=code, stencils=stencils, scale=scale)
     if not is_symmetric(found, alike):
-        return matrix
+        return matrix, False
     if alike > EXACT:
         kernels().symmetrise(code, stencils)
-    return found
+    return found, True
 
 
 def leads_one_way(matrix: StencilMatrix) -> bool:
