@@ -125,7 +125,7 @@ def certificates(rng: np.random.Generator, _: int, found: Counts) -> None:
     of = LATTICES[str(rng.choice(list(LATTICES)))]
     elastic = {"type": "elastic", "poisson_ratio": float(rng.uniform(-0.5, 0.45))}
     rule = elastic if rng.random() < 0.5 else {"type": "barycentre"}
-    frames = ["mean", "none", "mirror", *["natural"] * (rule is elastic)]
+    frames = ["mean", "none", "first", *["natural"] * (rule is elastic)]
     of = of | {"rule": rule, "frame": {"type": str(rng.choice(frames))}}
     motion = {"type": "displace", "displacement": rng.normal(size=2).tolist()}
     known = []
