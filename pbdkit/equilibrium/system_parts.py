@@ -151,6 +151,15 @@ class Held(Part):
                 x = self._solver.solve(r, ACCURACY)
         return x
 
+    def farthest(self, r: Floats, rounding: float) -> float:
+        """Of what an iteration leaves, some times as far as it leads if it goes on."""
+        if not isinstance(self._solver, Krylov):
+            return super().farthest(r, rounding)
+        x = self._inverted(r)
+        ahead = self._inverted(r - self._matrix @ x)
+        found, left = (float(np.abs(way).max(initial=0.0)) for way in (x, ahead))
+        return found + SAFETY * left + self._spread * rounding
+
 
 class Floating(Part):
     """A part with modes that no step changes: what their invariants Yᵀ u, Yᵀ A = 0, were, they
