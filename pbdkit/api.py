@@ -21,6 +21,7 @@ from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
+from pbdkit.runs.tuning import tuned
 from pbdkit.scene.scene import build_scene
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def _warn(texts: Iterable[str]) -> None:
 def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
-    return Analysis(build_scene(_experiment(experiment, components)))
+    return Analysis(tuned(build_scene(_experiment(experiment, components))))
 
 
 def identify(experiment: Given, *, components: Components = ()) -> Identity:
@@ -90,7 +91,7 @@ def identify(experiment: Given, *, components: Components = ()) -> Identity:
     elastic body, with its constants, from the rule's answer to plane waves."""
     from pbdkit.identity.identification import identified
 
-    return identified(build_scene(_experiment(experiment, components)))
+    return identified(tuned(build_scene(_experiment(experiment, components))))
 
 
 def rerun(

@@ -21,18 +21,20 @@ from pbdkit.scene.sizes import MIB, sizes_of
 
 @dataclass(frozen=True)
 class Forecast:
-    """Counts, with followers at step 1; memory and output in MiB; what the analysis found, None
-    where it cannot tell or it would take too long; with memory, the period in steps of the slowest
-    mode that swings and by what it shrinks a step, None where nothing swings; by how much the body
-    trails its equilibrium in the leaders' fastest steps, in lattice units, once that is steady and
-    when these steps end, None where no leader moves steadily; whether what the analysis found is
-    exact, or linearised at the start; warnings."""
+    """Counts, with followers at step 1; memory and output in MiB; the solver's relaxation and
+    memory; what the analysis found, None where it cannot tell or it would take too long; with
+    memory, the period in steps of the slowest mode that swings and by what it shrinks a step, None
+    where nothing swings; by how much the body trails its equilibrium in the leaders' fastest steps,
+    in lattice units, once that is steady and when these steps end, None where no leader moves
+    steadily; whether what the analysis found is exact, or linearised at the start; warnings."""
 
     particles: int
     followers: int
     bonds: int
     memory_mib: float
     output_mib: float
+    relaxation: float
+    memory: float
     spectral_radius: float | None
     smallest_eigenvalue: float | None
     largest_stable_relaxation: float | None
@@ -70,6 +72,8 @@ def forecast(scene: Scene) -> Forecast:
         bonds=count_bonds(scene.raster, scene.neighbourhood),
         memory_mib=round(sizes.memory / MIB, 3),
         output_mib=round(sizes.output / MIB, 3),
+        relaxation=solver.relaxation,
+        memory=solver.memory,
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,

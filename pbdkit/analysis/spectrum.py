@@ -133,6 +133,26 @@ def just_below(matrix: Any, edge: float) -> Complex:
     return np.concatenate([np.empty(0, complex), *found])
 
 
+def has_symmetric_rows(matrix: Any) -> bool:
+    """Whether positive factors of its rows make a sparse matrix symmetric: its eigenvalues are real
+    then."""
+    from scipy.sparse import diags_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    _, label = connected(matrix, strongly=False)
+    factor = np.ones(matrix.shape[0])
+    for root in np.unique(label, return_index=True)[1]:
+        order, before = breadth_first_order(matrix, root, directed=False)
+        others, known = order[1:], before[order[1:]]
+        there, back = (np.ravel(matrix[i, j]) for i, j in ((known, others), (others, known)))
+        if not (there * back > 0.0).all():
+            return False
+        for i, j, ratio in zip(others, known, there / back, strict=True):
+            factor[i] = factor[j] * ratio
+    even = diags_array(factor) @ matrix
+    return bool(abs(even - even.T).max() <= 1e-9 * abs(even).max())
+
+
 def _groups(matrix: Any) -> Iterator[Any]:
     """The strongly connected diagonal blocks, equal ones once."""
     count, label = connected(matrix, strongly=True)

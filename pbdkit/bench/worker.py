@@ -26,6 +26,7 @@ from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.results.progress import Watch
 from pbdkit.runs.course import peak_memory
+from pbdkit.runs.tuning import tuned
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene, build_scene
@@ -81,7 +82,7 @@ def _step(job: Job) -> Job:
     experiment, at = load(job["experiment"], settings=job["settings"]), job["at"]
     imports = _import(*[COMPILED] * (experiment.stepping.engine == "compiled"))
     begun = _clock()
-    scene = build_scene(experiment)
+    scene = tuned(build_scene(experiment))
     built = _clock() - begun
     engine, _ = make_engine(scene, choose(scene))
     setup_s, _ = _clock() - begun

@@ -66,10 +66,11 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     from pbdkit.analysis.forecast import forecast
     from pbdkit.api import load
     from pbdkit.runs.course import rehearse
+    from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
 
     loaded = load(experiment, settings=settings)
-    scene = build_scene(loaded)
+    scene = tuned(build_scene(loaded))
     rehearse(scene)
     found = forecast(scene)
     if as_json:
@@ -82,6 +83,11 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     click.echo(f"  bonds      {found.bonds}")
     click.echo(f"  memory     about {found.memory_mib:.3g} MiB")
     click.echo(f"  output     about {found.output_mib:.3g} MiB")
+    if loaded.stepping.is_open:
+        why = "the rule is not linear or bonds can break"
+        near = "" if found.exact else f", of the step linearised at rest: {why}"
+        chosen = f"relaxation {found.relaxation:.6g}, memory {found.memory:.6g}"
+        click.echo(f"  chosen     {chosen}{near}")
     if found.spectral_radius is not None:
         verdict = "stable" if found.stable else "not stable"
         near = "" if found.exact else ", linearised at the start"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import reduce
 from operator import or_
 from typing import Any
@@ -33,12 +33,30 @@ _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20}
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """The error to raise instead: a line a fault, the first few of them."""
-    found = error.errors(include_url=False)
+    found = list(_told_once(error.errors(include_url=False)))
     faults = [f for f in found if f["type"] != "too_short" or not _follows(f, found)]
     lines = [source.message(*_described(fault)) for fault in faults[:SHOWN]]
     if len(faults) > SHOWN:
         lines.append(f"... and {len(faults) - SHOWN} more")
     return ExperimentError("\n".join(lines), _described(faults[0])[0])
+
+
+AUTO = "literal['auto']"
+"""What pydantic calls the word among what may also be a number."""
+
+
+def _told_once(found: Iterable[Any]) -> Iterator[Any]:
+    """Of what is neither that word nor such a number, one fault instead of two."""
+    found = list(found)
+    either = {fault["loc"][:-1] for fault in found if fault["loc"][-1:] == (AUTO,)}
+    for fault in found:
+        where, is_word = fault["loc"][:-1], fault["loc"][-1:] == (AUTO,)
+        if where not in either:
+            yield fault
+        elif is_word and isinstance(fault["input"], str):
+            yield fault | {"loc": where, "msg": "should be a number or 'auto'"}
+        elif not is_word and not isinstance(fault["input"], str):
+            yield fault | {"loc": where}
 
 
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:

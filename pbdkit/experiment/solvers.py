@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, SerializeAsAny
 
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.component import Strict
@@ -44,21 +45,53 @@ class Stepping(Solver):
     `relaxation` w and `memory` b apply to any rule's move, for followers only:
     x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
     best; `precision` is that of the run's own numbers; `threads` for the compiled engine. With
-    `settle` the run ends where it has settled, after `steps` at the latest.
+    `settle` the run ends where it has settled, after `steps` at the latest. `auto` for `relaxation`
+    or `memory` takes what lets the slowest mode of the scene shrink fastest; results hold numbers.
     """
 
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
-    relaxation: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
-    memory: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    asked_relaxation: Literal["auto"] | Annotated[float, Field(gt=0.0, le=1e6)] = Field(
+        default=1.0, alias="relaxation"
+    )
+    asked_memory: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = Field(
+        default=0.0, alias="memory"
+    )
     settle: Settle | None = None
 
     @property
     def stepping(self) -> Stepping:
         """As the experiment says."""
         return self
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a number is yet to be chosen for the scene."""
+        return "auto" in (self.asked_relaxation, self.asked_memory)
+
+    @property
+    def relaxation(self) -> float:
+        """w. Raises ExperimentError where it is yet to be chosen."""
+        return _number(self.asked_relaxation, "relaxation")
+
+    @property
+    def memory(self) -> float:
+        """b. Raises ExperimentError where it is yet to be chosen."""
+        return _number(self.asked_memory, "memory")
+
+    def with_weights(self, relaxation: float, memory: float) -> Stepping:
+        """The same with these numbers."""
+        chosen = {"asked_relaxation": relaxation, "asked_memory": memory}
+        return self.model_copy(update=chosen)
+
+
+def _number(asked: Literal["auto"] | float, name: str) -> float:
+    if asked == "auto":
+        text = "'auto' is a number only once it is chosen for a scene: pbdkit.runs.tuning.tuned"
+        raise ExperimentError(text, ("solver", name))
+    return asked
 
 
 class Equilibrium(Solver):

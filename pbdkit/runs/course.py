@@ -19,6 +19,7 @@ from pbdkit.results.recorder import Outcome, Recorder
 from pbdkit.results.sink import KeepingSink, MemorySink, Sink
 from pbdkit.runs.drivers import Driver, Stepwise, Straight
 from pbdkit.runs.standing import standing_of
+from pbdkit.runs.tuning import tuned
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice
 from pbdkit.stepping.state import State, initial_state
@@ -45,7 +46,7 @@ class Run:
     def __init__(
         self, scene: Scene, *, start: State | None = None, watch: Watch | None = None
     ) -> None:
-        self.scene = scene
+        self.scene = scene = tuned(scene)
         self.outcome: Outcome | None = None
         """How the run ended; None until it has."""
         with _located(scene):

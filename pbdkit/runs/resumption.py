@@ -198,7 +198,11 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
         now = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
         now = None
-    if now != _map(about, "experiment"):
+    begun = _map(about, "experiment")
+    if now is not None:  # what the run has chosen itself is no change
+        chosen = begun.get("solver", {})
+        now["solver"] = {k: chosen.get(k) if v == "auto" else v for k, v in now["solver"].items()}
+    if now != begun:
         raise ExperimentError(
             f"{output}: {file} has changed since the run began, which goes on as it was then; "
             "--anyway does so"
