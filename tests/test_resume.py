@@ -36,6 +36,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "float32": {"solver": {"type": "stepping", "precision": "float32"}},
     "small records": {"record": {"every": 3, "dtype": "float32"}},
     "zlib": {"record": {"every": 1, "compression": "zlib"}, "diagnostics": EVERYTHING},
+    "auto": {"solver": {"type": "stepping", "relaxation": "auto", "memory": "auto"}},
     "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
     "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
     "equilibrium": {"solver": {"type": "equilibrium"}},

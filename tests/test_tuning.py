@@ -1,0 +1,163 @@
+"""Relaxation and memory `auto`: the best of the spectrum, chosen once, kept with the result."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from property_cases import BOTH_ENDS_HELD, FRAMES, LATTICES, RULES, experiment
+
+import pbdkit
+from pbdkit.analysis.analysis import Analysis
+from pbdkit.analysis.spectrum import has_symmetric_rows
+from pbdkit.analysis.weights import HopelessError, Weights, best_weights
+from pbdkit.runs.tuning import MARGIN, tuned
+from pbdkit.scene.scene import Scene, build_scene
+
+AUTO = {"type": "stepping", "engine": "numpy", "relaxation": "auto", "memory": "auto"}
+OTHERS = {"none": {"type": "none"}, "mean": FRAMES["mean"], "first": FRAMES["first"],
+          "wide": FRAMES["wide"]}  # fmt: skip
+MIRRORED = ("square", "rectangular")
+ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
+SPRINGS = {"type": "springs"}
+EIGHT, SIX = {"type": "chebyshev", "shells": 1}, {"type": "coordination", "shells": 1}
+CALIBRATED = [
+    *product(["square"], [ELASTIC, SPRINGS], [EIGHT], ["natural", "traction-free", "mean"]),
+    *product(["hexagonal"], [ELASTIC, SPRINGS], [SIX], ["natural", "mean"]),
+    ("square", {"type": "strain-gradient", "poisson_ratio": 0.2, "length": 1.5}, EIGHT, "natural"),
+]
+
+
+def scene_of(columns: int = 6, rows: int = 5, **parts: Any) -> Scene:
+    given = {"leaders": BOTH_ENDS_HELD, "solver": AUTO} | parts
+    return build_scene(pbdkit.Experiment(**experiment(columns, rows, **given)))
+
+
+def chosen(scene: Scene) -> Weights:
+    return Weights(*(getattr(scene.experiment.stepping, name) for name in Weights._fields))
+
+
+def rate(scene: Scene) -> float:
+    found = Analysis(scene).spectral_radius
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_the_choice_settles_every_rule_on_every_lattice_under_every_frame(lattice):
+    frames = dict(OTHERS, mirror={"type": "mirror"}) if lattice in MIRRORED else OTHERS
+    pairs = [("barycentre", frame) for frame in frames] + [(rule, "mean") for rule in RULES]
+    for rule, frame in pairs:
+        parts = {"lattice": lattice, "neighbours": "chebyshev-1", "frame": frames[frame]}
+        scene = tuned(scene_of(5, 4, rule=rule, **parts))
+        assert rate(scene) < 1.0, (rule, frame)
+
+
+@pytest.mark.parametrize(("lattice", "rule", "neighbours", "frame"), CALIBRATED)
+def test_the_choice_settles_calibrated_rules(lattice, rule, neighbours, frame):
+    parts = {"lattice": lattice, "rule": rule, "neighbours": neighbours}
+    assert rate(tuned(scene_of(**parts, frame={"type": frame}))) < 1.0
+
+
+def test_the_choice_is_that_of_the_heavy_ball():
+    """λ of a sheet whose ends are held is known: m and M are 1 - λ at the ends."""
+    scene = tuned(scene_of(12, 12))
+    slowest = (1 + math.cos(math.pi / 11)) / 2
+    m, M = 1 - slowest, 1 - Analysis(scene).smallest_eigenvalue
+    root = (math.sqrt(M) - math.sqrt(m)) / (math.sqrt(M) + math.sqrt(m))
+    assert chosen(scene) == pytest.approx((4 / (math.sqrt(m) + math.sqrt(M)) ** 2, root**2))
+    assert rate(scene) == pytest.approx(root, abs=1e-6)
+
+
+def test_no_numbers_nearby_are_better():
+    for z in (np.linspace(0.01, 1.9, 60), np.linspace(0.01, 1.5, 60) + 0.02j):
+        modes = np.concatenate([1 - z, 1 - z.conj()])
+        best = best_weights(modes)
+        for dw, db in product((-0.01, 0.0, 0.01), repeat=2):
+            near = Weights(best.relaxation + dw, best.memory + db)
+            assert near.rate(modes) > best.rate(modes) - 1e-5
+
+
+def test_a_number_that_is_given_stays():
+    modes = 1 - np.linspace(0.01, 1.9, 60).astype(complex)
+    relaxed = scene_of(solver=AUTO | {"memory": 0.25})
+    assert tuned(relaxed).experiment.stepping.memory == 0.25
+    assert best_weights(modes, memory=0.0).relaxation == pytest.approx(2 / 1.91)
+    assert best_weights(modes, relaxation=1.0).memory == pytest.approx(0.81)
+    for given in ({"relaxation": 2.5}, {"memory": 1.0}):
+        with pytest.raises(HopelessError):
+            best_weights(modes, **given)
+
+
+@pytest.mark.parametrize("parts", [{}, {"rule": SPRINGS, "neighbours": EIGHT}])
+def test_of_large_bodies_the_ends_are_found_by_iteration(parts):
+    """All modes of 24 × 24 with four neighbours are known in closed form; those of the springs by
+    the analysis of the choice."""
+    scene = tuned(scene_of(24, 24, **parts))
+    w, b = chosen(scene)
+    assert rate(scene) < math.sqrt(b) + 1e-3
+    if not parts:
+        m = (1 - math.cos(math.pi / 23)) / 2
+        assert (1 - math.sqrt(b)) ** 2 / w == pytest.approx(m, rel=3 * MARGIN)
+
+
+def test_a_result_holds_the_numbers_and_is_made_again_from_them():
+    given = experiment(solver=AUTO, leaders=BOTH_ENDS_HELD, initial={"type": "noise", "amplitude": 0.1})
+    first = pbdkit.run(given, progress=False)
+    solver = json.loads(first.attrs["experiment"])["solver"]
+    assert (solver["relaxation"], solver["memory"]) == chosen(tuned(scene_of()))
+    again = pbdkit.rerun(first, progress=False)
+    assert np.array_equal(first.position, again.position)
+    assert json.loads(again.attrs["experiment"])["solver"] == solver
+
+
+@pytest.mark.parametrize(
+    ("parts", "text"),
+    [
+        ({"frame": {"type": "mean", "lag": 1}}, "a frame with lag looks back farther; set "
+         "frame.lag: 0, or give numbers"),
+        ({"neighbours": {"type": "euclidean", "radius": 1.1, "reevaluate": True}},
+         "neighbours that are found anew have none; set neighbours.reevaluate: false"),
+        ({"solver": AUTO | {"relaxation": 4.0}}, "no memory lets all modes shrink with relaxation "
+         "4; give numbers, or leave them out (relaxation 1, memory 0)"),
+    ],
+)  # fmt: skip
+def test_where_there_is_no_choice_the_remedy_is_named(parts, text):
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        tuned(scene_of(**parts))
+    assert caught.value.where == ("solver",)
+    assert text in str(caught.value)
+
+
+def test_check_says_what_is_chosen_and_of_what(call):
+    auto = ["--set", "solver.memory=auto", "--set", "solver.relaxation=auto"]
+    linear = call("check", "paper/a", *auto).out
+    assert "  chosen     relaxation 1.83, memory 0.789057\n" in linear
+    torn = call("check", "paper/d1", *auto).out
+    assert ", of the step linearised at rest: the rule is not linear or bonds can break" in torn
+    found = json.loads(call("check", "paper/a", "--json", *auto[:2]).out)
+    assert (found["relaxation"], found["memory"]) == (1.0, pytest.approx(0.841661, abs=1e-6))
+
+
+@pytest.mark.parametrize("name", ["memory", "threads"])
+def test_a_word_that_is_none_is_answered_once(name, call):
+    told = call("check", "paper/a", "--set", f"solver.{name}=aut").err
+    assert f"solver.{name}: should be a number or 'auto', got 'aut'; did you mean 'auto'?" in told
+    assert "literal" not in told
+
+
+def test_numbers_that_are_yet_to_be_chosen_are_none():
+    with pytest.raises(pbdkit.ExperimentError, match="once it is chosen for a scene"):
+        _ = scene_of().experiment.stepping.memory
+
+
+def test_rows_that_can_be_made_symmetric_have_real_eigenvalues():
+    from scipy.sparse import csr_array
+
+    even = np.array([[0.0, 2.0, 0.0], [0.5, 0.0, 3.0], [0.0, 1.0, 1.0]])
+    assert has_symmetric_rows(csr_array(even))
+    assert not has_symmetric_rows(csr_array(even * [[1, -1, 1]]))
