@@ -106,7 +106,8 @@ def test_of_large_bodies_the_ends_are_found_by_iteration(parts):
 
 
 def test_a_result_holds_the_numbers_and_is_made_again_from_them():
-    given = experiment(solver=AUTO, leaders=BOTH_ENDS_HELD, initial={"type": "noise", "amplitude": 0.1})
+    noise = {"type": "noise", "amplitude": 0.1}
+    given = experiment(solver=AUTO, leaders=BOTH_ENDS_HELD, initial=noise)
     first = pbdkit.run(given, progress=False)
     solver = json.loads(first.attrs["experiment"])["solver"]
     assert (solver["relaxation"], solver["memory"]) == chosen(tuned(scene_of()))
