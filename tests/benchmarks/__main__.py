@@ -20,6 +20,7 @@ import document
 import numba
 import numpy as np
 from cost import cost
+from elements import elements
 from engines import engines, limit, threads
 from goals import all_goals
 from peers import peers
@@ -46,6 +47,7 @@ PARTS = {
     "cost": cost,
     "engines": engines,
     "peers": peers,
+    "elements": elements,
 }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cost import TERMS
+from front import fronts
 
 Data = dict[str, Any]
 
@@ -137,6 +138,10 @@ def _peers(rows: list[Data]) -> str:
     return _table(("program", "an iteration of", "100², ns", "1000², ns"), cells)
 
 
+def _elements(found: Data) -> str:
+    return fronts(found, _table)
+
+
 def _choice(rows: list[Data]) -> str:
     """Steps from which the compiled engine's set-up is won back."""
 
@@ -188,4 +193,5 @@ TABLES: dict[str, Callable[[Any], str]] = {
     "peers": _peers,
     "choice": _choice,
     "interval": _interval,
+    "elements": _elements,
 }

@@ -25,7 +25,7 @@ INSTALL_S, MEASURE_S = 240, 240
 
 def peers() -> list[dict[str, Any]]:
     """ns a particle and iteration; the best of three processes of each, taken in turns."""
-    pythons = {name: _python(package) for name, (package, _) in PEERS.items()}
+    pythons = {name: python_with(package) for name, (package, _) in PEERS.items()}
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for _ in range(3):
         for size in SIZES:
@@ -51,17 +51,17 @@ def _own(size: int, precision: str) -> float:
     return best(Running(moving(size, solver=solver), steps)) / steps / size**2 * 1e9
 
 
-def _python(package: str) -> str:
-    """The interpreter of an environment with that package; empty where it does not install."""
-    folder = HOME / package
+def python_with(*packages: str) -> str:
+    """The interpreter of an environment with these packages; empty where they do not install."""
+    folder = HOME / "-".join(packages)
     python = folder / "bin" / "python"
     if not (folder / "installed").exists():
         try:
             venv.create(folder, with_pip=True, clear=True)
-            call = [str(python), "-m", "pip", "install", "--quiet", package, "numpy"]
+            call = [str(python), "-m", "pip", "install", "--quiet", *packages, "numpy"]
             subprocess.run(call, check=True, capture_output=True, timeout=INSTALL_S)
         except (subprocess.SubprocessError, OSError) as error:
-            print(f"{package} does not install: {error}", file=sys.stderr)
+            print(f"{', '.join(packages)}: not installed: {error}", file=sys.stderr)
             return ""
         (folder / "installed").touch()
     return str(python)
