@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from finite_elements import layer
+from finite_elements import layer, varying
 from finite_elements.errors import load, relative_l2
 from finite_elements.lattices import between_edges, error_at, experiment, interpolated, solved
 from finite_elements.problems import BAR, CANTILEVER, HEXAGONAL_BAR, HOLE, NU, PROBLEMS
@@ -155,3 +155,13 @@ def test_every_site_of_a_reference_has_a_displacement():
     for problem in (BAR, CANTILEVER, HOLE):
         reference = load(problem.name, 10)
         assert not np.isnan(equilibrium(problem.name, 10).u[~np.isnan(reference.u)]).any()
+
+
+def test_the_varying_bar_s_solution_is_exact():
+    """Stress along x is the same everywhere along x, and the right edge moves by 1."""
+    h, x = 1e-4, np.linspace(0.1, 1.9, 7)
+    stress = varying.modulus(x, 0.3) * (varying.exact(x + h) - varying.exact(x - h)) / (2 * h)
+    assert stress == pytest.approx(stress[0], rel=1e-6)
+    assert varying.exact(np.array([0.0, 2.0])) == pytest.approx([0.0, 1.0])
+    corners = varying.modulus(np.array([0.0, 2.0]), np.array([0.0, 1.0]))
+    assert corners == pytest.approx([1.0, 1 / varying.LARGEST_OVER_SMALLEST])
