@@ -7,10 +7,15 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from pbdkit.cli.options import experiment_argument, json_option, set_option
+
+if TYPE_CHECKING:
+    from pbdkit.analysis.forecast import Forecast
+    from pbdkit.experiment.model import Experiment
 
 
 @click.command()
@@ -83,6 +88,13 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     click.echo(f"  bonds      {found.bonds}")
     click.echo(f"  memory     about {found.memory_mib:.3g} MiB")
     click.echo(f"  output     about {found.output_mib:.3g} MiB")
+    _tell_of_steps(loaded, found)
+    for warning in found.warnings:
+        click.echo(f"warning: {warning}")
+
+
+def _tell_of_steps(loaded: Experiment, found: Forecast) -> None:
+    """What is known of steps before the first one."""
     if loaded.stepping.is_open:
         why = "the rule is not linear or bonds can break"
         near = "" if found.exact else f", of the step linearised at rest: {why}"
@@ -109,8 +121,6 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
             f"  lag        {found.lag:.4g} lattice units behind equilibrium if the leaders' "
             f"fastest steps went on{reached}"
         )
-    for warning in found.warnings:
-        click.echo(f"warning: {warning}")
 
 
 @click.command()
