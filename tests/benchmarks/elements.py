@@ -32,9 +32,9 @@ from pbdkit.equilibrium.increments import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 CELLS = (10, 20, 40, 80, 160, 320, 640)
-TURNS, ENOUGH_S, LONG_S = 7, 3.0, 10.0
+TURNS, ENOUGH_S, LONG_S = 7, 2.0, 8.0
 """So many turns, two of what takes long (the first may compile), one of what takes very long."""
-PATIENCE_S, GROWTH = 40.0, 6.0
+PATIENCE_S, GROWTH = 30.0, 6.0
 """What would take longer at the next size, by its growth, is left out."""
 WANTED = {1e-3: 4.0, 2e-4: 10.0}
 """Errors, and by how many times pbdkit is to be faster there."""
