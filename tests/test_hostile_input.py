@@ -16,9 +16,9 @@ from ruamel.yaml.scanner import Scanner
 
 import pbdkit
 from pbdkit import Experiment
-from pbdkit.analysis.forecast import forecast
 from pbdkit.errors import LONGEST, PbdkitError, printable
 from pbdkit.experiment.source import MAX_DEPTH, Source, read_text
+from pbdkit.prediction.forecast import forecast
 from pbdkit.runs.course import rehearse
 from pbdkit.scene.scene import build_scene
 

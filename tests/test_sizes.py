@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import pbdkit
-from pbdkit.analysis.forecast import forecast
+from pbdkit.prediction.forecast import forecast
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene

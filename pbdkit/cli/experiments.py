@@ -63,8 +63,8 @@ def schema(what: str, builtin: bool) -> None:
 @json_option
 def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Validate an experiment and say what will happen, without running it."""
-    from pbdkit.analysis.forecast import forecast
     from pbdkit.api import load
+    from pbdkit.prediction.forecast import forecast
     from pbdkit.runs.course import rehearse
     from pbdkit.scene.scene import build_scene
 
@@ -85,6 +85,7 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     if found.spectral_radius is not None:
         verdict = "stable" if found.stable else "not stable"
         near = "" if found.exact else ", linearised at the start"
+        near += ", estimated: the steps to 1 %" if found.estimated else ""
         click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}{near}")
         steps = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
         if steps:

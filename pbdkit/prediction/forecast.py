@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.analysis import NO_REMEDY, Analysis
 from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
+from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory import machine_memory
@@ -26,7 +26,7 @@ class Forecast:
     mode that swings and by what it shrinks a step, None where nothing swings; by how much the body
     trails its equilibrium in the leaders' fastest steps, in lattice units, once that is steady and
     when these steps end, None where no leader moves steadily; whether what the analysis found is
-    exact, or linearised at the start; warnings."""
+    exact, or linearised at the start; whether it is estimated, 1 - ρ to 1 %; warnings."""
 
     particles: int
     followers: int
@@ -41,6 +41,7 @@ class Forecast:
     period: float | None
     decay: float | None
     exact: bool
+    estimated: bool
     lag: float | None
     lag_reached: float | None
     warnings: list[str]
@@ -52,7 +53,7 @@ class Forecast:
 
 ANALYSED = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
-    *("exact", "lag"),
+    *("exact", "estimated", "lag"),
 )
 """What the analysis calls by the same names."""
 
