@@ -98,6 +98,7 @@ class Estimate:
                 break
         return mode
 
+    @cached_property
     def spectrum(self) -> Spectrum | None:
         """Both ends of that of the rule's own step, where it is real."""
         if self._scene.lag:

@@ -39,7 +39,11 @@ Floats = NDArray[np.floating[Any]]
 DEAREST = 2e8
 """Products of numbers that are made at most to know the lag at the end of an interval."""
 ACCURACY = 1e-2
-"""Of solutions by iteration, as a share of what they come to."""
+"""Of solutions by iteration, as a share of what they were taken to come to."""
+FINEST = 1e-12
+"""The finest accuracy asked for."""
+FAR, TURNS = 8.0, 4
+"""Where they come to so many times less they are solved for once more, at most so often."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,9 @@ class Lag:
 
 @dataclass(frozen=True)
 class Trail:
-    """What drives the distance e = u* - u, planes: `delta` is the equilibrium's own speed, e gains
-    `first` in the first step and `push` in each of the others; `steady` is A⁻¹ push."""
+    """What drives the distance e = u* - u, planes: e gains `first` in the first step and `push` in
+    each of the others; `steady` is A⁻¹ push."""
 
-    delta: Floats
     first: Floats
     push: Floats
     steady: Floats
@@ -97,13 +100,19 @@ class Trail:
         direct, shown = edge.moves(v), edge.moves(edge.shown(v))
         if not (direct + shown).any():
             return None
-        delta = system.solve(direct + shown, ACCURACY * float(np.abs(v).max()))
-        first = delta - direct
-        push = first + scene.lag * shown - scene.experiment.stepping.memory * delta
-        if scene.lag:
-            push += edge.moves(edge.shown(delta))
-        steady = system.solve(push, ACCURACY * slowness * float(np.abs(push).max()))
-        return cls(delta, first, push, steady)
+        size, accuracy = float(np.abs(v).max()), ACCURACY
+        while True:
+            # What is wrong with δ may grow by the slowness in A⁻¹ δ.
+            accuracy *= ACCURACY
+            delta = system.solve(direct + shown, accuracy * size)
+            first = delta - direct
+            push = first + scene.lag * shown - scene.experiment.stepping.memory * delta
+            if scene.lag:
+                push += edge.moves(edge.shown(delta))
+            steady = _solved(system, push, slowness * float(np.abs(push).max()))
+            wrong = slowness * accuracy * size
+            if wrong <= ACCURACY * float(np.abs(steady).max()) or accuracy <= FINEST:
+                return cls(first, push, steady)
 
 
 def lag_of(
@@ -157,7 +166,7 @@ def _reached_about(
         return None
     e = trail.steady
     try:
-        further = system.solve(e, ACCURACY * slowness * float(np.abs(e).max()))
+        further = _solved(system, e, slowness * float(np.abs(e).max()))
     except StuckError:
         return None
     basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, further), (trail.push, e)))
@@ -165,6 +174,18 @@ def _reached_about(
     left = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
     most = min(_largest(e), steps * _largest(trail.push))
     return min(most, _largest((1.0 - left[0]) * e - left[1] * further))
+
+
+def _solved(system: System, moves: Floats, size: float) -> Floats:
+    """A⁻¹ moves, of at most that size, to a share of what it comes to."""
+    found = system.solve(moves, ACCURACY * size)
+    for _ in range(TURNS):
+        most = float(np.abs(found).max())
+        if most * FAR >= size:
+            break
+        size = most
+        found = system.solve(moves, ACCURACY * size)
+    return found
 
 
 def _largest(planes: Floats) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from pbdkit.analysis.couplings import Entries
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.analysis.spectrum import Spectrum, excess, modes, spectrum, spectrum_of
+from pbdkit.equilibrium.linearisation import LARGEST_DIRECT
 from pbdkit.prediction.estimate import Estimate
 from pbdkit.scene.scene import Scene
 
@@ -31,11 +32,6 @@ class Spectra:
     def estimate(self) -> Estimate:
         """Of what has no matrix, or one that is too large."""
         return Estimate(self.scene)
-
-    @property
-    def estimated(self) -> bool:
-        """Whether the spectrum is an estimate."""
-        return self._of_matrix is None and self.of_rule is not None
 
     @cached_property
     def spectrum(self) -> Spectrum | None:
@@ -67,14 +63,26 @@ class Spectra:
         too = "parts that no leader reaches too: " if too_many else ""
         return [f"analysis: the spectrum and the lag are left out, {too}{why}"]
 
-    @cached_property
+    @property
     def of_rule(self) -> Spectrum | None:
         """Of the rule's own step, with neither relaxation nor memory; None where the frame lags."""
-        return self._of_matrix or self.estimate.spectrum()
+        return self._found[0]
+
+    @property
+    def estimated(self) -> bool:
+        """Whether that is an estimate."""
+        return self._found[1]
 
     @cached_property
-    def _of_matrix(self) -> Spectrum | None:
-        return self._spectrum_of(self.rule_matrix, self.scene.lag == 0)
+    def _found(self) -> tuple[Spectrum | None, bool]:
+        """Large bodies are estimated sooner, where that can be, as they are solved."""
+        large = self.scene.raster.count > LARGEST_DIRECT
+        if large and (found := self.estimate.spectrum):
+            return found, True
+        if found := self._spectrum_of(self.rule_matrix, self.scene.lag == 0):
+            return found, False
+        found = None if large else self.estimate.spectrum
+        return found, found is not None
 
     def _spectrum_of(self, matrix: Callable[[], Any], asked: bool) -> Spectrum | None:
         """None where it is not asked for, cannot be had, or not soon."""
