@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from pbdkit.equilibrium.lattice_system import LatticeSystem
 
 ACCURACY = 1e-2
-"""Of solutions, and of the slowness at which inverse iteration ends."""
-MOST_TURNS = 8
+"""Of solutions, relative."""
+CLOSE, MOST_TURNS = 1e-3, 8
+"""Relative change of the slowness at which inverse iteration ends, and its turns at most."""
 MANY = 200_000
 """Particles from which on coarser grids are fine enough for the slowest mode."""
 BYTES = 500
@@ -94,7 +95,7 @@ class Estimate:
                 mode = mode.improved(system, ACCURACY)
             except StuckError:
                 return None
-            if abs(mode.slowness - before) <= ACCURACY * before:
+            if abs(mode.slowness - before) <= CLOSE * before:
                 break
         return mode
 

@@ -11,10 +11,10 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
-from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.solver_sizes import equilibrium_size
 
 MIB = 2**20
 LEAST = 6 * MIB
@@ -30,10 +30,6 @@ GRADIENT, FORCES, TABLES = 250, 160, 40
 
 ANEW, ANEW_EACH = 150, 118
 """The same where neighbours are found anew, and a neighbour."""
-
-FACTORS, COUPLED_FACTORS = 200, 800
-"""The same a neighbour for the matrices of an equilibrium: of rules that leave x and y apart, and
-of calibrated ones. Rough: it depends on the method and on the shape of the body."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,11 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
     table += experiment.fracture.can_break * planes
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
-    memory = LEAST + math.ceil(particles * (state + table + made))
+    memory = math.ceil(particles * (state + table + made))
+    if not experiment.solver.makes_steps:
+        solved = equilibrium_size(experiment, neighbourhood, particles)
+        memory = max(memory, math.ceil(particles * (state + table)) + solved)
+    memory += LEAST
     output = math.ceil(particles * state) + _output(experiment, particles, planes)
     return Sizes(particles, memory, output)
 
@@ -76,8 +76,6 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
         made += TABLES
     if experiment.neighbours.nearness():
         made += ANEW + each * ANEW_EACH
-    if not experiment.solver.makes_steps:
-        made += each * (FACTORS if material_of(rule) is None else COUPLED_FACTORS)
     return made
 
 
