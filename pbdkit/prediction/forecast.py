@@ -16,7 +16,8 @@ from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.scene.sizes import MIB, sizes_of
+from pbdkit.scene.sizes import MIB, Sizes, sizes_of
+from pbdkit.scene.solver_sizes import LARGEST_DIRECT
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,9 @@ ANALYSED = (
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
-    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
     kinds = kinds_at(scene.raster, scene.leading, 1)
     analysis, solver = Analysis(scene), scene.experiment.stepping
+    sizes = _sizes(analysis)
     swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
     waves = [] if analysis.spectrum else _growing_waves(scene)
     return Forecast(
@@ -77,6 +78,15 @@ def forecast(scene: Scene) -> Forecast:
         warnings=[*_doubts(scene), *analysis.warnings(), *waves],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
+
+
+def _sizes(analysis: Analysis) -> Sizes:
+    """Of a large equilibrium by what serves it."""
+    scene = analysis.scene
+    count, grids = scene.raster.count, True
+    if count > LARGEST_DIRECT and not scene.experiment.solver.makes_steps:
+        grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
+    return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
 
 def quick_warnings(scene: Scene) -> tuple[str, ...]:

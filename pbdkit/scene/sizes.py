@@ -42,8 +42,11 @@ class Sizes:
     output: int
 
 
-def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
-    """The sizes of a scene with so many particles."""
+def sizes_of(
+    experiment: Experiment, neighbourhood: Neighbourhood, particles: int, *, grids: bool = True
+) -> Sizes:
+    """The sizes of a scene with so many particles; `grids` where its lattice and its leaders let
+    grids find an equilibrium, as far as that is known."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
     state: float = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + value)
@@ -54,7 +57,7 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
     memory = math.ceil(particles * (state + table + made))
     if not experiment.solver.makes_steps:
-        solved = equilibrium_size(experiment, neighbourhood, particles)
+        solved = equilibrium_size(experiment, neighbourhood, particles, grids)
         memory = max(memory, math.ceil(particles * (state + table)) + solved)
     memory += LEAST
     output = math.ceil(particles * state) + _output(experiment, particles, planes)

@@ -20,7 +20,7 @@ LARGEST_DIRECT = 20_000
 
 KERNELS = 48 * 2**20
 """Bytes of the compiled functions of grids."""
-GRIDS, OWN_STENCILS = 160, 3000
+GRIDS, OWN_STENCILS = 160, 2300
 """Bytes a particle of grids where most particles share a stencil, and where each has its own, as
 with a rule that is not linear."""
 UNCOUPLED, UNCOUPLED_EACH, COUPLED_EACH = 900, 112, 800
@@ -30,10 +30,12 @@ TWO = 2
 """Matrices at a time where the rule is not linear."""
 
 
-def equilibrium_size(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> int:
-    """Bytes of the systems of an equilibrium."""
+def equilibrium_size(
+    experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
+) -> int:
+    """Bytes of the systems of an equilibrium, on grids where these serve."""
     linear = experiment.rule.linear
-    if _on_grids(experiment, neighbourhood, particles):
+    if grids and _on_grids(experiment, neighbourhood, particles):
         return KERNELS + particles * (GRIDS if linear else OWN_STENCILS)
     each = len(neighbourhood.slots[0])
     if material_of(experiment.rule) is None:
