@@ -9,14 +9,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.analysis.analysis import Analysis
-from pbdkit.analysis.forecast import refuse_too_much_output
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
+from pbdkit.prediction.analysis import Analysis
+from pbdkit.prediction.forecast import refuse_too_much_output
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.sink import MemorySink

@@ -20,6 +20,7 @@ ORDER = [
     "analysis",
     "identity",
     "equilibrium",
+    "prediction",
     "runs",
     "sweeps",
     "api",

@@ -16,9 +16,9 @@ from ruamel.yaml.scanner import Scanner
 
 import pbdkit
 from pbdkit import Experiment
-from pbdkit.analysis.forecast import forecast
 from pbdkit.errors import LONGEST, PbdkitError, printable
 from pbdkit.experiment.source import MAX_DEPTH, Source, read_text
+from pbdkit.prediction.forecast import forecast
 from pbdkit.runs.course import rehearse
 from pbdkit.scene.scene import build_scene
 
@@ -153,7 +153,10 @@ def test_the_unit_of_length_decides_nothing(a: float) -> None:
 
 
 BODIES = {
-    "a long strip": ({"body": grid(3000, 10)}, "eigenvalues lie too close together"),
+    "a long strip, a frame that lags": (
+        {"body": grid(3000, 10), "frame": {"type": "mean", "lag": 1}},
+        "eigenvalues lie too close together",
+    ),
     "a long strip, 24 neighbours": (
         {"body": grid(3000, 10), "neighbours": {"type": "chebyshev", "shells": 2}},
         "42056 particles with 24 neighbours each, 33333 at most",
@@ -162,7 +165,14 @@ BODIES = {
         {"neighbours": {"type": "chebyshev", "shells": 16}},
         "1764 particles with 1088 neighbours each, 168 at most",
     ),
-    "a large body": ({"body": grid(225, 225)}, "51529 particles, 50000 at most"),
+    "a large body, a frame that lags": (
+        {"body": grid(225, 225), "frame": {"type": "mean", "lag": 1}},
+        "51529 particles, 50000 at most",
+    ),
+    "a large body that nothing holds": (
+        {"body": grid(225, 225), "leaders": []},
+        "51529 particles, 50000 at most",
+    ),
 }
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from property_cases import BOTH_ENDS_HELD, advanced, body_sites, scene_of
 
-from pbdkit.analysis.forecast import forecast, quick_warnings
 from pbdkit.components.neighbours import Chebyshev, Coordination
+from pbdkit.prediction.forecast import forecast, quick_warnings
 from pbdkit.scene.neighbourhood import build_neighbourhood
 
 SQUARE = {"type": "square", "a": 1.0}

@@ -12,9 +12,9 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, FRAMES, LATTICES, RULES, experiment
 
 import pbdkit
-from pbdkit.analysis.analysis import Analysis
 from pbdkit.analysis.spectrum import has_symmetric_rows
 from pbdkit.analysis.weights import HopelessError, Weights, best_weights
+from pbdkit.prediction.analysis import Analysis
 from pbdkit.runs.tuning import MARGIN, tuned
 from pbdkit.scene.scene import Scene, build_scene
 

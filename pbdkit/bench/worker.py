@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pbdkit.api import load
 from pbdkit.equilibrium.certificate import Certificate, scale_of
 from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.inverse_iteration import SlowMode
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.errors import ExperimentError, PbdkitError
@@ -206,15 +207,13 @@ def decay_of(scene: Scene, exact: Floats) -> Decay:
     way.reshape(len(way), -1)[:, followers_of(scene)] = exact - _of_followers(scene, start)
     if not way.any():
         return Decay(0.0, 0.0)
-    system, mode, slowness = linearised(scene, resting, steps, "auto", Watch()), way, 0.0
+    system, slowest = linearised(scene, resting, steps, "auto", Watch()), SlowMode(way, 1.0)
     for _ in range(TURNS):
-        mode = mode / np.abs(mode).max()
-        after = system.solve(mode, ROUGH)
-        slowness = float((after * after).sum() / (after * mode).sum())
-        mode = after
+        slowest = slowest.improved(system, ROUGH)
+    mode = slowest.planes
     along = float((way * mode).sum() / (mode * mode).sum())
     share = abs(along) * _longest(mode) / scale_of(scene, start)
-    return Decay(share, 1.0 - 1.0 / slowness)
+    return Decay(share, 1.0 - 1.0 / slowest.slowness)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ import click
 from pbdkit.cli.options import experiment_argument, json_option, set_option
 
 if TYPE_CHECKING:
-    from pbdkit.analysis.forecast import Forecast
     from pbdkit.experiment.model import Experiment
+    from pbdkit.prediction.forecast import Forecast
 
 
 @click.command()
@@ -68,8 +68,8 @@ def schema(what: str, builtin: bool) -> None:
 @json_option
 def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     """Validate an experiment and say what will happen, without running it."""
-    from pbdkit.analysis.forecast import forecast
     from pbdkit.api import load
+    from pbdkit.prediction.forecast import forecast
     from pbdkit.runs.course import rehearse
     from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
@@ -103,6 +103,7 @@ def _tell_of_steps(loaded: Experiment, found: Forecast) -> None:
     if found.spectral_radius is not None:
         verdict = "stable" if found.stable else "not stable"
         near = "" if found.exact else ", linearised at the start"
+        near += ", estimated: the steps to 1 %" if found.estimated else ""
         click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}{near}")
         steps = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
         if steps:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.grid_functions import kernels
+from pbdkit.equilibrium.inverse_iteration import SlowMode, softest
 from pbdkit.equilibrium.lattice_krylov import (
     BiconjugateGradients,
     ConjugateGradients,
@@ -100,6 +101,11 @@ class LatticeSystem(System):
         if found.jumps and not found.ahead <= tolerance:
             raise StuckError
         return self._planes(found.x)
+
+    def slowest(self) -> SlowMode:
+        """Roughly the mode of the steps that fades most slowly, by the coarser grids."""
+        mode, softness = softest(self._grids, type(self._solver))
+        return SlowMode(self._planes(mode), softness * float(np.abs(self._matrix.scale[0, 0])))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """Of forces."""

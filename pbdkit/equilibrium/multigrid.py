@@ -23,6 +23,8 @@ STIFFER = 3.0
 """So many times stiffer, a direction is made coarser alone."""
 NARROW = 5
 """Places across, with the ring around, at which a grid is not made narrower."""
+TURNS = 30
+"""Of the inverse iteration on the coarsest grid."""
 SINGULAR = 1e-12
 """One part of what the inverse of the coarsest grid may magnify; a body that is not held gives way
 without end."""
@@ -165,6 +167,23 @@ class Multigrid:
         n = int(self._gives_way.argmax())
         i, j = (int(index[n // 2]) for index in self._at)
         return n % 2, (i, j), float(self._gives_way[n])
+
+    def softest_field(self) -> Floats:
+        """On the coarsest grid: what gives way most to forces like itself."""
+        mode = np.random.default_rng(0).random(len(self._inverse))
+        for _ in range(TURNS):
+            mode = self._inverse @ (mode / np.abs(mode).max())
+        found = self._levels[-1].grid.field(self.precision)
+        found[:, self._at[0], self._at[1]] = mode.reshape(-1, 2).T
+        return found
+
+    def finer_field(self, depth: int, field: Floats) -> Floats:
+        """A field of a grid on the one before it."""
+        above = self._levels[depth - 1]
+        found = above.grid.field(self.precision)
+        coarse = field.astype(self.precision, copy=False)
+        kernels().prolong(*above.grid.lists[:5], coarse, above.halved, found)
+        return found
 
     def finer_place(self, depth: int, place: tuple[int, int]) -> tuple[int, int]:
         """Where a place of a grid lies on the one before it."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pbdkit.analysis.forecast import prediction, quick_warnings
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
+from pbdkit.prediction.forecast import prediction, quick_warnings
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Outcome, Recorder
 from pbdkit.results.sink import KeepingSink, MemorySink, Sink

@@ -11,10 +11,10 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
-from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.solver_sizes import equilibrium_size
 
 MIB = 2**20
 LEAST = 6 * MIB
@@ -31,10 +31,6 @@ GRADIENT, FORCES, TABLES = 250, 160, 40
 ANEW, ANEW_EACH = 150, 118
 """The same where neighbours are found anew, and a neighbour."""
 
-FACTORS, COUPLED_FACTORS = 200, 800
-"""The same a neighbour for the matrices of an equilibrium: of rules that leave x and y apart, and
-of calibrated ones. Rough: it depends on the method and on the shape of the body."""
-
 
 @dataclass(frozen=True)
 class Sizes:
@@ -46,8 +42,11 @@ class Sizes:
     output: int
 
 
-def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> Sizes:
-    """The sizes of a scene with so many particles."""
+def sizes_of(
+    experiment: Experiment, neighbourhood: Neighbourhood, particles: int, *, grids: bool = True
+) -> Sizes:
+    """The sizes of a scene with so many particles; `grids` where its lattice and its leaders let
+    grids find an equilibrium, as far as that is known."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
     state: float = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + value)
@@ -56,7 +55,11 @@ def sizes_of(experiment: Experiment, neighbourhood: Neighbourhood, particles: in
     table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
     table += experiment.fracture.can_break * planes
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
-    memory = LEAST + math.ceil(particles * (state + table + made))
+    memory = math.ceil(particles * (state + table + made))
+    if not experiment.solver.makes_steps:
+        solved = equilibrium_size(experiment, neighbourhood, particles, grids)
+        memory = max(memory, math.ceil(particles * (state + table)) + solved)
+    memory += LEAST
     output = math.ceil(particles * state) + _output(experiment, particles, planes)
     return Sizes(particles, memory, output)
 
@@ -76,8 +79,6 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
         made += TABLES
     if experiment.neighbours.nearness():
         made += ANEW + each * ANEW_EACH
-    if not experiment.solver.makes_steps:
-        made += each * (FACTORS if material_of(rule) is None else COUPLED_FACTORS)
     return made
 
 

@@ -27,11 +27,11 @@ from hostile_text import hostile_setting, hostile_text, to_yaml
 from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
 import pbdkit
-from pbdkit.analysis.forecast import forecast
 from pbdkit.errors import LONGEST, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import MAX_NODES, Source, read_text
+from pbdkit.prediction.forecast import forecast
 from pbdkit.runs.course import rehearse
 from pbdkit.scene import sizes
 from pbdkit.scene.scene import build_scene

@@ -22,8 +22,8 @@ import numpy as np
 import xarray  # noqa: F401  # as above
 
 import pbdkit
-import pbdkit.analysis.forecast
 import pbdkit.cli.run
+import pbdkit.prediction.forecast
 import pbdkit.results.accessor
 import pbdkit.runs.resumption
 import pbdkit.storage.run_status

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,25 +10,29 @@ from typing import Any
 import numpy as np
 
 from pbdkit.analysis.couplings import Entries, connected
-from pbdkit.analysis.lag import Lag, lag_of
-from pbdkit.analysis.operator import StepOperator, step_operator
+from pbdkit.analysis.operator import StepOperator
 from pbdkit.analysis.spectrum import (
     NEUTRAL,
     Spectrum,
     Swing,
-    excess,
     just_below,
     largest_stable_relaxation,
     modes,
     slowest_swing,
-    spectrum,
-    spectrum_of,
     swings_below,
 )
+from pbdkit.analysis.stencil import bounds_the_body
+from pbdkit.equilibrium.linearisation import linearised
+from pbdkit.equilibrium.system import System
 from pbdkit.interfaces import Anchors
+from pbdkit.prediction.lag import Lag, fastest, lag_of
+from pbdkit.prediction.spectra import Spectra
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import initial_state
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
+NEAR = 0.9
 NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
 
 
@@ -49,58 +52,42 @@ class Analysis:
         return experiment.rule.linear and lasting
 
     @cached_property
-    def operator(self) -> StepOperator:
-        """The step operator, two unknowns a follower."""
-        return step_operator(self.scene)
-
-    @cached_property
-    def spectrum(self) -> Spectrum | None:
-        """Of the step as the solver makes it, with relaxation, memory and lag."""
-        own, solver = self._rule_spectrum, self.scene.experiment.stepping
-        if own is None:
-            return self._spectrum_of(lambda: self.operator.augmented().matrix(), self.scene.lag > 0)
-        if solver.relaxation == 1.0 and solver.memory == 0.0:
-            return own
-        # Radius and ends of what it is taken to are met at the ends of a real spectrum.
-        found = modes(own.eigenvalues, solver.relaxation, solver.memory)
-        return spectrum_of(found, own.symmetric and solver.memory == 0.0)
+    def spectra(self) -> Spectra:
+        """Where the eigenvalues come from."""
+        return Spectra(self.scene)
 
     @property
-    def _within_reach(self) -> bool:
-        """Whether there is an operator, and it is small enough to be looked at."""
-        return not (self.scene.experiment.neighbours.nearness() or excess(self.scene))
+    def operator(self) -> StepOperator:
+        """The step operator, two unknowns a follower."""
+        return self.spectra.operator
+
+    @property
+    def spectrum(self) -> Spectrum | None:
+        """Of the step as the solver makes it, with relaxation, memory and lag."""
+        return self.spectra.spectrum
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the spectrum is an estimate, as of large bodies: 1 - ρ within 1 %."""
+        return self.spectra.estimated
 
     @property
     def left_out(self) -> list[str]:
-        """What is not known because it would take too long."""
-        why = ""
-        if too_many := excess(self.scene):
-            why = f"parts that no leader reaches too: the body is too large, {too_many}"
-        elif self._within_reach and self.spectrum is None:
-            why = "eigenvalues lie too close together, as in long bodies; a shorter one shows more"
-        return [f"analysis: the spectrum and the lag are left out, {why}"] if why else []
-
-    @cached_property
-    def _rule_spectrum(self) -> Spectrum | None:
-        """Of the rule's own step, with neither relaxation nor memory; None where the frame lags."""
-        return self._spectrum_of(self._rule_matrix, self.scene.lag == 0)
-
-    def _spectrum_of(self, matrix: Callable[[], Any], asked: bool) -> Spectrum | None:
-        """None where it is not asked for, cannot be had, or not soon."""
-        if not asked or not self._within_reach:
-            return None
-        try:
-            return spectrum(matrix())
-        except RuntimeError:  # too dear, or not found by ARPACK
-            return None
-
-    def _rule_matrix(self) -> Any:
-        """The rule's own step. With no lag `before` is -b where particles move, so that the sum has
-        no memory left."""
-        both = self.operator.couplings_both.entries()
-        share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(both.shape[0])
-        rest = Entries(every, every, np.full(len(every), 1.0 - share), both.shape)
-        return rest.plus(both, share).matrix()
+        """What is not known because it would take too long, and why."""
+        found, solver = self.spectra.left_out, self.scene.experiment.stepping
+        if not self.estimated:
+            return found
+        if solver.memory > 0.0 and self.swing(solver.relaxation, solver.memory) is None:
+            found.append(
+                "analysis: the period is left out, a body of this size has many modes between "
+                "those that creep back and those that swing"
+            )
+        moves = self.scene.experiment.solver.makes_steps and fastest(self.scene).speed > 0.0
+        if moves and self.stable and self.trailing is None:
+            found.append(
+                "analysis: the lag is left out, in their fastest steps leaders do not hold the body"
+            )
+        return found
 
     @property
     def spectral_radius(self) -> float | None:
@@ -110,19 +97,19 @@ class Analysis:
     @property
     def smallest_eigenvalue(self) -> float | None:
         """min Re λ of the rule's own step."""
-        return self._rule_spectrum.smallest if self._rule_spectrum else None
+        return self.spectra.of_rule.smallest if self.spectra.of_rule else None
 
     @property
     def largest_stable_relaxation(self) -> float | None:
         """The relaxation below which all modes shrink, with the memory as it is:
         2 (1 + b) / (1 - λ_min) for real eigenvalues."""
-        own, memory = self._rule_spectrum, self.scene.experiment.stepping.memory
+        own, memory = self.spectra.of_rule, self.scene.experiment.stepping.memory
         return largest_stable_relaxation(own.eigenvalues, memory) if own else None
 
     @property
     def best_memory(self) -> float | None:
         """(1 - √(1 - ρ))², the memory that settles fastest without relaxation, for 0 ≤ ρ < 1."""
-        own = self._rule_spectrum
+        own = self.spectra.of_rule
         if own is None or not own.symmetric or not 0.0 <= own.largest < 1.0:
             return None
         return (1.0 - math.sqrt(1.0 - own.largest)) ** 2
@@ -137,7 +124,7 @@ class Analysis:
 
         None where the rule's own eigenvalues are not known: the frame lags, neighbours are found
         anew, the body is too large."""
-        own = self._rule_spectrum
+        own = self.spectra.of_rule
         if own is None:
             return None
         found = modes(own.eigenvalues, relaxation, memory)
@@ -146,14 +133,16 @@ class Analysis:
     def swing(self, relaxation: float, memory: float) -> Swing | None:
         """The slowest swinging mode with that relaxation and memory: 2π / arg μ in steps, and |μ|,
         √memory for real eigenvalues. None where no mode swings, or as for `stable_at`."""
-        own = self._rule_spectrum
+        own = self.spectra.of_rule
         if own is None:
             return None
         known = own.eigenvalues
+        if self.estimated and own.largest > swings_below(relaxation, memory):
+            return None
         if 0.0 < memory < 1.0 and own.largest > (edge := swings_below(relaxation, memory)):
             # The slowest modes creep back. Of large groups, those that just swing are not known.
             try:
-                known = np.append(known, just_below(self._rule_matrix(), edge))
+                known = np.append(known, just_below(self.spectra.rule_matrix(), edge))
             except RuntimeError:  # too dear, or not found by ARPACK
                 return None
         return slowest_swing(modes(known, relaxation, memory))
@@ -172,8 +161,30 @@ class Analysis:
 
         None where no leader moves steadily, steps do not settle or are not made, or it would cost
         too much."""
-        makes_steps = self.scene.experiment.solver.makes_steps
-        return lag_of(self.scene) if makes_steps and self._within_reach and self.stable else None
+        if not (self.scene.experiment.solver.makes_steps and self.stable):
+            return None
+        if self.estimated:
+            return lag_of(
+                self.scene,
+                self.spectra.estimate.at_rest,
+                self.spectra.estimate.system,
+                self._slowness,
+            )
+        state = initial_state(self.scene)
+
+        def system_at(step: int) -> System:
+            return linearised(self.scene, state, step, "auto", Watch())
+
+        return lag_of(self.scene, state, system_at, self._slowness)
+
+    @property
+    def _slowness(self) -> float:
+        """1 / (1 - λ) of the slowest mode that fades, without memory."""
+        assert self.spectrum
+        own = self.spectra.of_rule or self.spectrum
+        fading = 1.0 - own.eigenvalues.real
+        relaxation = self.scene.experiment.stepping.relaxation
+        return float(1.0 / (relaxation * fading[fading > NEUTRAL].min(initial=1.0)))
 
     @property
     def lag(self) -> float | None:
@@ -184,7 +195,7 @@ class Analysis:
     @cached_property
     def parts_without_leader(self) -> list[Any]:
         """The numbers of the particles of each part that no leader reaches."""
-        if not self._within_reach:
+        if not self.spectra.has_matrix:
             return []
         operator = self.operator
         both = operator.couplings_both.entries()
@@ -221,6 +232,19 @@ class Analysis:
                 "solver.relaxation: a mode that changes its sign in every step never decays; take "
                 "a relaxation below 1"
             )
+        found += self._edges_near_the_bound()
         bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
         late = self.trailing.late(bond) if self.trailing else []
         return [*found, *late, *self.left_out]
+
+    def _edges_near_the_bound(self) -> list[str]:
+        """A warning where the bound is that of waves and free edges may have a lower one."""
+        frame, bound = self.scene.experiment.frame, self.largest_stable_relaxation
+        bare = not bounds_the_body(self.scene) and not frame.weighs_cells
+        relaxation = self.scene.experiment.stepping.relaxation
+        if not (self.estimated and bare and bound and NEAR * bound < relaxation < bound):
+            return []
+        return [
+            f"solver.relaxation: {relaxation:g} is near the bound of plane waves, {bound:.4g}, and "
+            "edges without a frame may have one up to 10 % lower"
+        ]

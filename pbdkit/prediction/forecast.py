@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.analysis.analysis import NO_REMEDY, Analysis
 from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
+from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.scene.sizes import MIB, sizes_of
+from pbdkit.scene.sizes import MIB, Sizes, sizes_of
+from pbdkit.scene.solver_sizes import LARGEST_DIRECT
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Forecast:
     memory, the period in steps of the slowest mode that swings and by what it shrinks a step, None
     where nothing swings; by how much the body trails its equilibrium in the leaders' fastest steps,
     in lattice units, once that is steady and when these steps end, None where no leader moves
-    steadily; whether what the analysis found is exact, or linearised at the start; warnings."""
+    steadily; whether what the analysis found is exact, or linearised at the start; whether it is
+    estimated, 1 - ρ to 1 %; warnings."""
 
     particles: int
     followers: int
@@ -43,6 +45,7 @@ class Forecast:
     period: float | None
     decay: float | None
     exact: bool
+    estimated: bool
     lag: float | None
     lag_reached: float | None
     warnings: list[str]
@@ -54,16 +57,16 @@ class Forecast:
 
 ANALYSED = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
-    *("exact", "lag"),
+    *("exact", "estimated", "lag"),
 )
 """What the analysis calls by the same names."""
 
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
-    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
     kinds = kinds_at(scene.raster, scene.leading, 1)
     analysis, solver = Analysis(scene), scene.experiment.stepping
+    sizes = _sizes(analysis)
     swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
     waves = [] if analysis.spectrum else _growing_waves(scene)
     return Forecast(
@@ -80,6 +83,15 @@ def forecast(scene: Scene) -> Forecast:
         warnings=[*_doubts(scene), *analysis.warnings(), *waves],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
+
+
+def _sizes(analysis: Analysis) -> Sizes:
+    """Of a large equilibrium by what serves it."""
+    scene = analysis.scene
+    count, grids = scene.raster.count, True
+    if count > LARGEST_DIRECT and not scene.experiment.solver.makes_steps:
+        grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
+    return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
 
 def quick_warnings(scene: Scene) -> tuple[str, ...]:
