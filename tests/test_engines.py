@@ -1,13 +1,13 @@
 """Every engine gives the numbers of the numpy engine, to the last bit."""
 
 import time
-from contextlib import contextmanager
 
 import numba
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from interpreted_kernels import interpreting
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
 from remembering_parts import Tiring, Weakest
 from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
@@ -65,36 +65,22 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
     return reference
 
 
-@samples(40)
+@samples(30)
 @given(experiments())
 def test_the_kernels_logic_on_random_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@samples(40)
+@samples(30)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
 def test_the_kernels_logic_on_torn_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@samples(40)
+@samples(30)
 @given(calibrated_experiments())
 def test_the_kernels_logic_on_calibrated_scenes(experiment):
     compare_interpreted(experiment)
-
-
-@contextmanager
-def interpreting():
-    """Kernels' sources are run by Python itself: compiling each takes seconds."""
-    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
-        patch.setattr(numba.config, "DISABLE_JIT", 1)
-        yield
-
-
-@pytest.fixture
-def interpreted():
-    with interpreting():
-        yield
 
 
 def compare_interpreted(experiment):
