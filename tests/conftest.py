@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import settings
+from interpreted_kernels import interpreting
 
 import pbdkit
 from pbdkit.cli import main
@@ -101,6 +102,13 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     yield make
     for module in modules:
         sys.modules.pop(module, None)
+
+
+@pytest.fixture
+def interpreted() -> Iterator[None]:
+    """Kernels are run by Python itself."""
+    with interpreting():
+        yield
 
 
 @pytest.fixture

@@ -4,33 +4,45 @@ import json
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from typing import Literal
 
-import numba
 import pytest
 from faulty import others, remembering, rules
 from faulty.kagome import Kagome, OnKagome
+from interpreted_kernels import interpreting
 from pydantic import Field
 
 import pbdkit
 from pbdkit.components import pbdkit_components
 from pbdkit.components.rules import MixedCoordinate
-from pbdkit.interfaces import INTERFACES
+from pbdkit.interfaces import INTERFACES, FollowerRule, FractureModel
 from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of, properties_of
-from pbdkit.testing.subject import full_name
+from pbdkit.testing.subject import LATTICES, full_name
 
-test_built_in_components_conform = conformance(*pbdkit_components())
-FURTHER = [full_name(e) for c in pbdkit_components() for e in examples_of(c)[1:]]
+BUILT_IN = [(e, n) for c in pbdkit_components() for n, e in enumerate(examples_of(c))]
+FIRST = [example for example, n in BUILT_IN if n == 0]
+FURTHER = [example for example, n in BUILT_IN if n > 0]
+ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
+
+test_built_in_components_conform = conformance(*FIRST)
+test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO)
+OF_THEIR_OWN = [full_name(e) for e in FIRST if isinstance(e, (FollowerRule, FractureModel))]
+
+
+def is_compiled(node):
+    """One example of each built-in component with functions of its own, and where compiling is what
+    is tried."""
+    test, _, case = node.name.partition("[")
+    if test == "test_built_in_components_conform":
+        return any(case.startswith(f"{name}-") for name in OF_THEIR_OWN)
+    return "compile" in test or case.startswith(rules.Unlike.__name__)
 
 
 @pytest.fixture(autouse=True)
-def interpreted(request, monkeypatch):
-    """One example of each built-in component is compiled; Python itself runs the kernels of the
-    others, as `test_engines` compiles them too."""
-    test, _, example = request.node.name.partition("[")
-    is_further = any(example.startswith(f"{name}-") for name in FURTHER)
-    if test == "test_built_in_components_conform" and is_further:
-        monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+def mostly_interpreted(request):
+    with nullcontext() if is_compiled(request.node) else interpreting():
+        yield
 
 
 SOUND = [
@@ -145,11 +157,8 @@ def test_the_faulty_ones_are_sound_but_for_their_fault(component):
 @pytest.mark.parametrize(
     ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
 )
-def test_every_fault_is_found_and_named(faulty, name, words, monkeypatch):
-    """Python itself runs the kernels that are not to blame: to compile each takes seconds."""
-    if name != "is-the-same-compiled":
-        monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-    report = examine(made(faulty))
+def test_every_fault_is_found_and_named(faulty, name, words):
+    report = examine(made(faulty), **ONE_SITE_AND_TWO)
     assert [outcome.property for outcome in report.failed] == [name], str(report)
     assert words in report.failed[0].reason
 

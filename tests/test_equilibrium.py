@@ -58,8 +58,14 @@ def test_every_method_finds_the_affine_sheet_within_its_certificate(method, size
     assert abs(ds.u.isel(time=-1, axis=1)).max() <= known["distance"]
 
 
+def came_to_rest(state):
+    """Whether the last of some steps, in which every drawn motion has ended, moved nothing."""
+    last, scale = np.abs(state.u - state.previous).max(), max(1.0, np.abs(state.u).max())
+    return state.step >= 100 and last < 1e-15 * scale
+
+
 @pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
-@samples(6)
+@samples(4)
 @given(experiments())
 def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     """Where steps from
@@ -69,25 +75,26 @@ def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     assume(not experiment["neighbours"].get("reevaluate"))
     steps = 1500
     try:
-        straight = run(experiment | {"solver": STRAIGHT, "steps": steps, "diagnostics": []})
         relaxed = {"type": "stepping", "relaxation": 1.0}
         scene = build_scene(pbdkit.Experiment(**experiment | {"solver": relaxed, "steps": steps}))
-        state = Stepper(scene).advance(initial_state(scene), steps)
+        stepper, state = Stepper(scene), initial_state(scene)
+        while not (rests := came_to_rest(state)) and state.step < steps:
+            state = stepper.advance(state, 100)
+        assume(rests)
+        straight = run(experiment | {"solver": STRAIGHT, "steps": steps, "diagnostics": []})
     except (pbdkit.ExperimentError, pbdkit.DivergedError):
         assume(False)
     u = scene.raster.table(state.u)
-    last = np.abs(u - scene.raster.table(state.previous)).max()
     scale = max(1.0, np.abs(u).max())
-    assume(last < 1e-15 * scale)
     found = (straight.position[-1] - straight.reference).values
     reached = certificate(straight)["distance"] + 1e-9 * scale
     assert np.abs(found - u).max() <= reached
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(6, 5), (25, 24)])
+@pytest.mark.parametrize(("columns", "rows"), [(6, 5), (18, 17)])
 def test_a_released_body_keeps_what_stepping_keeps(columns, rows):
     """No leader in the last step: the mean at the release remains (model.md, section 9)."""
-    parts = {"leaders": [pulled(2.0, 1.0, until=7)], "steps": 20_000, "record": {"every": 20_000}}
+    parts = {"leaders": [pulled(2.0, 1.0, until=7)], "steps": 5_000, "record": {"every": 5_000}}
     straight = run(sheet(columns, rows, **parts))
     stepped = run(sheet(columns, rows, **parts, solver={"type": "stepping"}))
     np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-9)
@@ -95,14 +102,14 @@ def test_a_released_body_keeps_what_stepping_keeps(columns, rows):
 
 
 @pytest.mark.parametrize("lag", [0, 1])
-@pytest.mark.parametrize("columns", [6, 14])
+@pytest.mark.parametrize("columns", [6, 10])
 def test_late_leaders_start_where_stepping_has_them(columns, lag):
     leaders = [pulled(1.0, 0.5, until=5), LEFT | {"from": 6}]
     parts = {"leaders": leaders, "frame": {"type": "mean", "lag": lag}}
-    straight = run(sheet(columns, 5, **parts, steps=20_000))
+    straight = run(sheet(columns, 5, **parts, steps=4_000))
     stepped = run(
         sheet(
-            columns, 5, **parts, steps=20_000, record={"every": 20_000}, solver={"type": "stepping"}
+            columns, 5, **parts, steps=4_000, record={"every": 4_000}, solver={"type": "stepping"}
         )
     )
     np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-8)

@@ -154,7 +154,7 @@ def half_period(analysis):
 
 
 thoroughly = settings(
-    max_examples=20,
+    max_examples=12,
     derandomize=True,
     deadline=None,
     phases=[Phase.explicit, Phase.generate],
@@ -174,7 +174,7 @@ def test_runs_settle_and_diverge_at_the_predicted_rate(parts, seed):
     assert 1 / FIVE_PERCENT < excess(scene, analysis, seed) < FIVE_PERCENT
 
 
-@settings(thoroughly, max_examples=25)
+@settings(thoroughly, max_examples=15)
 @given(scenes())
 def test_bodies_are_stable_where_run_says_that_waves_are(parts):
     """What `run` says in milliseconds against what `check` knows."""

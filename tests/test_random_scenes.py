@@ -17,19 +17,19 @@ TOLERANCE = 1e-11
 MEASURED = ["pe1", "pe1_intact", "pe2", "u", "broken_bonds"]
 
 
-@samples(50)
+@samples(30)
 @given(experiments())
 def test_matches_the_plain_loops(experiment):
     compare(experiment)
 
 
-@samples(50)
+@samples(30)
 @given(experiments(body=grids, start=initials.filter(lambda i: i["type"] == "reference")))
 def test_grids_match_the_plain_loops(experiment):
     compare(experiment)
 
 
-@samples(50)
+@samples(30)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
 def test_fracture_matches_the_plain_loops(experiment):
     compare(experiment)

@@ -41,9 +41,9 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs.py --trials 20 --kinds breaking",
-        "two_writers.py --trials 6 --kinds small",
-        "mutate_stores.py --trials 6 --kinds breaking",
+        "kill_runs.py --trials 8 --kinds breaking",
+        "two_writers.py --trials 3 --kinds small",
+        "mutate_stores.py --trials 4 --kinds breaking",
     ],
 )
 def test_a_sample_of_the_long_trials(trial: str) -> None:

@@ -128,7 +128,7 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
     assert np.array_equal(found, build_scene(pbdkit.Experiment(**given)).cells.share)
 
 
-def test_a_process_reads_a_kernel_once():
+def test_a_process_reads_a_kernel_once(interpreted):
     pytest.importorskip("numba")
     from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 

@@ -1,0 +1,19 @@
+"""Kernels that Python itself runs, from the source that is else compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+
+@contextmanager
+def interpreting() -> Iterator[None]:
+    """For as long as this lasts, here and in processes that are started: to compile each kernel
+    takes seconds. `test_engines` says which are compiled."""
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
+        patch.setattr("numba.config.DISABLE_JIT", 1)
+        patch.setenv("NUMBA_DISABLE_JIT", "1")
+        yield
