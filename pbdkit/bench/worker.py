@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from pbdkit.api import load
 from pbdkit.equilibrium.certificate import Certificate, scale_of
+from pbdkit.equilibrium.grids.inverse_iteration import SlowMode
 from pbdkit.equilibrium.increments import settle
-from pbdkit.equilibrium.inverse_iteration import SlowMode
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.errors import ExperimentError, PbdkitError

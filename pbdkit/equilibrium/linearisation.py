@@ -39,7 +39,7 @@ def linearised(
 
     large = scene.raster.count > LARGEST_DIRECT
     if (method == "multigrid" or (method == "auto" and large)) and find_spec("numba"):
-        from pbdkit.equilibrium.lattice_system import lattice_system
+        from pbdkit.equilibrium.grids.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())

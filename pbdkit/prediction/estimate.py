@@ -17,7 +17,7 @@ import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL, Spectrum, spectrum_of
 from pbdkit.analysis.stencil import wave_bound
-from pbdkit.equilibrium.inverse_iteration import SlowMode
+from pbdkit.equilibrium.grids.inverse_iteration import SlowMode
 from pbdkit.equilibrium.system import StuckError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.memory import machine_memory
@@ -25,7 +25,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
-    from pbdkit.equilibrium.lattice_system import LatticeSystem
+    from pbdkit.equilibrium.grids.lattice_system import LatticeSystem
 
 ACCURACY = 1e-2
 """Of solutions, relative."""
@@ -60,7 +60,7 @@ class Estimate:
     def _made(self, step: int) -> LatticeSystem | None:
         if self.obstacle:
             return None
-        from pbdkit.equilibrium.lattice_system import lattice_system
+        from pbdkit.equilibrium.grids.lattice_system import lattice_system
 
         return lattice_system(self._scene, self.at_rest, step, Watch())
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbdkit.equilibrium.grid_functions import kernels
-from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
+from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
 
 EXACT, DIFFERENCED = 1e-9, 1e-5
 """Relative difference up to which a matrix counts as symmetric: one by derivatives, one by

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.grid_functions import kernels
-from pbdkit.equilibrium.multigrid import Multigrid
+from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.multigrid import Multigrid
 
 Floats = NDArray[np.floating[Any]]
 MOST = 400

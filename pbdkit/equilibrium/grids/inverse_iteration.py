@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbdkit.equilibrium.lattice_krylov import Krylov
-from pbdkit.equilibrium.multigrid import Multigrid
+from pbdkit.equilibrium.grids.lattice_krylov import Krylov
+from pbdkit.equilibrium.grids.multigrid import Multigrid
 from pbdkit.equilibrium.system import Floats, System
 
 MOST_TURNS, TURN = 32, 3

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.grid_functions import kernels
-from pbdkit.equilibrium.stencil_matrix import OWN, StencilMatrix, inverses
+from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.stencil_matrix import OWN, StencilMatrix, inverses
 
 Floats = NDArray[np.floating[Any]]
 COARSEST = 200

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import frame_matrices
 from pbdkit.analysis.linear_response import Response, by_sublattice, respond
-from pbdkit.equilibrium.grid_functions import kernels
+from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.primitive_raster import PrimitiveRaster, primitive_step
 from pbdkit.equilibrium.moves import Moves
-from pbdkit.equilibrium.primitive_raster import PrimitiveRaster, primitive_step
 from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import slot_step

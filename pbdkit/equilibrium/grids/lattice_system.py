@@ -18,30 +18,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.grid_functions import kernels
-from pbdkit.equilibrium.inverse_iteration import SlowMode, softest
-from pbdkit.equilibrium.lattice_krylov import (
+from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.inverse_iteration import SlowMode, softest
+from pbdkit.equilibrium.grids.lattice_krylov import (
     BiconjugateGradients,
     ConjugateGradients,
     Descent,
     Found,
     Krylov,
 )
-from pbdkit.equilibrium.moves import Moves, random_displacements
-from pbdkit.equilibrium.multigrid import FloatingError, Multigrid
-from pbdkit.equilibrium.stencil_matrix import (
+from pbdkit.equilibrium.grids.multigrid import FloatingError, Multigrid
+from pbdkit.equilibrium.grids.stencil_matrix import (
     NUDGE,
     StencilMatrix,
     differenced_matrix,
     stencil_matrix,
 )
-from pbdkit.equilibrium.stencil_properties import (
+from pbdkit.equilibrium.grids.stencil_properties import (
     DIFFERENCED,
     EXACT,
     balanced,
     is_held,
     leads_one_way,
 )
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene

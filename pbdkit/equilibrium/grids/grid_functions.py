@@ -15,6 +15,6 @@ def kernels() -> SimpleNamespace:
     """The compiled functions: how grids are made, what is done on one, and with whole fields."""
     found: dict[str, Any] = {}
     for name in ("coarsening", "grid", "field"):
-        file = files("pbdkit.equilibrium").joinpath(f"{name}_kernels.py")
+        file = files("pbdkit.equilibrium.grids").joinpath(f"{name}_kernels.py")
         found |= load_kernel(file.read_text(encoding="utf-8"), {}, ()).__globals__
     return SimpleNamespace(**found)

@@ -1,0 +1,1 @@
+"""Linear systems on the stencils of a lattice: multigrid, compiled, without a matrix."""
