@@ -18,12 +18,13 @@ from pbdkit.components import pbdkit_components
 from pbdkit.components.rules import MixedCoordinate
 from pbdkit.interfaces import INTERFACES, FollowerRule, FractureModel
 from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of, properties_of
-from pbdkit.testing.subject import LATTICES, full_name
+from pbdkit.testing.subject import LATTICES, NEIGHBOURS, full_name
 
 BUILT_IN = [(e, n) for c in pbdkit_components() for n, e in enumerate(examples_of(c))]
 FIRST = [example for example, n in BUILT_IN if n == 0]
 FURTHER = [example for example, n in BUILT_IN if n > 0]
 ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
+NEAREST = {"neighbours": [NEIGHBOURS["coordination-1"], NEIGHBOURS["chebyshev-1"]]}
 
 test_built_in_components_conform = conformance(*FIRST)
 test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO)
@@ -150,7 +151,7 @@ def made(faulty):
 
 @pytest.mark.parametrize("component", SOUND, ids=lambda c: c.type)
 def test_the_faulty_ones_are_sound_but_for_their_fault(component):
-    report = examine(component)
+    report = examine(component, **ONE_SITE_AND_TWO)
     assert report.holds, str(report)
 
 
@@ -158,7 +159,7 @@ def test_the_faulty_ones_are_sound_but_for_their_fault(component):
     ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
 )
 def test_every_fault_is_found_and_named(faulty, name, words):
-    report = examine(made(faulty), **ONE_SITE_AND_TWO)
+    report = examine(made(faulty), **ONE_SITE_AND_TWO, **NEAREST)
     assert [outcome.property for outcome in report.failed] == [name], str(report)
     assert words in report.failed[0].reason
 

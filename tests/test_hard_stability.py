@@ -173,7 +173,7 @@ def test_case_15_the_distance_weighted_rule_runs_as_printed_with_the_warning():
     ids=["relaxation", "memory", "both"],
 )
 def test_case_16_divergence_is_warned_of_and_stopped_and_the_last_good_state_kept(
-    solver, waves, exact, engine, call, tmp_path
+    solver, waves, exact, engine, call, tmp_path, interpreted
 ):
     sparse = experiment(8, 6, leaders=[HOLD_LEFT, pull_right(0.1, 0.0)], steps=3000)
     sparse |= {"solver": {"type": "stepping", "engine": engine} | solver}

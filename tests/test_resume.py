@@ -40,7 +40,10 @@ RUNS: dict[str, dict[str, Any]] = {
     "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
     "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
     "equilibrium": {"solver": {"type": "equilibrium"}},
-    "equilibrium, fracture": {"solver": {"type": "equilibrium"}, "fracture": FRACTURE},
+    "equilibrium, fracture": {
+        "solver": {"type": "equilibrium", "increments": 20},
+        "fracture": FRACTURE,
+    },
 }
 
 

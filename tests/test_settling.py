@@ -63,7 +63,7 @@ def error_of(ds, rest):
     return float(np.hypot(*(u - rest).T)[ds.kind[-1].values == 1].max(initial=0.0))
 
 
-@samples(6)
+@samples(4)
 @given(experiments(), st.sampled_from([1e-2, 1e-4, 1e-7]))
 def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tolerance):
     """All lattices, rules, frames, motions and fracture, against the steps themselves."""
@@ -87,9 +87,15 @@ def test_no_random_scene_ends_farther_from_equilibrium_than_certified(drawn, tol
         assert broken.max() <= steps_of(ds)
 
 
-@pytest.mark.parametrize("lattice", LATTICES)
-@pytest.mark.parametrize("rule", ["barycentre", "mean-displacement", "mixed-coordinate"])
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
+@pytest.mark.parametrize(
+    ("lattice", "rule", "tolerance"),
+    # Any two of them meet, and not any three.
+    [
+        (lattice, rule, (1e-2, 1e-6)[(n + m) % 2])
+        for n, lattice in enumerate(LATTICES)
+        for m, rule in enumerate(("barycentre", "mean-displacement", "mixed-coordinate"))
+    ],
+)
 def test_it_ends_hardly_after_the_first_step_within_the_tolerance(lattice, rule, tolerance):
     near = {"type": "chebyshev", "shells": 1}
     parts = {"lattice": lattice, "rule": rule, "neighbours": near}
@@ -270,7 +276,7 @@ def test_diagnostics_of_every_step_end_with_the_run_and_it_repeats_itself():
     np.testing.assert_array_equal(again.position, ds.position)
 
 
-def test_both_engines_end_at_the_same_step():
+def test_both_engines_end_at_the_same_step(interpreted):
     pytest.importorskip("numba")
     ends = [run(sheet(solver={"engine": engine})) for engine in ("numpy", "compiled")]
     assert steps_of(ends[0]) == steps_of(ends[1])
@@ -336,9 +342,16 @@ def test_runs_without_it_import_nothing_of_it():
     assert done.stdout.strip() == "[]", done.stderr
 
 
-@pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
-@pytest.mark.parametrize("memory", [0.0, 0.3])
-@pytest.mark.parametrize("frame", ["mean", "lag"])
+@pytest.mark.parametrize(
+    ("rule", "memory", "frame"),
+    # Any two of them meet, and not any three.
+    [
+        ("barycentre", 0.0, "mean"),
+        ("barycentre", 0.3, "lag"),
+        ("mixed-coordinate", 0.0, "lag"),
+        ("mixed-coordinate", 0.3, "mean"),
+    ],
+)
 def test_a_large_released_body_settles_within_what_is_certified(rule, memory, frame):
     """More than 500 unknowns that nothing holds, which keep what they had at the release."""
     solver = {"memory": memory, "relaxation": 0.9}
