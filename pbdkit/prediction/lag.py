@@ -40,6 +40,8 @@ DEAREST = 2e8
 """Products of numbers that are made at most to know the lag at the end of an interval."""
 ACCURACY = 1e-2
 """Of solutions by iteration, as a share of what they were taken to come to."""
+EARLY = 0.01
+"""Up to this share of 1 / (1 - λ) hardly anything fades that was pushed."""
 FINEST = 1e-12
 """The finest accuracy asked for."""
 FAR, TURNS = 8.0, 4
@@ -100,7 +102,7 @@ class Trail:
         direct, shown = edge.moves(v), edge.moves(edge.shown(v))
         if not (direct + shown).any():
             return None
-        size, accuracy = float(np.abs(v).max()), ACCURACY
+        size, accuracy = float(np.abs(v).max()), 0.1
         while True:
             # What is wrong with δ may grow by the slowness in A⁻¹ δ.
             accuracy *= ACCURACY
@@ -160,11 +162,14 @@ def _reached_exactly(scene: Scene, trail: Trail, first: int, steps: int) -> floa
 def _reached_about(
     scene: Scene, trail: Trail, system: System, slowness: float, steps: int
 ) -> float | None:
-    """The same where the step has no memory, e = (1 - Pⁿ) A⁻¹ push: with P on the span of A⁻¹ push
-    and A⁻² push, and no more than the pushes together. Within 10 %."""
+    """The same where the step has no memory, e = (1 - Pⁿ) A⁻¹ push, within 10 %: at first all
+    pushes together, later with P on the span of A⁻¹ push and A⁻² push."""
     if scene.lag or scene.experiment.stepping.memory:
         return None
     e = trail.steady
+    most = min(_largest(e), steps * _largest(trail.push))
+    if steps <= EARLY * slowness:
+        return most
     try:
         further = _solved(system, e, slowness * float(np.abs(e).max()))
     except StuckError:
@@ -172,7 +177,6 @@ def _reached_about(
     basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, further), (trail.push, e)))
     A = np.linalg.solve(basis @ basis.T, basis @ images.T)
     left = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
-    most = min(_largest(e), steps * _largest(trail.push))
     return min(most, _largest((1.0 - left[0]) * e - left[1] * further))
 
 
