@@ -44,6 +44,8 @@ OUT = Path("out.nc")
         "kill_runs.py --trials 8 --kinds breaking",
         "two_writers.py --trials 3 --kinds small",
         "mutate_stores.py --trials 4 --kinds breaking",
+        "equilibria.py fracture --trials 3",
+        "equilibria.py certificates --trials 5",
     ],
 )
 def test_a_sample_of_the_long_trials(trial: str) -> None:
