@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.equilibrium.grids.grid_functions import kernels
 from pbdkit.equilibrium.grids.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
@@ -58,18 +59,31 @@ def leads_one_way(matrix: StencilMatrix) -> bool:
 
 
 def is_held(matrix: StencilMatrix) -> bool:
-    """Whether every connected part of the body touches a leader, and no neighbours are apart."""
+    """Whether every connected part of the body touches a leader, and no neighbours are apart, as
+    across a crack: without a bond, and without a neighbour that both have one with."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
-    lone = np.nonzero(matrix.code > 0)
-    of_lone = bonds[matrix.code[lone]]
     known = bonds.any(axis=0)
-    for s in np.flatnonzero(known):
-        there = matrix.kind[lone[0] + s // 3 - 1, lone[1] + s % 3 - 1] != OUTSIDE
-        if (there & ~of_lone[:, s]).any():
-            return False
+    if any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist()):
+        return False
     pattern = (known | known[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
     touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
     return bool(np.count_nonzero(touched) == count)
+
+
+def _apart(matrix: StencilMatrix, bonds: NDArray[np.bool_], s: int) -> bool:
+    """Whether there are such neighbours along place s of the stencils."""
+    row, place = np.nonzero(matrix.code > 0)
+    down, along = s // 3 - 1, s % 3 - 1
+    there = matrix.kind[row + down, place + along] != OUTSIDE
+    some = np.flatnonzero(there & ~bonds[matrix.code[row, place], s])
+    one = matrix.code[row[some], place[some]]
+    other = matrix.code[row[some] + down, place[some] + along]
+    linked = other < 0  # a leader: nothing moves it
+    for t in range(9):
+        a, b = t // 3 - 1 - down, t % 3 - 1 - along
+        if max(abs(a), abs(b)) <= 1:
+            linked |= bonds[one, t] & bonds[other, 3 * (a + 1) + b + 1]
+    return not linked.all()
