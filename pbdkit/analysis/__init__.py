@@ -1,1 +1,1 @@
-"""What is known of a run before its first step: the step operator, its spectrum, predictions."""
+"""What a step is to small displacements: the step operator, its spectrum, plane waves."""

@@ -13,6 +13,7 @@ from pbdkit.analysis.couplings import Entries
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.analysis.spectrum import Spectrum, excess, modes, spectrum, spectrum_of
 from pbdkit.equilibrium.linearisation import LARGEST_DIRECT
+from pbdkit.equilibrium.system import one_thread
 from pbdkit.prediction.estimate import Estimate
 from pbdkit.scene.scene import Scene
 
@@ -89,7 +90,8 @@ class Spectra:
         if not asked or not self.has_matrix:
             return None
         try:
-            return spectrum(matrix())
+            with one_thread():
+                return spectrum(matrix())
         except RuntimeError:  # too dear, or not found by ARPACK
             return None
 
