@@ -178,12 +178,8 @@ COMPILED = {
         "frame": {"type": "traction-free"},
         "fracture": TORN,
     },
-    "strength by bond in cut cells, in single precision": CUT["square"]
-    | {
-        "fracture": SCATTERED,
-        "initial": {"type": "noise", "amplitude": 0.3},
-        "solver": {"type": "stepping", "precision": "float32", "relaxation": 0.9},
-    },
+    "strength by bond in cut cells": CUT["square"]
+    | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
     "damage, numbers of particles, frame spared": {
         "rule": Tiring(spread=0.1),
         "fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False},
@@ -196,7 +192,8 @@ COMPILED = {
     "found anew, numbers of particles": {"neighbours": ANEW, "rule": Tiring(spread=0.1)},
 }
 """Each kind of code that kernels are made of, several together in each; one rule that moves by
-another is compiled for threads, below, and the built-in functions in `test_conformance`."""
+another is compiled for threads, below, single precision in `test_fracture_models`, and the built-in
+functions in `test_conformance`."""
 
 
 @pytest.mark.parametrize("parts", COMPILED.values(), ids=COMPILED)
