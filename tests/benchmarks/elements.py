@@ -34,7 +34,7 @@ from pbdkit.scene.scene import build_scene
 CELLS = (10, 20, 40, 80, 160, 320, 640)
 TURNS, ENOUGH_S = 7, 2.0
 """So many turns, fewer of what takes long; pbdkit's first may compile, so that it has two."""
-PATIENCE_S, GROWTH = 30.0, 6.0
+PATIENCE_S, GROWTH = 15.0, 6.0
 """What would take longer at the next size, by its growth, is left out."""
 WANTED = {1e-3: 4.0, 2e-4: 10.0}
 """Errors, and by how many times pbdkit is to be faster there."""
