@@ -106,6 +106,10 @@ class Plan:
         """A literal in the scene's precision."""
         return f"real({float(value)!r})" if self.real == "real" else repr(float(value))
 
+    def rounded(self, value: str) -> str:
+        """A word for a value in the scene's precision: numbers of Python's count as such."""
+        return f"real({value})" if self.real == "real" else value
+
     def each(self, pattern: str) -> list[str]:
         """The pattern for each axis, with its name for `@` and its number for `#`."""
         return [pattern.replace("@", c).replace("#", str(a)) for a, c in enumerate(self.axes)]

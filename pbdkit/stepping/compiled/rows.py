@@ -67,7 +67,10 @@ def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, 
         difference(plan, level, f"n{k}@[j]"),
         *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", f"f{k}[j]"),
         contributions(level, r, listed(weights.values())),
-        *(f"t{n} = t{n} + c{n}" if k else f"t{n} = c{n}" for n in range(len(level.totals))),
+        *(
+            f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
+            for n in range(len(level.totals))
+        ),
     ]
 
 

@@ -97,5 +97,5 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
     out.add(2, contributions(level, "r", values(level.seen.weights, named)))
     for n, t in enumerate(sums):
-        out.add(2, f"{t} = {t} + (c{n} if is_there else {plan.number(0.0)})")
+        out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")
