@@ -132,7 +132,7 @@ def test_a_file_is_refused_at_once(refused: Refused, text: str | bytes, expected
     assert agrees(message, expected), message
     taken = time.process_time() - begun
     gc.unfreeze()
-    assert taken < 2.0
+    assert taken < 5.0
 
 
 READ = {
