@@ -63,7 +63,7 @@ def held_as(field, parts, width):
     them, and the solution at all particles."""
     base = {"name": "patch", "leaders": [], "steps": 1, "solver": {"type": "equilibrium"}} | parts
     scene = build_scene(pbdkit.Experiment(**base))
-    stiffness = scene.experiment.rule.stiffness()
+    stiffness = scene.experiment.rule.elasticity()
     X = scene.raster.reference(scene.raster.body_rows)
     exact = np.stack(field(*X.T, stiffness.xy / stiffness.yy), axis=1)
     ends = (X[:, 0] < X[:, 0].min() + width) | (X[:, 0] > X[:, 0].max() - width)

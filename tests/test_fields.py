@@ -66,7 +66,7 @@ def test_solutions_have_their_strain_rotation_and_stress_everywhere(name, field)
     """Small rotation, free tension and pure bending: at edges and leaders too."""
     given, _ = held_as(field, CASES[name], width=0.3)
     ds = pbdkit.run(given | {"diagnostics": FIELDS}, progress=False)
-    c = build_scene(pbdkit.Experiment(**given)).experiment.rule.stiffness()
+    c = build_scene(pbdkit.Experiment(**given)).experiment.rule.elasticity()
     contraction, modulus = c.xy / c.yy, E * (c.xx - c.xy**2 / c.yy)
     y = ds.reference.values[(ds.kind[-1] != FRAME).values, 1]
     x = ds.reference.values[(ds.kind[-1] != FRAME).values, 0]

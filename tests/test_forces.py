@@ -126,7 +126,7 @@ def test_the_energy_of_any_state_is_that_of_its_cells(lattice, body):
     """Σ share ½ uᵀK u with the cells' own matrices, cut cells too."""
     parts = LATTICES[lattice] | {"rule": AUXETIC, "body": body}
     scene, u, energy = random_state(parts)
-    stiffness, expected = scene.experiment.rule.stiffness(), 0.0
+    stiffness, expected = scene.experiment.rule.elasticity(), 0.0
     lattice = scene.experiment.lattice
     K = rectangle_matrix(stiffness, lattice.a, getattr(lattice, "b", lattice.a))
     K = K.reshape(8, 8)

@@ -91,7 +91,10 @@ def has_neighbours(scene: Scene, place: Indices) -> Present:
 def _differ(scene: Scene, state: State) -> bool:
     """Whether what is remembered of bonds or particles, and reaches the rule, is not the same
     everywhere."""
-    of_bonds = state.bond_values if isinstance(scene.experiment.fracture, Softens) else ()
+    if scene.constants.by_particle:
+        return True
+    of_bonds = list(state.bond_values) if isinstance(scene.experiment.fracture, Softens) else []
+    of_bonds += scene.constants.by_bond.values() if of_bonds else ()
     return any((values != values.flat[0]).any() for values in (*of_bonds, *state.particle_values))
 
 
@@ -106,8 +109,9 @@ def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple
     neighbours = around.neighbours(state)
     code = np.zeros(len(some), np.int64)
     if scene.cells:
-        left = np.array([np.broadcast_to(to.w.left, some.shape) for to in neighbours])
-        cut = (left != 1.0).any(axis=0)
+        kinds = [to.w.left for to in neighbours] + [w.left for to in neighbours for w in to.more]
+        left = np.array([np.broadcast_to(shares, some.shape) for shares in kinds])
+        cut = (left[: len(neighbours)] != 1.0).any(axis=0)
         code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
@@ -130,7 +134,7 @@ def _plain(scene: Scene, state: State, sublattice: int) -> Present:
     here = block.within(plain)
     here[...] = True
     there = raster.kind != EMPTY
-    whole = scene.cells.share == 1.0 if scene.cells else there
+    whole = scene.cells.weight == 1.0 if scene.cells else there
     for slot in around.slots[sublattice]:
         here &= block.seen_through(slot).of(there)
         if state.broken_step is not None:
@@ -149,9 +153,9 @@ class _Followers:
     def __init__(
         self, scene: Scene, state: State, sublattice: int, place: Indices, answer: str
     ) -> None:
-        self._evaluator, self._name = Evaluator(scene), answer
-        self._answer = {"move": self._evaluator.move, "force": self._evaluator.force}[answer]
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
+        self._evaluator, self._name = Evaluator(scene).given(around.parameters), answer
+        self._answer = {"move": self._evaluator.move, "force": self._evaluator.force}[answer]
         u = state.u.astype(float, copy=False)
         self._here, self._slots = around.here(u, state), around.slots
         self._d = dict(zip(around.slots, around.differences(u), strict=True))

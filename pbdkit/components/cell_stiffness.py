@@ -34,7 +34,9 @@ def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
     B = np.zeros((3, len(gradient), 2))
     B[0, :, 0] = B[2, :, 1] = gradient[:, 0]
     B[1, :, 1] = B[2, :, 0] = gradient[:, 1]
-    C = np.array([[c.xx, c.xy, 0.0], [c.xy, c.yy, 0.0], [0.0, 0.0, c.shear]])
+    C = np.array(
+        [[c.xx, c.xy, c.x_shear], [c.xy, c.yy, c.y_shear], [c.x_shear, c.y_shear, c.shear]]
+    )
     K: Floats = area * np.einsum("ima,ij,jnb->manb", B, C, B)
     return K
 

@@ -12,9 +12,9 @@ from pbdkit.components.cell_stiffness import on_both_sides
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
-    Calibrated,
     FollowerRule,
     Here,
+    MixesCells,
     Setting,
     Slot,
     Stiffness,
@@ -23,7 +23,13 @@ from pbdkit.interfaces import (
 )
 
 
-class CellElastic(Calibrated, FollowerRule):
+Factor = Annotated[
+    float,
+    Field(ge=1e-9, le=1e9, description="Stiffness over that of the material.", examples=[10.0]),
+]
+
+
+class CellElastic(MixesCells, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -36,14 +42,17 @@ class CellElastic(Calibrated, FollowerRule):
     linear: ClassVar[bool] = True
     uses_cells: ClassVar[bool] = True
 
+    stiffness: Factor = 1.0
+
     @abstractmethod
     def material(self) -> tuple[float, Stiffness]:
         """A modulus over Young's, and the stiffness over that modulus: its ratios are finite for
         every material that the rule takes."""
 
-    def stiffness(self) -> Stiffness | None:
-        """Ratios times modulus, where that is finite."""
+    def elasticity(self) -> Stiffness | None:
+        """Ratios times modulus and `stiffness`, where the modulus is finite."""
         modulus, ratios = self.material()
+        modulus *= self.stiffness
         finite = math.isfinite(modulus)
         return Stiffness(*(modulus * ratio for ratio in ratios)) if finite else None
 
@@ -56,20 +65,23 @@ class CellElastic(Calibrated, FollowerRule):
                 "({type: chebyshev, shells: 1}) and, where it is isotropic, on the hexagonal "
                 "lattice with 6 ({type: coordination, shells: 1})"
             )
-        xx, yy, xy, shear = ratios
+        xx, yy, xy, shear = ratios[:4]
         isotropic = xx == yy and math.isclose(xx, xy + 2 * shear, rel_tol=1e-12)
         if setting.cells.regular == 3 and not isotropic:
             raise ExperimentError(
                 f"'{self.type}' is not isotropic and goes with the square or rectangular lattice"
             )
-        return {"modulus": modulus}
+        return {"modulus": self.stiffness * modulus}
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
         to the right the transpose; a cell on both sides counts half on each."""
-        left, right = on_both_sides(slot, self.material()[1], setting.cells)
-        mean = (left + right.T) / 2
-        return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
+        return _weights(slot, setting, self.material()[1])
+
+    def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
+        """The same of cells of that stiffness."""
+        modulus = self.stiffness * self.material()[0]
+        return _weights(slot, setting, Stiffness(*(value / modulus for value in c)))
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
@@ -88,6 +100,12 @@ class CellElastic(Calibrated, FollowerRule):
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · Σ W d."""
         return p.modulus * total[0]
+
+
+def _weights(slot: Slot, setting: Setting, ratios: Stiffness) -> dict[str, float]:
+    left, right = on_both_sides(slot, ratios, setting.cells)
+    mean = (left + right.T) / 2
+    return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
 
 
 def mean_move(total: Any) -> Vector:

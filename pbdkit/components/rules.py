@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from pbdkit.components.elasticity import Factor
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     FollowerRule,
@@ -139,18 +140,20 @@ class Springs(StoresEnergy, FollowerRule):
 
     uses_cells: ClassVar[bool] = True
 
-    def stiffness(self) -> Stiffness:
-        """Plane stress with ν = 1/3, for small strain."""
-        return Stiffness(9 / 8, 9 / 8, 3 / 8, 3 / 8)
+    stiffness: Factor = 1.0
+
+    def elasticity(self) -> Stiffness:
+        """Plane stress with ν = 1/3, for small strain, times `stiffness`."""
+        return Stiffness(*(self.stiffness * ratio for ratio in (9 / 8, 9 / 8, 3 / 8, 3 / 8)))
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Half the spring's stiffness, for each of the cells beside it, and its rest length."""
         cells, rest = setting.cells, math.hypot(*slot.rest)
         if cells.regular == 3:
-            return {"half": OF_TRIANGLE / 2, "rest": rest}
+            return {"half": self.stiffness * OF_TRIANGLE / 2, "rest": rest}
         if cells.regular == 4:
             k = DIAGONAL_OF_SQUARE if cells.is_diagonal(slot) else EDGE_OF_SQUARE
-            return {"half": k / 2, "rest": rest}
+            return {"half": self.stiffness * k / 2, "rest": rest}
         raise ExperimentError(
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"

@@ -23,6 +23,7 @@ from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.parts import brief, fault, open_part, report
 from pbdkit.experiment.record import Record
+from pbdkit.experiment.sampling import sampled
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
@@ -38,6 +39,7 @@ from pbdkit.interfaces import (
     Softens,
 )
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.varying import RESERVED, TakesFields, unknown_regions
 from pbdkit.registry.registry import Registry
 
 
@@ -62,6 +64,16 @@ Name = Annotated[
     str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
 ]
 Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
+def _region(name: str) -> str:
+    if name in RESERVED or not re.fullmatch(_WORD, name):
+        raise fault(
+            f"a region's name may hold letters, digits, '.', '_' and '-', and be none of "
+            f"{', '.join(RESERVED)}; got {brief(name)}"
+        )
+    return name
+
+
+RegionName = Annotated[str, AfterValidator(_region)]
 AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
 
 
@@ -82,6 +94,7 @@ class Experiment(Strict):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
     body: AnyBody
+    regions: dict[RegionName, AnyBody] = {}
     neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
         "coordination"
     )
@@ -122,6 +135,18 @@ class Experiment(Strict):
         for key, clash, text in clashes:
             if clash:
                 raise fault(text, key=key)
+        for field in ("rule", "fracture"):
+            for name, text in unknown_regions(getattr(self, field), self.regions):
+                raise fault(text, key=(field, name))
+            try:
+                self.__dict__[field] = sampled(getattr(self, field), self.lattice, self.body)
+            except ValidationError as error:
+                first = error.errors()[0]
+                raise fault(first["msg"], key=(field, first["ctx"]["key"])) from None
+        for name, region in self.regions.items():
+            if any(box.in_sites for box in region.boxes()):
+                raise fault("counts sites, and a region is a place: take a rectangle",
+                            key=("regions", name))
         return self
 
     @property
@@ -159,6 +184,8 @@ class Experiment(Strict):
         *single, many = (found[field] for field in INTERFACES)
         for part, dumped in zip(self.components(), [*single, *many], strict=True):
             dumped["type"] = self._registry.name_of(part)
+            if isinstance(part, TakesFields):
+                dumped |= {name: field.written() for name, field in part.varying.items()}
         return found
 
     @classmethod
@@ -178,7 +205,7 @@ class Experiment(Strict):
         return isinstance(other, Experiment) and self.__dict__ == other.__dict__
 
     def __hash__(self) -> int:
-        return hash(tuple(self.__dict__.values()))
+        return hash((self.name, self.seed, self.lattice, self.body, self.steps))
 
     @property
     def shows_bonds(self) -> bool:
@@ -201,7 +228,9 @@ class Experiment(Strict):
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:
             self.__pydantic_validator__.validate_python(
-                parts, self_instance=self, context={"registry": registry}
+                parts,
+                self_instance=self,
+                context={"registry": registry, "folder": source.folder},
             )
         except ValidationError as error:
             raise report(error, source) from None

@@ -6,15 +6,18 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import reduce
 from operator import or_
+from pathlib import Path
 from typing import Any
 
 from pydantic import BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.experiment.field_file import read_field
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.varying import TakesFields
 from pbdkit.registry.blame import blame
 from pbdkit.registry.registry import Registry
 
@@ -62,7 +65,8 @@ def _told_once(found: Iterable[Any]) -> Iterator[Any]:
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     where, context = tuple(fault["loc"]), fault.get("ctx", {})
     if "text" in context:
-        return (*where, context["key"]) if "key" in context else where, context["text"]
+        key = context.get("key", ())
+        return (*where, *(key if isinstance(key, tuple) else (key,))), context["text"]
     if fault["type"] in PLAIN:
         return where, PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
     message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
@@ -145,6 +149,8 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     except PluginError as error:
         raise PluginError(str(error), (info.field_name or "", "type")) from None
     parameters = {k: v for k, v in value.items() if k != "type"}
+    if issubclass(part, TakesFields):
+        parameters |= _from_files(parameters, part, info)
     try:
         return part.model_validate(parameters, context=info.context)
     except (ValidationError, PbdkitError, MemoryError):
@@ -153,6 +159,21 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
         if not issubclass(part, tuple(INTERFACES.values())):
             raise
         raise _blame(part, "when given its parameters", error, info) from error
+
+
+def _from_files(
+    parameters: dict[str, Any], part: type[TakesFields], info: ValidationInfo
+) -> dict[str, Any]:
+    """The fields that stand in files, read."""
+    folder, found = Path((info.context or {}).get("folder", "")), {}
+    for name in part.numbers() & parameters.keys():
+        given = parameters[name]
+        if isinstance(given, dict) and "file" in given:
+            try:
+                found[name] = read_field(given, folder)
+            except ValueError as error:
+                raise fault(str(error), key=name) from None
+    return found
 
 
 def _blame(

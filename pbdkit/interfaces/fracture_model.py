@@ -9,15 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces.component import Component, Pair
+from pbdkit.interfaces.component import Pair
 from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.values import Remembers
+from pbdkit.interfaces.varying import TakesFields
 
 Segment = tuple[Pair, Pair]
 """A straight crack, from one point to another (lattice units)."""
 
 
-class FractureModel(Component):
+class FractureModel(TakesFields):
     """Breaks bonds for good, and puts a fictitious point in the place of the lost neighbour.
 
     To add a model, write `breaks` and `fictitious`, both static and elementwise as a rule's

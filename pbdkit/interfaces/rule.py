@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.interfaces.values import Remembers
+from pbdkit.interfaces.varying import TakesFields
 from pbdkit.interfaces.vector import Components
 
 
@@ -31,13 +31,15 @@ class Here(NamedTuple):
 
 
 class Stiffness(NamedTuple):
-    """Plane elasticity along the lattice's axes, over Young's modulus and thickness:
-    σ_x = xx ε_x + xy ε_y, σ_y = xy ε_x + yy ε_y, τ = shear · γ."""
+    """Plane elasticity over Young's modulus and thickness: σ_x = xx ε_x + xy ε_y + x_shear γ,
+    σ_y = xy ε_x + yy ε_y + y_shear γ, τ = x_shear ε_x + y_shear ε_y + shear γ."""
 
-    xx: float
-    yy: float
-    xy: float
-    shear: float
+    xx: Any
+    yy: Any
+    xy: Any
+    shear: Any
+    x_shear: Any = 0.0
+    y_shear: Any = 0.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Setting:
     cells: Tiling = field(default_factory=Tiling)
 
 
-class FollowerRule(Component):
+class FollowerRule(TakesFields):
     """How a follower moves, given its neighbours in the intermediate configuration m.
 
     To add a rule, write `gather` and `apply`, both static and elementwise: the framework calls
@@ -113,7 +115,7 @@ class Calibrated(ABC):
     """A rule that is calibrated to a material: it knows forces."""
 
     @abstractmethod
-    def stiffness(self) -> Stiffness | None:
+    def elasticity(self) -> Stiffness | None:
         """The material whose linear elasticity the rule is; None where its parameters leave it
         without one."""
 
@@ -132,6 +134,16 @@ class StoresEnergy(Calibrated):
     def energy(d: Any, r: Any, w: Any, p: Any) -> Any:
         """The half of a bond's strain energy that falls to this end, over Young's modulus and
         thickness, elementwise."""
+
+
+class MixesCells(Calibrated):
+    """A calibrated rule that works cell by cell, of whatever material each cell is: its numbers may
+    then differ from cell to cell."""
+
+    @abstractmethod
+    def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
+        """The weights of a slot, as `weights`, were the cells of stiffness c over the modulus of
+        the rule: linear in c."""
 
 
 class RenewsParticles(Remembers):
@@ -158,4 +170,4 @@ class AppliesTwice(ABC):
 
 def material_of(rule: FollowerRule) -> Stiffness | None:
     """The material that a rule is calibrated to, if it is."""
-    return rule.stiffness() if isinstance(rule, Calibrated) else None
+    return rule.elasticity() if isinstance(rule, Calibrated) else None

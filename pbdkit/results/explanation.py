@@ -91,7 +91,9 @@ class Explained:
         own = [_last(self._dataset[name]).astype(float) for name in self._remembered]
         for n, plane in enumerate(self._scene.neighbourhood.planes):
             rows = np.flatnonzero(self._scene.bonds.plane == n)
-            c = constants.of_bond(*constants.limits[plane.slot], *(values[rows] for values in own))
+            home = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
+            fixed = constants.limits_at(plane.slot, n, home)
+            c = constants.of_bond(*fixed, *(values[rows] for values in own))
             limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
         return limits
 

@@ -83,28 +83,42 @@ def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
 @dataclass(frozen=True)
 class WeighedCells:
     """The body's cells, weighed: `share` (kind, sublattice, cell, cell) of the cell whose first
-    corner is at that place of the raster, 0 to 1."""
+    corner is at that place of the raster, 0 to 1, None where all are whole; `weight` is the same
+    times its stiffness over that of the rule. Cells whose stiffness is no multiple of that have the
+    weight 0, and in `mixed` their share of each of some stiffnesses, whose `weights` by slot are
+    those of the rule for it."""
 
     tiling: Tiling
-    share: Floats
+    share: Floats | None
+    weight: Floats
+    mixed: tuple[Floats, ...] = ()
+    weights: tuple[dict[Slot, Any], ...] = ()
 
-    def of(self, patch: Patch) -> Floats:
+    def of(self, patch: Patch) -> Floats | float:
         """The shares of the cells of a patch."""
+        if self.share is None:
+            return 1.0
         return patch.corners[0].of(self.share[patch.polygon.kind])
 
-    def beside(self, slot: Slot, where: Where, precision: str) -> tuple[Share, Share]:
-        """The shares to the left and the right of a slot; 1 where all are whole."""
-        left, right = (self._seen(side, where, precision) for side in self.tiling.beside[slot])
+    def beside(
+        self, slot: Slot, where: Where, precision: str, shares: Floats | None = None
+    ) -> tuple[Share, Share]:
+        """The weights, or other `shares`, of the cells to the left and the right of a slot; 1 where
+        all are."""
+        of = self.weight if shares is None else shares
+        left, right = (_seen(of, side, where, precision) for side in self.tiling.beside[slot])
         return left, right
 
-    def _seen(self, side: Side, where: Where, precision: str) -> Share:
-        there = where if side.first is None else where.seen_through(side.first)
-        share = there.of(self.share[side.kind])
-        if (share == 1.0).all():
-            return 1.0
-        share = share.astype(precision)
-        share.flags.writeable = False
-        return share
+
+def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
+    """Of the cell on one side of a slot."""
+    there = where if side.first is None else where.seen_through(side.first)
+    share = there.of(shares[side.kind])
+    if (share == 1.0).all():
+        return 1.0
+    share = share.astype(precision)
+    share.flags.writeable = False
+    return share
 
 
 def _within(raster: Raster, polygon: Polygon) -> Block | None:

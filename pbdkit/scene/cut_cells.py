@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -86,31 +87,35 @@ class _Cutter:
             for some in np.split(cut, range(CELLS_AT_ONCE, len(cut), CELLS_AT_ONCE)):
                 at = [tuple((some - low + step).T) for step in steps]
                 x, y = (np.array([plane[where] for where in at]) for plane in self._at)
-                share[tuple(some.T)] = self._cut_shares(x, y)
+                share[tuple(some.T)] = shares_inside(self._at_places, x, y)
         share[share <= SMALLEST] = 0.0
         return there, share
 
-    def _cut_shares(self, x: Floats, y: Floats) -> Floats:
-        """The share inside of cells with corners (corner, cell): the mean over its triangles, cut
-        into small ones in which the distance is linear."""
-        triangles, n = [(0, 1, 2)], len(x)
-        if n > 3:
-            x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
-            triangles = [(k, (k + 1) % n, n) for k in range(n)]
-        corners = np.array(triangles).T
-        weights, small = _small_triangles()
-        px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
-        nowhere = np.zeros(px.shape, int)
-        distance = self._signed(Sites((nowhere, nowhere), Vector(px, py)))
-        share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
-        cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
-        a, b, c = (distance[corner][..., cut] for corner in small.T)
-        share[cut] = _negative_share(a, b, c).mean(axis=(0, 1))
-        return share
+    def _at_places(self, x: Floats, y: Floats) -> Floats:
+        nowhere = np.zeros(x.shape, int)
+        return self._signed(Sites((nowhere, nowhere), Vector(x, y)))
 
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
         return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+
+
+def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Floats:
+    """The share inside of cells with corners (corner, cell), given the signed distance at places:
+    the mean over its triangles, cut into small ones in which the distance is linear."""
+    triangles, n = [(0, 1, 2)], len(x)
+    if n > 3:
+        x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
+        triangles = [(k, (k + 1) % n, n) for k in range(n)]
+    corners = np.array(triangles).T
+    weights, small = _small_triangles()
+    px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
+    distance = signed(px, py)
+    share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
+    cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
+    a, b, c = (distance[corner][..., cut] for corner in small.T)
+    share[cut] = _negative_share(a, b, c).mean(axis=(0, 1))
+    return share
 
 
 def _shifted(window: Window, step: Index) -> Window:

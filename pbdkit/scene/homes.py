@@ -7,27 +7,34 @@ A new kind of value is declared here: by who sees it, under which name, and wher
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
 from typing import Any
 
 from pbdkit.errors import PluginError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Remembered, Setting, Slot
+from pbdkit.interfaces import FollowerRule, Remembered, Setting, Slot
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
+from pbdkit.scene.places import Floats, Where
 
 WHOLE_CELLS = {"left": 1.0, "right": 1.0}
 """The shares of the cells on both sides of a bond, where no frame weighs cells."""
+
+Planes = Mapping[str, Floats]
 
 
 @dataclass(frozen=True)
 class SceneConstants:
     """Named tuples: the parameters `rule` and `fracture` (``p``); by slot the rule's `weights`
     (``w``) and the fracture model's `limits` (``c`` without what is remembered). `of_bond` makes
-    ``c`` of limits and remembered numbers, `of_particle` ``here.own``."""
+    ``c`` of limits and remembered numbers, `of_particle` ``here.own``.
+
+    Where fields make them differ, `by_particle` has parameters of the rule, (sublattice, cell,
+    cell), and `by_bond` limits, (plane, cell, cell), each by name.
+    """
 
     rule: Any
     weights: dict[Slot, Any]
@@ -35,6 +42,17 @@ class SceneConstants:
     limits: dict[Slot, Any]
     of_bond: Any
     of_particle: Any
+    by_particle: Planes = field(default_factory=dict)
+    by_bond: Planes = field(default_factory=dict)
+
+    def rule_at(self, where: Where) -> Any:
+        """The rule's parameters of some particles."""
+        return self.rule._replace(**{name: where.of(v) for name, v in self.by_particle.items()})
+
+    def limits_at(self, slot: Slot, plane: int, home: Where) -> Any:
+        """The limits of bonds along a slot, where they are kept on a plane."""
+        own = {name: home.within(values[plane]) for name, values in self.by_bond.items()}
+        return self.limits[slot]._replace(**own)
 
 
 def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
@@ -43,8 +61,7 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     rule, fracture = experiment.rule, experiment.fracture
     with blaming(rule, "when asked for its constants", "rule"):
         of_rule = _named("Parameters", rule.parameters(setting))
-        sides = WHOLE_CELLS if rule.uses_cells else {}
-        weights = {s: _named("Weights", rule.weights(s, setting), **sides) for s in slots}
+        weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
@@ -59,6 +76,11 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     own = tuple(number.name for number in particle_numbers(experiment))
     kinds = _kind("Constants", names), _kind("Own", own)
     return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
+
+
+def named_weights(values: Any, rule: FollowerRule) -> Any:
+    """w of what a rule gives for a slot."""
+    return _named("Weights", values, **(WHOLE_CELLS if rule.uses_cells else {}))
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:
@@ -87,6 +109,8 @@ class Home(Enum):
     CELL = "cell"
     BOND = "bond"
     PARTICLE = "particle"
+    FIXED_BOND = "bond, by a field"
+    FIXED_PARTICLE = "particle, by a field"
 
 
 @dataclass(frozen=True)
@@ -119,16 +143,19 @@ def numbers_of(experiment: Experiment, constants: SceneConstants, *, weighs_cell
     weights = next(iter(constants.weights.values()))._fields
     limits = next(iter(constants.limits.values()))._fields
     return Seen(
-        _all(constants.rule._fields, Home.SCENE),
+        _all(constants.rule._fields, Home.SCENE, constants.by_particle, Home.FIXED_PARTICLE),
         tuple(Number(w, Home.CELL if w in shares else Home.SLOT) for w in weights),
         _remembered(particle_numbers(experiment), Home.PARTICLE),
         _all(constants.fracture._fields, Home.SCENE),
-        _all(limits, Home.SLOT) + _remembered(bond_numbers(experiment), Home.BOND),
+        _all(limits, Home.SLOT, constants.by_bond, Home.FIXED_BOND)
+        + _remembered(bond_numbers(experiment), Home.BOND),
     )
 
 
-def _all(names: Iterable[str], home: Home) -> Numbers:
-    return tuple(Number(name, home) for name in names)
+def _all(
+    names: Iterable[str], home: Home, fixed: Container[str] = (), theirs: Home = Home.SCENE
+) -> Numbers:
+    return tuple(Number(name, theirs if name in fixed else home) for name in names)
 
 
 def _remembered(numbers: Iterable[Remembered], home: Home) -> Numbers:

@@ -15,9 +15,11 @@ from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table
+from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
+from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
@@ -114,7 +116,9 @@ def _build(experiment: Experiment) -> Scene:
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += doubts(raster, experiment.leaders)
-    constants = ask_for_constants(experiment, setting_of(raster, neighbourhood))
+    setting = setting_of(raster, neighbourhood)
+    constants = ask_for_constants(experiment, setting)
+    constants = with_fields(constants, experiment, raster, neighbourhood, setting)
     if neighbours.nearness() and any(constants.weights.values()):
         raise ExperimentError(
             f"'{experiment.rule.type}' weighs neighbours by their slots, which re-evaluated "
@@ -125,6 +129,7 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
     cells = filling.on(raster, neighbourhood.tiling)
+    cells = weighed(experiment, raster, setting, cells)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     return with_inner(Scene(experiment, *parts, tuple(warnings)))
 

@@ -47,7 +47,7 @@ class Filling:
         sites = tuple((raster.site_of(rows) - self.first).T)
         for own, share in zip(out, self.share, strict=True):
             own.ravel()[raster.place_of(rows)] = share[sites]
-        return WeighedCells(tiling, out)
+        return WeighedCells(tiling, out, out)
 
 
 def trimmed(low: Index, body: Mask, share: Floats | None = None) -> Filling | None:
@@ -134,7 +134,7 @@ def fill(body: Body, lattice: Lattice) -> Filling:
 
 def rounding_of(cell: Cell, *at: Floats) -> float:
     """The distance up to which points count as on the outline."""
-    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max() for x in at)
+    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(initial=0.0) for x in at)
     return float(max(1e-9 * math.hypot(*cell.vectors[0]), rounding))
 
 

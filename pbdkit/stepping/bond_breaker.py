@@ -27,7 +27,7 @@ class Fracturing:
 
     def __init__(self, scene: Scene) -> None:
         self._model: FractureModel = scene.experiment.fracture
-        self._limits, self._evaluator = scene.constants.limits, Evaluator(scene)
+        self._constants, self._evaluator = scene.constants, Evaluator(scene)
         self._breakable = []
         frame_too = self._model.breaks_frame_bonds()
         for n, plane in enumerate(scene.neighbourhood.planes):
@@ -76,6 +76,7 @@ class Fracturing:
             if nudge:
                 d, own = d + nudge, [value.copy() for value in own]
             with np.errstate(all="ignore"), blaming(self._model, when):
-                self._evaluator.renew_bonds(d, r, self._limits[slot], own, intact)
-                breaks = intact & self._evaluator.breaks(d, r, self._limits[slot], own)
+                limits = self._constants.limits_at(slot, n, block)
+                self._evaluator.renew_bonds(d, r, limits, own, intact)
+                breaks = intact & self._evaluator.breaks(d, r, limits, own)
             yield (n, *block.slices()[1:]), d, r, breaks

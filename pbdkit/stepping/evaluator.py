@@ -8,6 +8,7 @@ against this.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,13 +42,15 @@ Contributions = tuple[Any, ...]
 class Neighbour:
     """One neighbour of some particles, or of one: its rest offset r and the rule's weights w; where
     it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
-    constants c of the bond, what is remembered of it included."""
+    constants c of the bond, what is remembered of it included. `more` are weights besides w, of
+    cells that are of a stiffness of their own: what they contribute is added."""
 
     r: Components
     w: Any
     present: Mask | None = None
     broken: Mask | None = None
     c: Any = None
+    more: tuple[Any, ...] = ()
 
 
 class Evaluator:
@@ -61,9 +64,20 @@ class Evaluator:
         self._of_bond = bond_numbers(scene.experiment)
         self._of_particle = particle_numbers(scene.experiment)
 
+    def given(self, p: Any) -> Evaluator:
+        """The same with the rule's parameters of some particles."""
+        found = copy(self)
+        found._p = p
+        return found
+
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        return as_values(self.rule.gather(self.seen(d, u, to), to.r, to.w, self._p), "gather")
+        seen = self.seen(d, u, to)
+        found = as_values(self.rule.gather(seen, to.r, to.w, self._p), "gather")
+        for w in to.more:
+            more = self.rule.gather(seen, to.r, w, self._p)
+            found = tuple(a + b for a, b in zip(found, more, strict=True))
+        return found
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""

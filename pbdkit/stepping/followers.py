@@ -52,7 +52,7 @@ def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
     return there + solver.memory * (here - before) if solver.memory != 0.0 else there
 
 
-Summed = tuple[Surroundings, Contributions, Here]
+Summed = tuple[Surroundings, Evaluator, Contributions, Here]
 
 
 class SlotFollowers(Followers):
@@ -62,31 +62,35 @@ class SlotFollowers(Followers):
         self._scene = scene
         self._solver = solver or scene.experiment.stepping
         self._inner = SlotFollowers(scene.inner, Stepping()) if scene.inner else None
-        self._evaluator = Evaluator(scene)
         self._blocks = blocks(scene)
+        evaluator = Evaluator(scene)
+        varies = scene.constants.by_particle
+        self._evaluators = [evaluator.given(b.parameters) if varies else evaluator
+                            for b in self._blocks]
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
-        for around, total, here in self._summed(m, state):
-            planes = around.where.of(m), self._evaluator.move(total, here), around.where.of(new)
+        for around, evaluator, total, here in self._summed(m, state):
+            planes = around.where.of(m), evaluator.move(total, here), around.where.of(new)
             for u, move, plane in zip(*planes, strict=True):
                 _write(plane, target(u, move, plane, self._solver), around.movable, u)
-            self._evaluator.renew_particles(total, here, around.own(state), around.movable)
+            evaluator.renew_particles(total, here, around.own(state), around.movable)
 
     def moves(self, m: Floats, state: State) -> Floats:
         """The rule's moves, leaders' too; zero where nobody can move."""
-        return self._of_all(self._evaluator.move, m, state)
+        return self._of_all(Evaluator.move, m, state)
 
     def forces(self, m: Floats, state: State) -> Floats:
         """The rule's forces on body particles, leaders too, over Young's modulus and thickness;
         zero where there is no neighbour."""
-        return self._of_all(self._evaluator.force, m, state)
+        return self._of_all(Evaluator.force, m, state)
 
     def _of_all(self, function: Callable[..., Any], m: Floats, state: State) -> Floats:
         """What a function makes of the sums of contributions, zero where there is none."""
         out = np.zeros_like(m)
-        for around, total, here in self._summed(m, state):
-            for value, plane in zip(function(total, here), around.where.of(out), strict=True):
+        for around, evaluator, total, here in self._summed(m, state):
+            values = function(evaluator, total, here)
+            for value, plane in zip(values, around.where.of(out), strict=True):
                 _write(plane, value, around.movable, 0.0)
         return out
 
@@ -95,8 +99,8 @@ class SlotFollowers(Followers):
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
             return self._work(m, self.forces(m, state))
         seen, out = self._seen(m, state), np.zeros_like(m[0])
-        for around in self._blocks:
-            (value,) = around.sums(self._evaluator.energy, seen, state)
+        for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
+            (value,) = around.sums(evaluator.energy, seen, state)
             _write(around.where.of(out), value, around.movable, 0.0)
         return float(out.sum())
 
@@ -122,9 +126,9 @@ class SlotFollowers(Followers):
     def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
         """Every block with the sums of its neighbours' contributions and what stands there."""
         seen = self._seen(m, state)
-        for around in self._blocks:
-            total = around.sums(self._evaluator.contribution, seen, state)
-            yield around, total, around.here(seen, state)
+        for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
+            total = around.sums(evaluator.contribution, seen, state)
+            yield around, evaluator, total, around.here(seen, state)
 
 
 def _write(plane: Floats, value: Any, where_: Mask | None, otherwise: Any) -> None:

@@ -32,6 +32,7 @@ class Surroundings:
         self.slots = scene.neighbourhood.slots[sublattice]
         self._present = presence(scene.raster, where, self.slots)
         self._weights = [self._weights_of(slot) for slot in self.slots]
+        self._more = [self._more_of(slot) for slot in self.slots]
         neighbours = sum(1 if there is None else there.astype(int) for there in self._present)
         movable = (where.of(scene.raster.kind) == FOLLOWER) & (neighbours > 0)
         self.movable: Mask | None = None if movable.all() else movable
@@ -52,10 +53,16 @@ class Surroundings:
 
     def neighbours(self, state: State) -> list[Neighbour]:
         """The neighbours through each slot, as they are in a state."""
-        parts = zip(self.slots, self._weights, self._present, strict=True)
+        parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
         return [
-            Neighbour(slot.rest, w, present, *self._bond(slot, state)) for slot, w, present in parts
+            Neighbour(slot.rest, w, present, *self._bond(slot, state), more)
+            for slot, w, present, more in parts
         ]
+
+    @property
+    def parameters(self) -> Any:
+        """p of the rule."""
+        return self._scene.constants.rule_at(self.where)
 
     def here(self, u: NDArray[Any], state: State) -> Here:
         """What stands at the particles."""
@@ -80,6 +87,16 @@ class Surroundings:
         left, right = cells.beside(slot, self.where, self._scene.experiment.stepping.precision)
         return weights._replace(left=left, right=right)
 
+    def _more_of(self, slot: Slot) -> tuple[Any, ...]:
+        """w of cells of a stiffness of their own, where any is beside the slot."""
+        cells, precision = self._scene.cells, self._scene.experiment.stepping.precision
+        found = []
+        for weights, shares in zip(cells.weights, cells.mixed, strict=True) if cells else ():
+            left, right = cells.beside(slot, self.where, precision, shares)
+            if np.any(left) or np.any(right):
+                found.append(weights[slot]._replace(left=left, right=right))
+        return tuple(found)
+
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
         """Where the bond along a slot is broken, and its constants where they reach the rule."""
         if state.broken_step is None:
@@ -91,7 +108,7 @@ class Surroundings:
         c = None
         if isinstance(scene.experiment.fracture, Softens):
             own = shown([home.within(value[plane]) for value in state.bond_values])
-            c = scene.constants.of_bond(*scene.constants.limits[slot], *own)
+            c = scene.constants.of_bond(*scene.constants.limits_at(slot, plane, home), *own)
         return (broken if broken.any() else None), c
 
 

@@ -24,6 +24,7 @@ Arrays = dict[str, Any]
 def constant_arrays(plan: Plan) -> Arrays:
     """What does not change from step to step."""
     scene, slots = plan.scene, plan.scene.neighbourhood.slots
+    constants = scene.constants
     most, real = max(map(len, slots)), np.dtype(scene.experiment.stepping.precision)
     # Sublattices with fewer neighbours than others have the first once more, which nobody reads.
     padded = [slot for own in slots for slot in (*own, *own[:1] * (most - len(own)))]
@@ -38,7 +39,10 @@ def constant_arrays(plan: Plan) -> Arrays:
         **_stacked([_of_plane(scene, plane) for plane in scene.neighbourhood.planes], real),
     }
     if scene.cells:
-        arrays["share"] = np.array(scene.cells.share, real)
+        arrays["share"] = np.array(scene.cells.weight, real)
+        arrays |= {f"mixed{m}": np.array(v, real) for m, v in enumerate(scene.cells.mixed)}
+    for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
+        arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
     if frame := scene.frame:
         counts = np.bincount(frame.map.point, minlength=len(frame.place))
         arrays |= {"points": frame.place, "bodies": frame.body_place}
@@ -81,6 +85,7 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
     away, (plane, here) = slot_step(shape, slot), scene.neighbourhood.home[slot]
     home = plane - (slot.source if here else slot.target)
     beside = scene.cells.tiling.beside[slot] if scene.cells else ()
+    more = scene.cells.weights if scene.cells else ()
     cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in beside]
     return {
         "rests": slot.rest,
@@ -89,6 +94,7 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
         "away": away,
         "bonds_away": home * math.prod(shape[1:]) + (0 if here else away),
         "cells_away": [kind * math.prod(shape) + step for kind, step in cells],
+        **{f"more{m}": by_slot[slot] for m, by_slot in enumerate(more)},
         **{f"weights{n}": own.scene.constants.weights[slot] for n, own in enumerate(plan.levels)},
     }
 

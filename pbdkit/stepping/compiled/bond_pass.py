@@ -29,6 +29,7 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(0, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
     out.add(0, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
     out.add(0, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(plan.bonds)))
+    out.add(0, *(f"x{m} = {plan.row(f'limit{m}', 'n')}" for m in range(plan.limits)))
     _write_judging(out, plan)
     return out
 
@@ -36,7 +37,8 @@ def write_bond_pass(plan: Plan) -> Function:
 def _write_judging(out: Function, plan: Plan) -> None:
     """One row of bonds."""
     model, numbers = plan.model, plan.levels[-1].seen.bond
-    c = values(numbers, {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]"})
+    homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
+    c = values(numbers, homes)
     can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
     if model.breaks_frame_bonds():
         can = (

@@ -16,10 +16,16 @@ RUNS = ("first_run", "last_run", "first_row", "last_row")
 def parameters(plan: Plan, level: Level) -> list[str]:
     """p of the rule, and of the fracture model, whose numbers are literals: they decide what is to
     be computed at all."""
-    n = level.number
-    rule = f"p = Rule{n}({values(level.seen.rule, {Home.SCENE: f'rule{n}[{{n}}]'})})"
+    rule = [] if level.fields else [_rule(level)]
     literal = listed(map(plan.number, plan.scene.constants.fracture))
-    return [rule, f"q = Fracture({literal})"] if plan.model else [rule]
+    return [*rule, f"q = Fracture({literal})"] if plan.model else rule
+
+
+def _rule(level: Level) -> str:
+    """p of the rule at a particle."""
+    n = level.number
+    homes = {Home.SCENE: f"rule{n}[{{n}}]", Home.FIXED_PARTICLE: "g{n}[j]"}
+    return f"p = Rule{n}({values(level.seen.rule, homes)})"
 
 
 def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
@@ -40,12 +46,13 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
     for row, of in rows.items():
         out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
     out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
+    out.add(0, *(f"g{m} = {plan.row(f'field{m}', s)}" for m in range(level.fields)))
 
 
 def displacements(plan: Plan, level: Level) -> list[str]:
-    """u of the particle, and z, which the rule sees, on later levels."""
+    """u of the particle, and z, which the rule sees, on later levels; p where it differs."""
     u, z = (f"{name} = {plan.vector(f'{row}@[j]')}" for name, row in ("uh", "zz"))
-    return [u, z] if level.number else [u]
+    return [u, *([z] if level.number else []), *([_rule(level)] if level.fields else [])]
 
 
 def difference(plan: Plan, level: Level, there: str) -> str:
@@ -73,8 +80,21 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
 
 def contributions(level: Level, r: str, weights: str) -> str:
     """What a neighbour contributes, by name."""
+    return _gathered(level, r, weights, "c")
+
+
+def more_contributions(plan: Plan, level: Level, r: str, weights: Sequence[str]) -> list[str]:
+    """What cells of a stiffness of their own add to it, with these weights."""
+    lines = list[str]()
+    for w in weights:
+        lines.append(_gathered(level, r, w, "e"))
+        lines += [f"c{n} = c{n} + {plan.rounded(f'e{n}')}" for n in range(len(level.totals))]
+    return lines
+
+
+def _gathered(level: Level, r: str, weights: str, into: str) -> str:
     n = level.number
-    names = _pattern(level, [f"c{total[1:]}" for total in level.totals], "")
+    names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
     return f"{names}, = gather{n}(d, {r}, Weights{n}({weights}), p)"
 
 

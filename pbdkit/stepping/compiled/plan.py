@@ -35,6 +35,11 @@ class Level:
         return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
 
     @property
+    def fields(self) -> int:
+        """How many of the rule's parameters differ from place to place."""
+        return len(self.scene.constants.by_particle)
+
+    @property
     def source(self) -> str:
         """The planes that it works on; the first letter names what stands there at a particle."""
         return f"z{self.number - 1}" if self.number else "u"
@@ -79,6 +84,16 @@ class Plan:
     def bonds(self) -> int:
         """How many numbers are remembered of each bond."""
         return sum(number.home is Home.BOND for number in self.levels[-1].seen.bond)
+
+    @property
+    def limits(self) -> int:
+        """How many limits differ from bond to bond."""
+        return len(self.scene.constants.by_bond)
+
+    @property
+    def mixed(self) -> int:
+        """Of how many stiffnesses there are cells besides that of the rule."""
+        return len(self.scene.cells.mixed) if self.scene.cells else 0
 
     @property
     def bonds_first(self) -> bool:

@@ -19,6 +19,7 @@ from pbdkit.stepping.compiled.particle import (
     difference,
     displacements,
     local_places,
+    more_contributions,
     target_lines,
     write_row_loop,
 )
@@ -81,7 +82,11 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
+            for m in range(plan.mixed):
+                shares = f"flat_mixed{m}[at_j + cells_away[s, k, {side}]]"
+                out.add(depth, f"mixed{m}_{side} = {shares}")
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
+    fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
     since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
     out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
     if plan.long:
@@ -89,13 +94,19 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
         out.add(2, *displacements(plan, level))
     out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, there))
     out.add(2, *(f"b{n} = {value}" for n, value in enumerate(bond)))
-    limits = {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}"}
+    out.add(2, *(f"x{n} = {value}" for n, value in enumerate(fixed)))
+    limits = {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}", Home.FIXED_BOND: "x{n}"}
     c = f"Constants({values(level.seen.bond, limits)})"
     spares = plan.model and not plan.model.breaks_frame_bonds()
     can = f"({kind} == {FOLLOWER})" if spares else "is_there"
     breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
     out.add(2, contributions(level, "r", values(level.seen.weights, named)))
+    mixed = [
+        values(level.seen.weights, {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"mixed{m}_{{n}}"})
+        for m in range(plan.mixed)
+    ]
+    out.add(2, *more_contributions(plan, level, "r", mixed))
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")

@@ -1,0 +1,55 @@
+"""A field of a parameter in a netCDF file: a variable over x and y."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.varying import MOST_VALUES, Gridded
+
+MOST_BYTES = 2**30
+
+
+def read_field(given: dict[str, Any], folder: Path) -> Gridded:
+    """What ``{file: NAME, variable: NAME}`` says, the file relative to a folder.
+
+    Raises ValueError where the file or the variable is not there, or no numbers over x and y.
+    """
+    if given.keys() != {"file", "variable"}:
+        raise ValueError(f"a field from a file has file and variable, got {', '.join(given)}")
+    name, variable = given["file"], given["variable"]
+    if not isinstance(name, str) or not isinstance(variable, str):
+        raise ValueError("file and variable should be words")
+    path = folder / name
+    if not path.is_file():
+        raise ValueError(f"{path} is no regular file; its place counts from the experiment's file")
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path} is larger than 1 GiB")
+    import xarray
+
+    try:
+        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
+            return _gridded(dataset, variable, path)
+    except (OSError, KeyError) as error:
+        raise ValueError(f"{path} cannot be read as netCDF-4: {error}") from None
+
+
+def _gridded(dataset: Any, variable: str, path: Path) -> Gridded:
+    if variable not in dataset:
+        hint = did_you_mean(variable, dataset)
+        raise ValueError(f"{path} has no variable '{variable}'{hint}")
+    values = dataset[variable]
+    if set(values.dims) != {"x", "y"} or not {"x", "y"} <= set(values.coords):
+        raise ValueError(
+            f"{path}: '{variable}' should be over x and y, with a coordinate for each; it is over "
+            f"{', '.join(map(str, values.dims)) or 'nothing'}"
+        )
+    if values.size > MOST_VALUES:
+        raise ValueError(f"{path}: '{variable}' has {values.size} values, more than {MOST_VALUES}")
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{path}: '{variable}' holds {values.dtype}, not numbers")
+    try:
+        return Gridded(values["x"], values["y"], values.transpose("x", "y"))
+    except ValueError as error:
+        raise ValueError(f"{path}: '{variable}': {error}") from None

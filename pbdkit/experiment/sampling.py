@@ -1,0 +1,51 @@
+"""Functions of the place, as values over a grid: so an experiment says all in its file."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.experiment.body import Body, Box
+from pbdkit.interfaces import Lattice
+from pbdkit.interfaces.varying import OfPlace, TakesFields
+
+Floats = NDArray[np.float64]
+BEYOND = 2
+"""Spacings by which the grid goes beyond the body."""
+
+
+def sampled(part: TakesFields, lattice: Lattice, body: Body) -> TakesFields:
+    """The part with values in place of functions, half a spacing apart: on the square and the
+    rectangular lattice particles, middles of bonds and of cells are places of the grid.
+
+    Raises ValidationError where the part does not take a value.
+    """
+    functions = {n: f for n, f in part.varying.items() if isinstance(f, OfPlace)}
+    if not functions:
+        return part
+    places = _grid(lattice, body)
+    found = {name: field.sampled(*places) for name, field in functions.items()}
+    return part.with_values(**part.varying | found)
+
+
+def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
+    cell = lattice.cell()
+    steps = np.array(cell.vectors) / np.array(cell.period)[:, None]
+    spacing = np.abs(np.diag(steps))
+    corners = np.concatenate([_corners(box, steps, lattice) for box in body.boxes()])
+    origin = np.array(lattice.origin)
+    low = np.floor((corners.min(axis=0) - origin) / spacing).astype(int) - BEYOND
+    high = np.ceil((corners.max(axis=0) - origin) / spacing).astype(int) + BEYOND
+    x, y = (
+        o + s / 2 * np.arange(2 * a, 2 * b + 1)
+        for o, s, a, b in zip(origin, spacing, low, high, strict=True)
+    )
+    return x, y
+
+
+def _corners(box: Box, steps: Floats, lattice: Lattice) -> Floats:
+    """Of a rectangle around a body, in coordinates."""
+    corners = np.array(list(product(*zip(box.low, box.high, strict=True))), float)
+    return corners @ steps + lattice.origin if box.in_sites else corners

@@ -1,0 +1,232 @@
+"""Of what stiffness each cell is, where fields make the material of a rule differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import MixesCells, Setting, Slot, Stiffness
+from pbdkit.interfaces.polygons import Polygon, Tiling
+from pbdkit.interfaces.rule import material_of
+from pbdkit.interfaces.varying import ByRegion
+from pbdkit.scene.cells import WeighedCells
+from pbdkit.scene.cut_cells import CELLS_AT_ONCE, NEAREST, shares_inside
+from pbdkit.scene.field_values import Values, kinds_of, signed_distance, values_at
+from pbdkit.scene.homes import named_weights
+from pbdkit.scene.laminate import laminate
+from pbdkit.scene.places import Block, Floats, Mask
+from pbdkit.scene.raster import FOLLOWER, Raster
+
+STIFFNESS = "stiffness"
+"""The parameter that multiplies a cell's stiffness, whatever the rule."""
+PLACES = {"xx": (0, 0), "yy": (1, 1), "xy": (0, 1), "x_shear": (0, 2), "y_shear": (1, 2)}
+PLACES["shear"] = (2, 2)
+"""Where the components of a stiffness stand in a matrix."""
+NEAR = 1e-3
+"""The step of differences of a distance, as a share of a cell's width."""
+
+
+def weighed(
+    experiment: Experiment, raster: Raster, setting: Setting, cells: WeighedCells | None
+) -> WeighedCells | None:
+    """The cells with the weights that fields give them; the same where the rule has none.
+
+    Raises ExperimentError where the rule does not say what other materials are for it.
+    """
+    rule = experiment.rule
+    if not (rule.varying and rule.uses_cells):
+        return cells
+    _refuse_unmixable(experiment)
+    shape = (1 + max(p.kind for p in setting.cells.polygons), *raster.shape)
+    weight, mixed = np.ones(shape), {name: np.zeros(shape) for name in PLACES}
+    for polygon in setting.cells.polygons:
+        if some := _Cells.of(experiment, raster, polygon):
+            factor, stiffness = some.materials()
+            there = (polygon.kind, *some.place)
+            weight[there] = factor
+            for name, at in PLACES.items():
+                mixed[name][there] = np.where(factor == 0.0, stiffness[(slice(None), *at)], 0.0)
+    share = cells.share if cells else None
+    if share is not None:
+        weight *= share
+        for planes in mixed.values():
+            planes *= share
+    used = [name for name, planes in mixed.items() if planes.any()]
+    slots = [slot for own in setting.slots for slot in own]
+    weights = tuple(_weights(experiment, setting, slots, name) for name in used)
+    return WeighedCells(setting.cells, share, weight, tuple(mixed[name] for name in used), weights)
+
+
+def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
+    """The stiffness over Young's modulus at each particle, (particle,) a component; that of the
+    rule where it is one."""
+    rule = experiment.rule
+    if not (rule.varying and rule.uses_cells):
+        return material_of(rule)
+    x, y = raster.reference().T
+    values = values_at(experiment, "rule", x, y, raster.table_kind == FOLLOWER)
+    matrices = _stiffness(experiment, values)
+    return Stiffness(**{name: matrices[(slice(None), *at)] for name, at in PLACES.items()})
+
+
+def _refuse_unmixable(experiment: Experiment) -> None:
+    rule = experiment.rule
+    others = sorted(rule.varying.keys() - {STIFFNESS})
+    if others and not isinstance(rule, MixesCells):
+        raise ExperimentError(
+            f"'{rule.type}' works cell by cell and does not say what cells of another "
+            f"{others[0]} do: one number for all is needed",
+            ("rule", others[0]),
+        )
+
+
+def _weights(
+    experiment: Experiment, setting: Setting, slots: list[Slot], name: str
+) -> dict[Slot, Any]:
+    """The rule's weights for cells that have one component of stiffness alone."""
+    rule = experiment.rule
+    assert isinstance(rule, MixesCells)
+    one = Stiffness(**{n: float(n == name) for n in PLACES})
+    return {s: named_weights(rule.cell_weights(s, setting, one), rule) for s in slots}
+
+
+def _stiffness(experiment: Experiment, values: Values) -> Floats:
+    """(place, 3, 3) over Young's modulus, for parameters at places; NaN where there is none."""
+    rule, size = experiment.rule, len(next(iter(values.values())))
+    others = {name: value for name, value in values.items() if name != STIFFNESS}
+    parts, kind = kinds_of(rule, others) if others else ([rule], np.zeros(size, np.intp))
+    table = np.full((len(parts), 3, 3), np.nan)
+    for matrix, part in zip(table, parts, strict=True):
+        if (c := material_of(part)) is not None:
+            for name, (row, column) in PLACES.items():
+                matrix[row, column] = matrix[column, row] = getattr(c, name)
+    found = table[kind]
+    if STIFFNESS in values:
+        found *= (values[STIFFNESS] / getattr(rule, STIFFNESS))[:, None, None]
+    return found
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells of one shape that have a corner in the body: `place` (sublattice, cell, cell) of their
+    first corners on the raster, x and y of all corners, (corner, cell)."""
+
+    experiment: Experiment
+    polygon: Polygon
+    place: tuple[Any, ...]
+    x: Floats
+    y: Floats
+    inside: Mask
+    """(cell,): whether all corners are of the body."""
+
+    @classmethod
+    def of(cls, experiment: Experiment, raster: Raster, polygon: Polygon) -> _Cells | None:
+        """Those of the raster; None where there is none."""
+        steps = np.array([corner.cell for corner in polygon.corners])
+        start, stop = np.maximum(0, -steps.min(axis=0)), raster.shape[1:] - steps.max(axis=0)
+        block = Block(polygon.source, tuple(start.tolist()), tuple(stop.tolist()))
+        corners = [block.seen_through(corner) for corner in polygon.corners]
+        body = np.array([corner.of(raster.kind) == FOLLOWER for corner in corners])
+        found = np.nonzero(body.any(axis=0))
+        if not len(found[0]):
+            return None
+        first = raster.reference_planes(block)
+        x, y = (np.broadcast_to(c, body.shape[1:])[found] for c in first)
+        at = np.array([(x + r.x, y + r.y) for r in polygon.rest])
+        at += np.array(raster.lattice.origin)[:, None]
+        place = (polygon.source, *(n + a for n, a in zip(found, start, strict=True)))
+        inside = body[(slice(None), *found)].all(axis=0)
+        return cls(experiment, polygon, place, at[:, 0], at[:, 1], inside)
+
+    def materials(self) -> tuple[Floats, Floats]:
+        """(factor, stiffness): how many times the stiffness of the rule each cell has, 0 where that
+        is no such multiple, and its stiffness there, (cell, 3, 3)."""
+        rule, x, y = self.experiment.rule, self.x.mean(axis=0), self.y.mean(axis=0)
+        values = dict(values_at(self.experiment, "rule", x, y, self.inside))
+        if all(name == STIFFNESS for name in values) and not isinstance(rule, MixesCells):
+            return self._factors(values[STIFFNESS]), np.zeros((len(x), 3, 3))
+        cut = [(name, *found) for name, found in self._cut()]
+        mixed = np.zeros(len(x), bool)
+        for _, share, _ in cut:
+            mixed |= (share > 0.0) & (share < 1.0)
+        factor = values.get(STIFFNESS, np.ones(len(x))) / getattr(rule, STIFFNESS, 1.0)
+        others = [values[name] != getattr(rule, name) for name in values if name != STIFFNESS]
+        apart = np.logical_or.reduce([mixed, *others])
+        stiffness = np.zeros((len(x), 3, 3))
+        some = np.flatnonzero(apart)
+        if len(some):
+            stiffness[some] = self._mixed(values, cut, some)
+        return np.where(apart, 0.0, factor), stiffness
+
+    def _mixed(self, values: Values, cut: list[Any], some: Any) -> Floats:
+        """The stiffness of some cells: region after region, as layers along its border."""
+        here = {name: value[some] for name, value in values.items()}
+        fields = self.experiment.rule.varying
+        for name, field in fields.items():
+            if isinstance(field, ByRegion):
+                here[name] = np.full(len(some), field.otherwise)
+        found = _stiffness(self.experiment, here)
+        for region, share, normal in cut:
+            f, within = share[some], dict(here)
+            for name, field in fields.items():
+                if isinstance(field, ByRegion) and region in dict(field.values):
+                    within[name] = np.full(len(some), dict(field.values)[region])
+            inner = _stiffness(self.experiment, within)
+            part = (f > 0.0) & (f < 1.0)
+            found[part] = laminate(found[part], inner[part], f[part], normal[some][part])
+            found[f == 1.0] = inner[f == 1.0]
+            here = {name: np.where(f >= 0.5, within[name], value) for name, value in here.items()}
+        if not np.isfinite(found).all():
+            raise ExperimentError(
+                f"'{self.experiment.rule.type}' has no finite stiffness for some of its cells, as at "
+                "poisson_ratio -1: cells of several materials need one",
+                ("rule",),
+            )
+        return found
+
+    def _factors(self, otherwise: Floats) -> Floats:
+        """Where a cell is only as stiff as its parts on the average."""
+        rule = self.experiment.rule
+        field, base = rule.varying[STIFFNESS], getattr(rule, STIFFNESS)
+        if not isinstance(field, ByRegion):
+            return otherwise / base
+        found = np.full(len(otherwise), field.otherwise)
+        for region, (share, _) in self._cut():
+            found += share * (dict(field.values)[region] - found)
+        return np.asarray(found / base)
+
+    def _cut(self) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
+        """The regions that some field names, each with the share of every cell inside and the
+        normal of its border there."""
+        fields = self.experiment.rule.varying.values()
+        named = {n for field in fields if isinstance(field, ByRegion) for n, _ in field.values}
+        for name, region in self.experiment.regions.items():
+            if name in named:
+                yield name, self._shares(region)
+
+    def _shares(self, region: Body) -> tuple[Floats, Floats]:
+        signed = partial(signed_distance, region, self.experiment.lattice.cell())
+        at_corners = signed(self.x, self.y)
+        share = (at_corners <= 0.0).all(axis=0).astype(float)
+        normal = np.zeros((len(share), 2))
+        corners = np.array(self.polygon.rest)
+        width = float(max(np.hypot(*(a - b)) for a in corners for b in corners))
+        reach = width if region.exaggerates() else NEAREST * width
+        near = np.flatnonzero(np.abs(at_corners).min(axis=0) <= reach)
+        for some in np.split(near, range(CELLS_AT_ONCE, len(near), CELLS_AT_ONCE)):
+            share[some] = shares_inside(signed, self.x[:, some], self.y[:, some])
+        cut = np.flatnonzero((share > 0.0) & (share < 1.0))
+        x, y, h = self.x[:, cut].mean(axis=0), self.y[:, cut].mean(axis=0), NEAR * width
+        slope = np.stack([signed(x + h, y) - signed(x - h, y), signed(x, y + h) - signed(x, y - h)])
+        size = np.hypot(*slope)
+        slope = np.where(np.abs(slope) < 1e-9 * size, 0.0, slope)
+        slope[0] = np.where(size == 0.0, 1.0, slope[0])
+        normal[cut] = (slope / np.hypot(*slope)).T
+        return share, normal

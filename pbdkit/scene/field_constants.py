@@ -1,0 +1,186 @@
+"""Constants of a scene that fields make differ from particle to particle or from bond to bond."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import AppliesTwice, FollowerRule, Remembers, Setting
+from pbdkit.interfaces.varying import TakesFields
+from pbdkit.registry.blame import blaming
+from pbdkit.scene.bonds import bonds_in, plane_block
+from pbdkit.scene.field_values import Values, kinds_of, values_at
+from pbdkit.scene.homes import SceneConstants
+from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.places import Floats
+from pbdkit.scene.raster import FOLLOWER, Raster
+
+FEW = 3
+"""So many places are looked at to see whether a part answers for whole arrays."""
+
+
+def with_fields(
+    constants: SceneConstants,
+    experiment: Experiment,
+    raster: Raster,
+    neighbourhood: Neighbourhood,
+    setting: Setting,
+) -> SceneConstants:
+    """The constants with those that fields make differ; the same where the experiment has none.
+
+    Raises ExperimentError where the place cannot be taken into account.
+    """
+    rule, fracture = experiment.rule, experiment.fracture
+    if not (rule.varying or fracture.varying):
+        return constants
+    _refuse(experiment)
+    if rule.varying and not rule.uses_cells:
+        with blaming(rule, "when asked for its constants", "rule"):
+            found = _by_particle(experiment, raster, setting, constants)
+        constants = replace(constants, by_particle=found)
+    if fracture.varying and fracture.can_break:
+        with blaming(fracture, "when asked for its constants", "fracture"):
+            found = _by_bond(experiment, raster, neighbourhood, constants)
+        constants = replace(constants, by_bond=found)
+    return constants
+
+
+def _refuse(experiment: Experiment) -> None:
+    rule, fracture = experiment.rule, experiment.fracture
+    unfit = (
+        (rule.varying and isinstance(rule, AppliesTwice), "rule", rule,
+         "applies a rule to the moves of another: what its energy is where they differ is not told"),
+        (rule.varying and experiment.neighbours.nearness(), "rule", rule,
+         "is asked for neighbours that are found anew; set neighbours.reevaluate: false"),
+        (isinstance(fracture, Remembers) and fracture.varying and _hidden(fracture), "fracture",
+         fracture, "draws each bond's own number from it: scatter goes with one number for all"),
+    )  # fmt: skip
+    for clash, field, part, text in unfit:
+        if clash:
+            name = min(part.varying)
+            raise ExperimentError(
+                f"'{part.type}' {text}; '{name}' must be one number here", (field, name)
+            )
+
+
+def _hidden(fracture: Any) -> bool:
+    """Whether what varies is remembered instead of being a constant."""
+    return any(name in fracture.varying for name in ("scatter",)) or bool(
+        getattr(fracture, "scatter", 0.0)
+    )
+
+
+def _by_particle(
+    experiment: Experiment, raster: Raster, setting: Setting, constants: SceneConstants
+) -> dict[str, Floats]:
+    """(sublattice, cell, cell) by name, of the rule's parameters; frame points have those that
+    serve for all."""
+    rule, rows = experiment.rule, raster.body_rows
+    x, y = raster.reference(rows).T
+    values = values_at(experiment, "rule", x, y, np.ones(len(rows), bool))
+    _refuse_weights(rule, values, setting)
+    place, found = raster.place_of(rows), {}
+    for name, own in _asked(rule, values, lambda part: part.parameters(setting)).items():
+        planes = np.full(raster.shape, getattr(constants.rule, name))
+        planes.reshape(-1)[place] = own
+        found[name] = planes
+    return found
+
+
+def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> None:
+    """Weights are of slots: they cannot differ from place to place."""
+    slots = [slot for own in setting.slots for slot in own]
+    parts, _ = kinds_of(rule, {name: _ends(value) for name, value in values.items()})
+    weights = [[part.weights(slot, setting) for slot in slots] for part in parts]
+    if any(own != weights[0] for own in weights):
+        name = min(values)
+        raise ExperimentError(
+            f"'{rule.type}' takes its weights of neighbours from its numbers, and has one weight a "
+            f"neighbour for all particles; '{name}' must be one number",
+            ("rule", name),
+        )
+
+
+def _by_bond(
+    experiment: Experiment, raster: Raster, around: Neighbourhood, constants: SceneConstants
+) -> dict[str, Floats]:
+    """(plane, cell, cell) by name, of the fracture model's limits; bonds take the values at their
+    middle, and what the functions see besides must be the same everywhere."""
+    fracture, found = experiment.fracture, dict[str, Floats]()
+    shape, origin = (len(around.planes), *raster.shape[1:]), raster.lattice.origin
+    for n, plane in enumerate(around.planes):
+        if not (block := plane_block(raster, plane)):
+            continue
+        start = raster.reference_planes(block)
+        middle = (start + 0.5 * plane.slot.rest).each(add, origin)
+        x, y = np.broadcast_arrays(*middle)
+        needed = bonds_in(raster, block, plane, frame_too=False)
+        values = values_at(experiment, "fracture", x, y, needed)
+        own = _asked(fracture, values, lambda part, s=plane.slot: part.constants(s))
+        for name, limits in own.items():
+            planes = found.setdefault(name, np.zeros(shape))
+            block.within(planes[n])[...] = limits
+        parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
+        if any(part.parameters() != fracture.parameters() for part in parts) and not own:
+            _refuse_parameter(fracture)
+    for name, planes in found.items():
+        for n, plane in enumerate(around.planes):
+            if not planes[n].any():
+                planes[n] = getattr(constants.limits[plane.slot], name)
+    return {name: found[name] for name in constants.limits[around.every[0]]._fields if name in found}
+
+
+def _refuse_parameter(fracture: TakesFields) -> None:
+    name = min(fracture.varying)
+    raise ExperimentError(
+        f"'{name}' of '{fracture.type}' is no limit of a bond: it must be one number",
+        ("fracture", name),
+    )
+
+
+def _ends(value: Floats) -> Floats:
+    """The smallest and the largest."""
+    return np.array([value.min(), value.max()])
+
+
+def _asked(
+    part: Any, values: Values, ask: Callable[[Any], Mapping[str, Any]]
+) -> dict[str, NDArray[Any]]:
+    """What a part answers, by name, for numbers at places; what is the same everywhere is left out.
+
+    It is asked for whole arrays first. Where it does not take them, or answers otherwise for the
+    first places than for each by itself, it is asked once for each kind of place.
+    """
+    shape, names = next(iter(values.values())).shape, list(ask(part))
+    found = _of_arrays(part, values, ask, names)
+    if found is None:
+        parts, kind = kinds_of(part, values)
+        answers = [ask(one) for one in parts]
+        found = {name: np.array([float(a[name]) for a in answers])[kind] for name in names}
+    whole = {name: np.broadcast_to(value, shape) for name, value in found.items()}
+    return {name: value for name, value in whole.items() if (value != value.flat[0]).any()}
+
+
+def _of_arrays(
+    part: Any, values: Values, ask: Callable[[Any], Mapping[str, Any]], names: Iterable[str]
+) -> dict[str, NDArray[Any]] | None:
+    try:
+        answer = ask(part.model_copy(update=dict(values)))
+        found = {name: np.asarray(answer[name], float) for name in names}
+    except Exception:  # it is asked place by place instead
+        return None
+    size = next(iter(values.values())).size
+    for n in sorted({0, size // 2, size - 1})[:FEW]:
+        alone = ask(part.with_values(**{name: float(v.flat[n]) for name, v in values.items()}))
+        for name, value in found.items():
+            here = value if value.ndim == 0 else value.flat[n]
+            if value.size not in (1, size) or float(here) != float(alone[name]):
+                return None
+    return found

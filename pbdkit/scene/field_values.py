@@ -1,0 +1,63 @@
+"""What the fields of an experiment's parts are at some places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body, Sites
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import Cell, Vector
+from pbdkit.interfaces.varying import ByRegion, TakesFields
+from pbdkit.scene.places import Floats, Mask
+from pbdkit.scene.sites import rounding_of
+
+Values = Mapping[str, Floats]
+"""By the name of the parameter, an array over the places."""
+
+
+def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: Mask) -> Values:
+    """The parameters of the part at a field of the experiment that differ, at places where they
+    are `needed`; elsewhere where there is none the number that serves for all.
+
+    Raises ExperimentError for a place outside of what is known.
+    """
+    part: TakesFields = getattr(experiment, field)
+    cell, held = experiment.lattice.cell(), dict[str, Mask]()
+    if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
+        for name, region in experiment.regions.items():
+            held[name] = signed_distance(region, cell, x, y) <= 0.0
+    found = {}
+    for name, varying in part.varying.items():
+        values = varying.at(x, y, held)
+        missing = np.isnan(values)
+        if (missing & needed).any():
+            place = int(np.argmax(missing & needed))
+            raise ExperimentError(
+                f"has no value at ({x.flat[place]:.6g}, {y.flat[place]:.6g}), where one is needed; "
+                "its places must cover the body",
+                (field, name),
+            )
+        found[name] = np.where(missing, getattr(part, name), values)
+    return found
+
+
+def signed_distance(body: Body, cell: Cell, x: Floats, y: Floats) -> Floats:
+    """To an outline, negative inside, zero on it whatever the rounding."""
+    nowhere = np.zeros(np.shape(x), int)
+    distance = body.distance(Sites((nowhere, nowhere), Vector(x, y)))
+    return np.where(np.abs(distance) <= rounding_of(cell, x, y), 0.0, distance)
+
+
+def kinds_of(part: TakesFields, values: Values) -> tuple[list[Any], NDArray[np.intp]]:
+    """(parts, kind): the part with the numbers of each kind of place, and of each place its kind,
+    in the shape of the values."""
+    shape = next(iter(values.values())).shape
+    table = np.stack([value.ravel() for value in values.values()], axis=1)
+    rows, kind = np.unique(table, axis=0, return_inverse=True)
+    parts = [part.with_values(**dict(zip(values, row, strict=True))) for row in rows.tolist()]
+    return parts, kind.reshape(shape)
