@@ -88,10 +88,15 @@ def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
 
 def identify(experiment: Given, *, components: Components = ()) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
-    elastic body, with its constants, from the rule's answer to plane waves."""
+    elastic body, with its constants, from the rule's answer to plane waves.
+
+    Where its numbers differ from place to place it is that of the first of
+    ``experiment.materials()``, which are experiments of one material each, by name.
+    """
     from pbdkit.identity.identification import identified
 
-    return identified(tuned(build_scene(_experiment(experiment, components))))
+    first = next(iter(_experiment(experiment, components).materials().values()))
+    return identified(tuned(build_scene(first)))
 
 
 def rerun(

@@ -133,13 +133,18 @@ def identify(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     from pbdkit.api import identify, load
     from pbdkit.cli.output import show_table
 
-    found = identify(load(experiment, settings=settings))
+    materials = load(experiment, settings=settings).materials()
+    every = {name: identify(one) for name, one in materials.items()}
     if as_json:
-        click.echo(json.dumps(found.as_dict()))
-    else:
-        from pbdkit.identity.verdict import table
+        alone = every.get("")
+        told = alone.as_dict() if alone else {name: f.as_dict() for name, f in every.items()}
+        click.echo(json.dumps(told))
+        return
+    from pbdkit.identity.verdict import table
 
-        click.echo(f"{found.name}: {found.rule}, {found.lattice} lattice, {found.neighbours}")
+    for name, found in every.items():
+        where = f" ({name})" if name else ""
+        click.echo(f"{found.name}: {found.rule}{where}, {found.lattice} lattice, {found.neighbours}")
         show_table(table(found))
         for note in found.notes:
             click.echo(f"note: {note}")

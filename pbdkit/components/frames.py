@@ -146,6 +146,11 @@ class TractionFree(FramePolicy):
                 f"'{self.type}' needs a rule that is calibrated to a material ('elastic', "
                 f"'orthotropic'), which '{frame.rule.type}' is not"
             )
+        if others := frame.rule.varying.keys() - {"stiffness"}:
+            raise ExperimentError(
+                f"'{self.type}' balances edges of one material, up to a factor 'stiffness', and "
+                f"{min(others)} differs from place to place; take {{type: natural}}"
+            )
         equations = _Equations(frame)
         equations.balance_edges(stiffness)
         equations.extrapolate_corners()

@@ -161,10 +161,11 @@ AnyMotion = Annotated[
 
 
 class Selection(Strict):
-    """Chooses body particles of the reference configuration, in one of four ways.
+    """Chooses body particles of the reference configuration, in one of five ways.
 
     `edge`: the outermost of every row (left, right) or column (bottom, top); `box`: [xmin, ymin,
-    xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points.
+    xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points;
+    `region`: all that the region of that name holds.
     """
 
     model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
@@ -173,11 +174,12 @@ class Selection(Strict):
     box: Box | None = None
     numbers: Numbers | None = None
     nearest: Points | None = None
+    region: str | None = None
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Selection:
         if len(self._given()) != 1:
-            raise ValueError("give exactly one of edge, box, numbers, nearest")
+            raise ValueError("give exactly one of edge, box, numbers, nearest, region")
         return self
 
     def _given(self) -> dict[str, Any]:

@@ -212,6 +212,17 @@ class Experiment(Strict):
         """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
         return self.fracture.can_break or any("bonds" in d.needs for d in self.diagnostics)
 
+    def materials(self) -> dict[str, Experiment]:
+        """The experiment with the rule as it is at each place that its fields tell apart, the same
+        everywhere; itself under no name where it has no field."""
+        fields = self.rule.varying
+        found: dict[str, Experiment] = {}
+        for label in dict.fromkeys(label for field in fields.values() for label in field.samples):
+            values = {n: f.samples.get(label, getattr(self.rule, n)) for n, f in fields.items()}
+            rule = self.rule.with_values(**values)
+            found[label] = self.model_copy(update={"rule": rule})
+        return found or {"": self}
+
     def components(self) -> list[Component]:
         """Every part of an open interface."""
         *single, many = (getattr(self, field) for field in INTERFACES)

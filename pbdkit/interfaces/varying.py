@@ -26,6 +26,39 @@ MOST_IN_WORDS = 1000
 MOST_VALUES = 2**24
 
 
+DEFINITION = "Field"
+ABOUT = ("title", "description", "examples", "default")
+"""What a schema says of a parameter whatever stands in it."""
+SCHEMA = {
+    "title": "Field",
+    "description": "A value for each place: by region, from a netCDF file, or over a grid.",
+    "oneOf": [
+        {
+            "type": "object",
+            "required": ["otherwise"],
+            "additionalProperties": {"type": "number"},
+        },
+        {
+            "type": "object",
+            "required": ["file", "variable"],
+            "properties": {"file": {"type": "string"}, "variable": {"type": "string"}},
+            "additionalProperties": False,
+        },
+        {
+            "type": "object",
+            "required": ["x", "y", "values"],
+            "properties": {
+                "x": {"type": "array", "items": {"type": "number"}},
+                "y": {"type": "array", "items": {"type": "number"}},
+                "values": {"type": ["array", "string"]},
+            },
+            "additionalProperties": False,
+        },
+    ],
+}
+"""The JSON Schema of what a file writes in place of a number."""
+
+
 class Varying(ABC):
     """What a parameter is, place by place (lattice units)."""
 
@@ -36,8 +69,9 @@ class Varying(ABC):
         asked for."""
 
     @abstractmethod
-    def at(self, x: Floats, y: Floats, held: Held) -> Floats:
-        """The values at places of one shape; NaN where there is none."""
+    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
+        """The values at places of one shape; NaN where there is none. What lies within `reach` of
+        a place that has one may have the same."""
 
     @abstractmethod
     def written(self) -> dict[str, Any]:
@@ -57,7 +91,7 @@ class ByRegion(Varying):
         """All."""
         return {"otherwise": self.otherwise, **dict(self.values)}
 
-    def at(self, x: Floats, y: Floats, held: Held) -> Floats:
+    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
         """Region after region."""
         found, values = np.full(np.shape(x), self.otherwise), dict(self.values)
         for name, inside in held.items():
@@ -106,7 +140,7 @@ class Gridded(Varying):
         middle, least, most = (float(ordered[n]) for n in (len(ordered) // 2, 0, -1))
         return {"the median": middle, "the smallest value": least, "the largest value": most}
 
-    def at(self, x: Floats, y: Floats, held: Held) -> Floats:
+    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
         """Bilinear (scipy)."""
         from scipy.interpolate import RegularGridInterpolator
 
@@ -117,7 +151,7 @@ class Gridded(Varying):
                 grid.append(np.array([0.0, 1.0]))
                 places.append(np.zeros(np.shape(wanted)))
                 continue
-            slack = 1e-9 * (known[-1] - known[0])
+            slack = reach + 1e-9 * (known[-1] - known[0])
             near = (wanted >= known[0] - slack) & (wanted <= known[-1] + slack)
             grid.append(known)
             places.append(np.where(near, np.clip(wanted, known[0], known[-1]), np.nan))
@@ -148,7 +182,7 @@ class OfPlace(Varying):
         """The value at (0, 0)."""
         return {"(0, 0)": float(self.function(np.zeros(1), np.zeros(1))[0])}
 
-    def at(self, x: Floats, y: Floats, held: Held) -> Floats:
+    def at(self, x: Floats, y: Floats, held: Held, reach: float = 0.0) -> Floats:
         """The function's."""
         return np.broadcast_to(np.asarray(self.function(x, y), float), np.shape(x))
 
@@ -244,6 +278,17 @@ class TakesFields(Component):
         part = handler(data | {name: _first(field) for name, field in varying.items()})
         part._varying = varying
         return part
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """Numbers, or fields in their place."""
+        schema: dict[str, Any] = handler(core_schema)
+        known = handler.resolve_ref_schema(schema).get("properties", {})
+        for name in cls.numbers() & known.keys():
+            about = {k: v for k, v in known[name].items() if k in ABOUT}
+            number = {k: v for k, v in known[name].items() if k not in ABOUT}
+            known[name] = about | {"anyOf": [number, {"$ref": f"#/$defs/{DEFINITION}"}]}
+        return schema
 
     @classmethod
     def numbers(cls) -> set[str]:

@@ -14,7 +14,6 @@ from pbdkit.interfaces import LeaderRows, Moment, Pair, Stiffness, length
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
 from pbdkit.results.tables import Tables, read_only
@@ -170,8 +169,8 @@ class StateForces(ForceValues):
 
     @property
     def stiffness(self) -> Stiffness:
-        """The rule's."""
-        stiffness = material_of(self._rule)
+        """The rule's, of each particle where fields make it differ."""
+        stiffness = self._tables.stiffness
         if stiffness is None:
             raise ValueError(
                 f"the rule '{self._rule.type}' is not calibrated to a material: declare "

@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces import Stiffness
+from pbdkit.scene.cell_materials import stiffness_of_particles
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
@@ -60,6 +62,11 @@ class Tables:
     def followers(self) -> SlotFollowers:
         """The rule on the scene, which knows forces and energy."""
         return SlotFollowers(self.scene)
+
+    @cached_property
+    def stiffness(self) -> Stiffness | None:
+        """The rule's, of each particle where fields make it differ."""
+        return stiffness_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
     def surroundings(self) -> list[Surroundings]:

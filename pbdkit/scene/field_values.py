@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,12 +29,14 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
     """
     part: TakesFields = getattr(experiment, field)
     cell, held = experiment.lattice.cell(), dict[str, Mask]()
+    # Corners of cut cells lie that far outside of a body at most.
+    reach = max(math.hypot(*vector) for vector in cell.vectors)
     if any(isinstance(varying, ByRegion) for varying in part.varying.values()):
         for name, region in experiment.regions.items():
             held[name] = signed_distance(region, cell, x, y) <= 0.0
     found = {}
     for name, varying in part.varying.items():
-        values = varying.at(x, y, held)
+        values = varying.at(x, y, held, reach)
         missing = np.isnan(values)
         if (missing & needed).any():
             place = int(np.argmax(missing & needed))

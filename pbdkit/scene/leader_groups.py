@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body
 from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Pair
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.places import Floats, distinct
 from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
 
@@ -40,7 +43,7 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
     move one particle differently in the same step.
     """
     found: list[Leading] = []
-    body, steps = Selecting(raster), experiment.steps
+    body, steps = Selecting(raster, experiment.regions), experiment.steps
     for n, group in enumerate(experiment.leaders):
         rows = body.select(group.select, ("leaders", n, "select"))
         at = raster.reference(rows)
@@ -98,6 +101,7 @@ class Selecting:
     """Chooses body particles of a raster; what it looks at is made once."""
 
     raster: Raster
+    regions: Mapping[str, Body] = field(default_factory=dict)
 
     @cached_property
     def _body(self) -> Indices:
@@ -119,6 +123,8 @@ class Selecting:
             rows = self._box(selection.box)
         elif selection.numbers is not None:
             rows = _numbers(self.raster, selection.numbers, (*where, "numbers"))
+        elif selection.region is not None:
+            rows = self._region(selection.region, (*where, "region"))
         else:
             rows = self.nearest(selection.nearest or ())
         if not len(rows):
@@ -136,6 +142,14 @@ class Selecting:
         slack = 1e-9 * _spacing(self.raster)
         low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
         return self._body[((self._x >= low) & (self._x <= high)).all(axis=1)]
+
+    def _region(self, name: str, where: tuple[str | int, ...]) -> Indices:
+        if name not in self.regions:
+            known = ", ".join(self.regions) or "there is none: add `regions`"
+            hint = did_you_mean(name, self.regions)
+            raise ExperimentError(f"there is no region '{name}'{hint} (known: {known})", where)
+        distance = signed_distance(self.regions[name], self.raster.lattice.cell(), *self._x.T)
+        return self._body[distance <= 0.0]
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
         """The row of the particle nearest to each point, the lowest number on ties."""

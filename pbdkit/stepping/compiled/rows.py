@@ -12,16 +12,14 @@ from pbdkit.stepping.compiled.particle import (
     difference,
     displacements,
     local_places,
-    more_contributions,
     target_lines,
     write_row_loop,
 )
 from pbdkit.stepping.compiled.plan import Function, Level, Plan, listed, values
 
-NOBODY, GENERAL, PLAIN, WITH_CELLS, MIXED = range(5)
+NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
 """Kinds of rows: those where no particle follows; where something may be missing; where all
-neighbours are there and cells are whole; where cells are not; where cells have a stiffness of their
-own."""
+neighbours are there and cells are whole; where cells are not."""
 
 
 def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | None) -> Function:
@@ -33,9 +31,8 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
         there = plan.row(f"{level.source}_@", slot.target, slot.cell)
         out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
     shares: dict[str, str] = {}
-    if kind in (WITH_CELLS, MIXED):
-        arrays = ["share", *(f"mixed{m}" for m in range(plan.mixed if kind == MIXED else 0))]
-        rows = dict.fromkeys(row for a in arrays for slot in slots for row in _beside(plan, slot, a))
+    if kind == WITH_CELLS:
+        rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
         shares = {row: f"s{n}" for n, row in enumerate(rows)}
     out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
     if plan.judged:
@@ -45,7 +42,7 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     if plan.judged:
         out.add(1, "bits = int64(gone[j])", "now = bits")
     for k, slot in enumerate(slots):
-        out.add(1, *_slot_lines(plan, level, k, slot, shares, plan.mixed * (kind == MIXED)))
+        out.add(1, *_slot_lines(plan, level, k, slot, shares))
     out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
     if events:
         out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
@@ -54,9 +51,7 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     return out
 
 
-def _slot_lines(
-    plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str], mixed: int
-) -> list[str]:
+def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str]) -> list[str]:
     """The contributions of one neighbour; `shares` are the names of rows of shares of cells."""
     bond = {
         Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
@@ -67,22 +62,15 @@ def _slot_lines(
     # A bond is judged as its home end sees it, so that both ends agree to the last bit.
     _, at_home = plan.scene.neighbourhood.home[slot]
     seen = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
-    every, r = [level.scene.constants.weights[slot]], plan.literal(slot.rest)
-    if mixed:
-        assert plan.scene.cells
-        every += [weights[slot] for weights in plan.scene.cells.weights]
-    weights = list[str]()
-    for m, literal in enumerate(every):
-        named = {name: plan.number(value) for name, value in literal._asdict().items()}
-        if shares:
-            rows = _beside(plan, slot, f"mixed{m - 1}" if m else "share")
-            named["left"], named["right"] = (f"{shares[row]}[j]" for row in rows)
-        weights.append(listed(named.values()))
+    literal = level.scene.constants.weights[slot]._asdict()
+    weights = {name: plan.number(value) for name, value in literal.items()}
+    if shares:
+        weights["left"], weights["right"] = (f"{shares[row]}[j]" for row in _beside(plan, slot))
+    r = plan.literal(slot.rest)
     return [
         difference(plan, level, f"n{k}@[j]"),
         *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", f"f{k}[j]"),
-        contributions(level, r, weights[0]),
-        *more_contributions(plan, level, r, weights[1:]),
+        contributions(level, r, listed(weights.values())),
         *(
             f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
             for n in range(len(level.totals))
@@ -103,11 +91,11 @@ def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
     return [f"{name} = {plan.row(array, plane, step)}" for name, array in rows.items()]
 
 
-def _beside(plan: Plan, slot: Slot, array: str) -> list[str]:
+def _beside(plan: Plan, slot: Slot) -> list[str]:
     """The rows of shares of the cells on both sides of a slot."""
     assert plan.scene.cells
     rows = []
     for side in plan.scene.cells.tiling.beside[slot]:
         target, step = (side.first.target, side.first.cell) if side.first else (slot.source, None)
-        rows.append(plan.row(array, f"{side.kind}, {target}", step))
+        rows.append(plan.row("share", f"{side.kind}, {target}", step))
     return rows

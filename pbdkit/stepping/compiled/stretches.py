@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pbdkit.scene.places import Block
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.rows import GENERAL, MIXED, NOBODY, PLAIN, WITH_CELLS
+from pbdkit.stepping.compiled.rows import GENERAL, NOBODY, PLAIN, WITH_CELLS
 from pbdkit.stepping.surroundings import presence
 
 SHORT = 4
@@ -71,7 +71,7 @@ def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
                 kinds[fits & (share != 1.0) & (kinds == PLAIN)] = WITH_CELLS
             for mixed in scene.cells.mixed:
                 for share in scene.cells.beside(slot, block, precision, mixed):
-                    kinds[fits & (share != 0.0)] = MIXED
+                    kinds[fits & (share != 0.0)] = GENERAL
     return kinds
 
 
@@ -80,8 +80,7 @@ def _lines_of(kinds: Ints) -> Ints:
     beyond = [*[(0, 0)] * (kinds.ndim - 1), (0, 1)]
     closed = np.pad(kinds, beyond, constant_values=NOBODY)
     flat = closed.ravel()
-    for n, beside in enumerate((WITH_CELLS, MIXED, GENERAL)):
-        these = [PLAIN, WITH_CELLS, MIXED][: n + 1]
+    for these, beside in (([PLAIN], WITH_CELLS), ([PLAIN, WITH_CELLS], GENERAL)):
         begin, end, kind = _stretches(flat)
         # The last is of nobody, so that no end touches the other.
         touches = (np.roll(kind, 1) == beside) | (np.roll(kind, -1) == beside)

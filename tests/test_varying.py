@@ -1,0 +1,141 @@
+"""Parameters that differ from place to place: what an experiment may write, and what it is told."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+from jsonschema import Draft202012Validator
+
+import pbdkit
+from pbdkit.interfaces.varying import Gridded, as_varying
+
+DISC = {"type": "disc", "radius": 2.0, "centre": [4.0, 2.0]}
+GIVEN: dict[str, Any] = {
+    "name": "plate",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "rectangle", "width": 8.0, "height": 4.0},
+    "regions": {"disc": DISC},
+    "neighbours": {"type": "chebyshev"},
+    "rule": {"type": "elastic", "poisson_ratio": 0.3},
+    "frame": {"type": "natural"},
+    "steps": 2,
+}
+
+
+def with_rule(**rule: Any) -> dict[str, Any]:
+    return GIVEN | {"rule": GIVEN["rule"] | rule}
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    grid = {"x": [-1.0, 9.0], "y": [0.0], "values": [[1.0], [2.0]]}
+    fields = (
+        {"stiffness": {"otherwise": 1.0, "disc": 10.0}},
+        {"poisson_ratio": {"otherwise": 0.3, "disc": 0.0}},
+        {"stiffness": grid},
+        {"stiffness": lambda x, y: np.exp(x / 8) + 0 * y},
+    )
+    for rule in fields:
+        experiment = pbdkit.Experiment(**with_rule(**rule))
+        written = json.loads(experiment.model_dump_json())
+        again = pbdkit.Experiment(**written)
+        assert again == experiment
+        assert again.model_dump_json() == experiment.model_dump_json()
+        Draft202012Validator(json.loads(schema())).validate(written)
+
+
+def schema() -> str:
+    from pbdkit.experiment.schema import experiment_schema
+    from pbdkit.registry.registry import Registry
+
+    return json.dumps(experiment_schema(Registry(), installed=False))
+
+
+def test_a_variable_of_a_file_is_read_from_beside_the_experiment(tmp_path):
+    values = xarray.DataArray(
+        [[1.0, 2.0, 3.0], [2.0, 3.0, 4.0]],
+        coords={"y": [-2.0, 6.0], "x": [-2.0, 4.0, 10.0]},
+        dims=("y", "x"),
+    )
+    values.to_dataset(name="E").to_netcdf(tmp_path / "modulus.nc", engine="h5netcdf")
+    text = json.dumps(with_rule(stiffness={"file": "modulus.nc", "variable": "E"}))
+    (tmp_path / "plate.yaml").write_text(text)
+    experiment = pbdkit.load(tmp_path / "plate.yaml")
+    field = experiment.rule.varying["stiffness"]
+    x, y = np.array([1.0, 4.0]), np.array([2.0, 6.0])
+    np.testing.assert_allclose(field.at(x, y, {}), values.interp(x=("n", x), y=("n", y)))
+    assert pbdkit.Experiment(**experiment.model_dump(mode="json")) == experiment
+
+
+def test_a_grid_is_bilinear_and_nowhere_else():
+    field = Gridded([0.0, 1.0, 3.0], [0.0, 2.0], [[1.0, 3.0], [2.0, 4.0], [4.0, 6.0]])
+    x, y = np.meshgrid(np.linspace(0.0, 3.0, 7), np.linspace(0.0, 2.0, 5))
+    np.testing.assert_allclose(field.at(x, y, {}), 1.0 + x + y)
+    assert np.isnan(field.at(np.array([-0.1]), np.array([1.0]), {})).all()
+
+
+@pytest.mark.parametrize(
+    ("rule", "place", "text"),
+    [
+        ({"stiffness": {"otherwise": 1.0, "disk": 2.0}}, "rule.stiffness", "did you mean 'disc'"),
+        ({"stiffness": {"disc": 2.0}}, "rule.stiffness", "should be a number, {otherwise:"),
+        ({"stiffness": {"otherwise": 1.0, "disc": "x"}}, "rule.stiffness", "'disc' should be a"),
+        ({"stiffness": {"otherwise": 1.0, "disc": -2.0}}, "rule.stiffness", "disc: should be gre"),
+        ({"poisson_ratio": {"otherwise": 0.3, "disc": 0.7}}, "rule.poisson_ratio", "got 0.7"),
+        ({"stiffness": {"file": "no.nc", "variable": "E"}}, "rule.stiffness", "no regular file"),
+        ({"stiffness": {"file": "no.nc"}}, "rule.stiffness", "has file and variable"),
+        ({"stiffness": {"x": [1, 0], "y": [0], "values": [[1], [2]]}}, "rule.stiffness", "increase"),
+        ({"stiffness": {"x": [0], "y": [0], "values": [[1, 2]]}}, "rule.stiffness", "1 lists of 1"),
+        ({"stiffness": {"x": [0], "y": [0], "values": "?"}}, "rule.stiffness", "base 64"),
+        ({"stiffness": lambda x, y: 1 - 2 * (x > 8)}, "rule.stiffness", "the smallest value: should be"),
+        ({"plane": {"otherwise": "stress"}}, "rule.plane", "should be 'stress' or 'strain'"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_place(rule, place, text):
+    with pytest.raises(pbdkit.ExperimentError, match="^" + place.replace(".", r"\.")) as caught:
+        pbdkit.Experiment(**with_rule(**rule))
+    assert text in str(caught.value)
+
+
+def test_a_place_outside_the_data_is_an_error():
+    field = {"x": [0.0, 5.0], "y": [0.0], "values": [[1.0], [2.0]]}
+    with pytest.raises(pbdkit.ExperimentError, match=r"rule\.stiffness: has no value at \(6\.5, 0\.5\)"):
+        pbdkit.run(with_rule(stiffness=field), progress=False)
+
+
+def test_regions_are_places_with_names_of_their_own():
+    for regions, text in (
+        ({"file": DISC}, "and be none of otherwise, file, steps"),
+        ({"grid": {"type": "grid", "columns": 3, "rows": 3}}, "take a rectangle"),
+    ):
+        with pytest.raises(pbdkit.ExperimentError, match=text):
+            pbdkit.Experiment(**GIVEN | {"regions": regions})
+
+
+def test_leaders_are_selected_by_region():
+    leaders = [{"select": {"region": "disc"}, "motion": {"type": "hold"}}]
+    ds = pbdkit.run(GIVEN | {"leaders": leaders}, progress=False)
+    X = ds["reference"].values
+    inside = np.hypot(*(X - DISC["centre"]).T) <= 2.0
+    np.testing.assert_array_equal(ds["kind"].isel(time=-1).values == 0, inside)
+    leaders[0]["select"] = {"region": "disk"}
+    with pytest.raises(pbdkit.ExperimentError, match="leaders.0.select.region: there is no region"):
+        pbdkit.run(GIVEN | {"leaders": leaders}, progress=False)
+
+
+def test_each_material_is_identified():
+    experiment = pbdkit.Experiment(**with_rule(poisson_ratio={"otherwise": 0.3, "disc": 0.1}))
+    materials = experiment.materials()
+    assert {name: one.rule.poisson_ratio for name, one in materials.items()} == {
+        "otherwise": 0.3,
+        "disc": 0.1,
+    }
+    assert pbdkit.identify(experiment).as_dict() == pbdkit.identify(materials["otherwise"]).as_dict()
+
+
+@pytest.mark.parametrize("given", [1.0, 3, None, "0.3", [1.0]])
+def test_what_is_no_field_is_left_to_the_parameter(given):
+    assert as_varying(given) is None
