@@ -188,7 +188,8 @@ def wave_bound(scene: Scene) -> Bound | None:
 
 def bounds_the_body(scene: Scene) -> bool:
     """Whether no mode of the body can grow where no wave does: particles with fewer neighbours have
-    modes of their own, so have bodies of several materials, and with much memory so have frames on leaning lattices."""
+    modes of their own, so have bodies of several materials, and with much memory frames on leaning
+    lattices."""
     reach = scene.neighbourhood.reach
     whole = scene.experiment.frame.depth(reach) >= reach and not scene.experiment.rule.varying
     return whole and abs(scene.experiment.stepping.memory) <= LITTLE_MEMORY

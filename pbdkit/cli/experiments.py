@@ -144,7 +144,9 @@ def identify(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
 
     for name, found in every.items():
         where = f" ({name})" if name else ""
-        click.echo(f"{found.name}: {found.rule}{where}, {found.lattice} lattice, {found.neighbours}")
+        click.echo(
+            f"{found.name}: {found.rule}{where}, {found.lattice} lattice, {found.neighbours}"
+        )
         show_table(table(found))
         for note in found.notes:
             click.echo(f"note: {note}")

@@ -22,7 +22,6 @@ from pbdkit.interfaces import (
     where,
 )
 
-
 Factor = Annotated[
     float,
     Field(ge=1e-9, le=1e9, description="Stiffness over that of the material.", examples=[10.0]),

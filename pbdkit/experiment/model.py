@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from typing import Annotated, Any, Self
 
 from pydantic import (
-    AfterValidator,
     Field,
     PrivateAttr,
     SerializeAsAny,
@@ -21,7 +19,8 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
-from pbdkit.experiment.parts import brief, fault, open_part, report
+from pbdkit.experiment.names import Name, RegionName, Version
+from pbdkit.experiment.parts import fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.sampling import sampled
 from pbdkit.experiment.solvers import AnySolver, Stepping
@@ -39,41 +38,9 @@ from pbdkit.interfaces import (
     Softens,
 )
 from pbdkit.interfaces.component import Strict
-from pbdkit.interfaces.varying import RESERVED, TakesFields, unknown_regions
+from pbdkit.interfaces.fields import TakesFields, unknown_regions
 from pbdkit.registry.registry import Registry
 
-
-def _valid_name(name: str) -> str:
-    words = name.split("/")
-    if len(name) > 200 or ".." in name or not all(re.fullmatch(_WORD, word) for word in words):
-        raise fault(
-            "may hold letters, digits, '.', '_', '-' and '/', no '..', and no part between slashes "
-            f"that is empty or begins with a dot; got {brief(name)}"
-        )
-    return name
-
-
-def _known_version(version: int) -> int:
-    if version != 1:
-        raise fault(f"this pbdkit reads version 1, got {brief(version)}")
-    return version
-
-
-_WORD = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
-Name = Annotated[
-    str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
-]
-Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
-def _region(name: str) -> str:
-    if name in RESERVED or not re.fullmatch(_WORD, name):
-        raise fault(
-            f"a region's name may hold letters, digits, '.', '_' and '-', and be none of "
-            f"{', '.join(RESERVED)}; got {brief(name)}"
-        )
-    return name
-
-
-RegionName = Annotated[str, AfterValidator(_region)]
 AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
 
 
@@ -94,7 +61,7 @@ class Experiment(Strict):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
     body: AnyBody
-    regions: dict[RegionName, AnyBody] = {}
+    regions: dict[RegionName, AnyBody] = Field(default_factory=dict)
     neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
         "coordination"
     )
@@ -145,8 +112,9 @@ class Experiment(Strict):
                 raise fault(first["msg"], key=(field, first["ctx"]["key"])) from None
         for name, region in self.regions.items():
             if any(box.in_sites for box in region.boxes()):
-                raise fault("counts sites, and a region is a place: take a rectangle",
-                            key=("regions", name))
+                raise fault(
+                    "counts sites, and a region is a place: take a rectangle", key=("regions", name)
+                )
         return self
 
     @property

@@ -17,7 +17,7 @@ from pbdkit.experiment.field_file import read_field
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.interfaces.varying import TakesFields
+from pbdkit.interfaces.fields import TakesFields
 from pbdkit.registry.blame import blame
 from pbdkit.registry.registry import Registry
 

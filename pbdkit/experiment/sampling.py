@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.experiment.body import Body, Box
 from pbdkit.interfaces import Lattice
-from pbdkit.interfaces.varying import OfPlace, TakesFields
+from pbdkit.interfaces.fields import TakesFields
+from pbdkit.interfaces.varying import OfPlace, Varying
 
 Floats = NDArray[np.float64]
-BEYOND = 2
-"""Spacings by which the grid goes beyond the body."""
+SLACK = 1e-9
+"""Of spacings: so far a body reaches beyond a place by rounding."""
 
 
-def sampled(part: TakesFields, lattice: Lattice, body: Body) -> TakesFields:
+def sampled(part: TakesFields, lattice: Lattice, body: Body) -> Any:
     """The part with values in place of functions, half a spacing apart: on the square and the
     rectangular lattice particles, middles of bonds and of cells are places of the grid.
 
@@ -26,8 +28,8 @@ def sampled(part: TakesFields, lattice: Lattice, body: Body) -> TakesFields:
     if not functions:
         return part
     places = _grid(lattice, body)
-    found = {name: field.sampled(*places) for name, field in functions.items()}
-    return part.with_values(**part.varying | found)
+    found: dict[str, Varying] = {n: field.sampled(*places) for n, field in functions.items()}
+    return part.with_values(**{**part.varying, **found})
 
 
 def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
@@ -36,8 +38,8 @@ def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
     spacing = np.abs(np.diag(steps))
     corners = np.concatenate([_corners(box, steps, lattice) for box in body.boxes()])
     origin = np.array(lattice.origin)
-    low = np.floor((corners.min(axis=0) - origin) / spacing).astype(int) - BEYOND
-    high = np.ceil((corners.max(axis=0) - origin) / spacing).astype(int) + BEYOND
+    low = np.floor((corners.min(axis=0) - origin) / spacing + SLACK).astype(int)
+    high = np.ceil((corners.max(axis=0) - origin) / spacing - SLACK).astype(int)
     x, y = (
         o + s / 2 * np.arange(2 * a, 2 * b + 1)
         for o, s, a, b in zip(origin, spacing, low, high, strict=True)

@@ -11,7 +11,7 @@ from pydantic.json_schema import models_json_schema
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import INTERFACES
-from pbdkit.interfaces.varying import DEFINITION, SCHEMA
+from pbdkit.interfaces.fields import DEFINITION, SCHEMA
 from pbdkit.registry.registry import Registry
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.component import Pair
+from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.values import Remembers
-from pbdkit.interfaces.varying import TakesFields
 
 Segment = tuple[Pair, Pair]
 """A straight crack, from one point to another (lattice units)."""

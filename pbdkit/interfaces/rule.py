@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
+from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbour_metric import Slot
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.interfaces.values import Remembers
-from pbdkit.interfaces.varying import TakesFields
 from pbdkit.interfaces.vector import Components
 
 

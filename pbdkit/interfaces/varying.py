@@ -5,58 +5,19 @@ from __future__ import annotations
 import base64
 import binascii
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
-
-from pbdkit.interfaces.component import Component, did_you_mean
 
 Floats = NDArray[np.float64]
 Held = Mapping[str, NDArray[np.bool_]]
 """Which places a region holds, by its name, in the order in which the experiment names them."""
-RESERVED = ("otherwise", "file", "steps")
-"""What no region is called, so that a map tells what it is."""
 MOST_IN_WORDS = 1000
 """So many values are written as numbers, more as bytes in base 64."""
 MOST_VALUES = 2**24
-
-
-DEFINITION = "Field"
-ABOUT = ("title", "description", "examples", "default")
-"""What a schema says of a parameter whatever stands in it."""
-SCHEMA = {
-    "title": "Field",
-    "description": "A value for each place: by region, from a netCDF file, or over a grid.",
-    "oneOf": [
-        {
-            "type": "object",
-            "required": ["otherwise"],
-            "additionalProperties": {"type": "number"},
-        },
-        {
-            "type": "object",
-            "required": ["file", "variable"],
-            "properties": {"file": {"type": "string"}, "variable": {"type": "string"}},
-            "additionalProperties": False,
-        },
-        {
-            "type": "object",
-            "required": ["x", "y", "values"],
-            "properties": {
-                "x": {"type": "array", "items": {"type": "number"}},
-                "y": {"type": "array", "items": {"type": "number"}},
-                "values": {"type": ["array", "string"]},
-            },
-            "additionalProperties": False,
-        },
-    ],
-}
-"""The JSON Schema of what a file writes in place of a number."""
 
 
 class Varying(ABC):
@@ -128,7 +89,8 @@ class Gridded(Varying):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Gridded) and all(
-            np.array_equal(getattr(self, name), getattr(other, name)) for name in ("x", "y", "values")
+            np.array_equal(getattr(self, name), getattr(other, name))
+            for name in ("x", "y", "values")
         )
 
     __hash__ = None  # type: ignore[assignment]  # arrays can be long, and nobody asks
@@ -237,93 +199,3 @@ def _unpacked(given: dict[str, Any]) -> Any:
         return numbers.reshape(len(given["x"]), len(given["y"]))
     except (binascii.Error, TypeError, ValueError):
         raise ValueError("values are no numbers: bytes in base 64 of as many as x and y") from None
-
-
-class TakesFields(Component):
-    """A component whose numbers may differ from place to place.
-
-    Each stands in its field with the value that serves where one number is asked for; what it is
-    elsewhere, `varying` tells.
-    """
-
-    _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
-
-    @property
-    def varying(self) -> Mapping[str, Varying]:
-        """The parameters that differ from place to place."""
-        return self._varying
-
-    def with_values(self, **values: Any) -> Any:
-        """The component with other numbers, or fields, in place of its own; what is not given is
-        the same everywhere. Raises ValidationError where they do not go together."""
-        fields = type(self).model_fields.items()
-        given = {field.alias or name: getattr(self, name) for name, field in fields}
-        return type(self).model_validate(given | values)
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _with_fields(cls, data: Any, handler: Any) -> Any:
-        if not isinstance(data, dict):
-            return handler(data)
-        varying = {}
-        for name in cls.numbers() & data.keys():
-            try:
-                found = as_varying(data[name])
-            except ValueError as error:
-                raise _fault(name, str(error)) from None
-            if found:
-                varying[name] = found
-        if varying:
-            cls._refuse_wrong(data, varying)
-        part = handler(data | {name: _first(field) for name, field in varying.items()})
-        part._varying = varying
-        return part
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """Numbers, or fields in their place."""
-        schema: dict[str, Any] = handler(core_schema)
-        known = handler.resolve_ref_schema(schema).get("properties", {})
-        for name in cls.numbers() & known.keys():
-            about = {k: v for k, v in known[name].items() if k in ABOUT}
-            number = {k: v for k, v in known[name].items() if k not in ABOUT}
-            known[name] = about | {"anyOf": [number, {"$ref": f"#/$defs/{DEFINITION}"}]}
-        return schema
-
-    @classmethod
-    def numbers(cls) -> set[str]:
-        """The parameters that can differ from place to place."""
-        return {name for name, field in cls.model_fields.items() if field.annotation is float}
-
-    @classmethod
-    def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Varying]) -> None:
-        """Validates with the values of each place that is told apart."""
-        for label in dict.fromkeys(label for field in varying.values() for label in field.samples):
-            here = {n: field.samples.get(label, _first(field)) for n, field in varying.items()}
-            try:
-                cls.model_validate(data | here)
-            except ValidationError as error:
-                for fault in error.errors(include_url=False):
-                    name = next((w for w in fault["loc"] if w in here), None)
-                    if name or not fault["loc"]:  # else it is about another parameter
-                        text = fault["msg"].removeprefix("Value error, ")
-                        text = text.replace("Input should", "should")
-                        got = f", got {here[name]:g}" if name else ""
-                        raise _fault(str(name or min(here)), f"{label}: {text}{got}") from None
-
-
-def _first(field: Varying) -> float:
-    return next(iter(field.samples.values()))
-
-
-def _fault(name: str, text: str) -> PydanticCustomError:
-    return PydanticCustomError("fault", "{text}", {"text": text, "key": name})
-
-
-def unknown_regions(part: TakesFields, regions: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The parameters whose fields name regions that there are not, each with a message."""
-    for name, field in part.varying.items():
-        for region, _ in field.values if isinstance(field, ByRegion) else ():
-            if region not in regions:
-                known = f"known: {', '.join(regions)}" if regions else "there is none: add `regions`"
-                yield name, f"there is no region '{region}'{did_you_mean(region, regions)} ({known})"

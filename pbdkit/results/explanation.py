@@ -13,6 +13,7 @@ from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Bonds, BreaksAtStrain, FractureModel
 from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.scene.declarations import bond_numbers
+from pbdkit.scene.places import Places
 from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import describe_bonds

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import MixesCells, Setting, Slot, Stiffness
-from pbdkit.interfaces.polygons import Polygon, Tiling
+from pbdkit.interfaces.polygons import Polygon
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.cells import WeighedCells
@@ -120,7 +121,7 @@ class _Cells:
 
     experiment: Experiment
     polygon: Polygon
-    place: tuple[Any, ...]
+    place: Any
     x: Floats
     y: Floats
     inside: Mask
@@ -142,7 +143,7 @@ class _Cells:
         at = np.array([(x + r.x, y + r.y) for r in polygon.rest])
         at += np.array(raster.lattice.origin)[:, None]
         place = (polygon.source, *(n + a for n, a in zip(found, start, strict=True)))
-        inside = body[(slice(None), *found)].all(axis=0)
+        inside = np.asarray(body[:, *found].all(axis=0))
         return cls(experiment, polygon, place, at[:, 0], at[:, 1], inside)
 
     def materials(self) -> tuple[Floats, Floats]:
@@ -185,8 +186,8 @@ class _Cells:
             here = {name: np.where(f >= 0.5, within[name], value) for name, value in here.items()}
         if not np.isfinite(found).all():
             raise ExperimentError(
-                f"'{self.experiment.rule.type}' has no finite stiffness for some of its cells, as at "
-                "poisson_ratio -1: cells of several materials need one",
+                f"'{self.experiment.rule.type}' has no finite stiffness for some cells, as at "
+                "poisson_ratio -1: a body of several materials needs one",
                 ("rule",),
             )
         return found
@@ -216,8 +217,7 @@ class _Cells:
         at_corners = signed(self.x, self.y)
         share = (at_corners <= 0.0).all(axis=0).astype(float)
         normal = np.zeros((len(share), 2))
-        corners = np.array(self.polygon.rest)
-        width = float(max(np.hypot(*(a - b)) for a in corners for b in corners))
+        width = max(math.dist(a, b) for a in self.polygon.rest for b in self.polygon.rest)
         reach = width if region.exaggerates() else NEAREST * width
         near = np.flatnonzero(np.abs(at_corners).min(axis=0) <= reach)
         for some in np.split(near, range(CELLS_AT_ONCE, len(near), CELLS_AT_ONCE)):

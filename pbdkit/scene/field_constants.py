@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from operator import add
+from operator import add, methodcaller
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, FollowerRule, Remembers, Setting
-from pbdkit.interfaces.varying import TakesFields
+from pbdkit.interfaces.fields import TakesFields
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.field_values import Values, kinds_of, values_at
 from pbdkit.scene.homes import SceneConstants
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.places import Floats
-from pbdkit.scene.raster import FOLLOWER, Raster
+from pbdkit.scene.raster import Raster
 
 FEW = 3
 """So many places are looked at to see whether a part answers for whole arrays."""
@@ -56,7 +56,7 @@ def _refuse(experiment: Experiment) -> None:
     rule, fracture = experiment.rule, experiment.fracture
     unfit = (
         (rule.varying and isinstance(rule, AppliesTwice), "rule", rule,
-         "applies a rule to the moves of another: what its energy is where they differ is not told"),
+         "applies a rule to the moves of another: what its energy would be is not told"),
         (rule.varying and experiment.neighbours.nearness(), "rule", rule,
          "is asked for neighbours that are found anew; set neighbours.reevaluate: false"),
         (isinstance(fracture, Remembers) and fracture.varying and _hidden(fracture), "fracture",
@@ -123,7 +123,7 @@ def _by_bond(
         x, y = np.broadcast_arrays(*middle)
         needed = bonds_in(raster, block, plane, frame_too=False)
         values = values_at(experiment, "fracture", x, y, needed)
-        own = _asked(fracture, values, lambda part, s=plane.slot: part.constants(s))
+        own = _asked(fracture, values, methodcaller("constants", plane.slot))
         for name, limits in own.items():
             planes = found.setdefault(name, np.zeros(shape))
             block.within(planes[n])[...] = limits
@@ -134,7 +134,9 @@ def _by_bond(
         for n, plane in enumerate(around.planes):
             if not planes[n].any():
                 planes[n] = getattr(constants.limits[plane.slot], name)
-    return {name: found[name] for name in constants.limits[around.every[0]]._fields if name in found}
+    return {
+        name: found[name] for name in constants.limits[around.every[0]]._fields if name in found
+    }
 
 
 def _refuse_parameter(fracture: TakesFields) -> None:

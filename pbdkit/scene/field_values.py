@@ -13,7 +13,8 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import Cell, Vector
-from pbdkit.interfaces.varying import ByRegion, TakesFields
+from pbdkit.interfaces.fields import TakesFields
+from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.places import Floats, Mask
 from pbdkit.scene.sites import rounding_of
 

@@ -45,6 +45,16 @@ class SceneConstants:
     by_particle: Planes = field(default_factory=dict)
     by_bond: Planes = field(default_factory=dict)
 
+    @property
+    def shared(self) -> list[float]:
+        """The parameters of the rule that are the same everywhere."""
+        return [v for name, v in self.rule._asdict().items() if name not in self.by_particle]
+
+    def limits_of(self, slot: Slot) -> list[float]:
+        """The limits of a slot that all its bonds share."""
+        own = self.limits[slot]._asdict()
+        return [value for name, value in own.items() if name not in self.by_bond]
+
     def rule_at(self, where: Where) -> Any:
         """The rule's parameters of some particles."""
         return self.rule._replace(**{name: where.of(v) for name, v in self.by_particle.items()})

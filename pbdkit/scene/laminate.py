@@ -1,6 +1,8 @@
-"""The stiffness of a cell that the border of two materials cuts: that of layers along the border."""
+"""The stiffness of a cell that a border of two materials cuts: of layers along the border."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +13,9 @@ ACROSS, ALONG = [0, 2], [1]
 
 
 def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Floats:
-    """(cell, 3, 3): the stiffness of layers, `share` (cell,) of them of the material `inner` and the
-    rest of `outer`, (cell, 3, 3) in the components xx, yy, xy with the angle of shear, under the
-    `normal` (cell, 2).
+    """(cell, 3, 3): the stiffness of layers, `share` (cell,) of them of the material `inner` and
+    the rest of `outer`, (cell, 3, 3) in the components xx, yy, xy with the angle of shear, under
+    the `normal` (cell, 2).
 
     The tractions across the layers and the strain along them are the same in both (Backus 1962):
     harmonic means across, arithmetic along.
@@ -38,7 +40,7 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
     return np.asarray(np.swapaxes(turn, 1, 2) @ found @ turn)
 
 
-def _pieces(c: Floats) -> tuple[Floats, Floats, Floats]:
+def _pieces(c: Floats) -> tuple[Any, Any, Any]:
     """Of one material in the layers' axes: compliance across, C_nn⁻¹; C_nn⁻¹ C_nt; and what stands
     along for itself, C_tt - C_tn C_nn⁻¹ C_nt."""
     across, to = c[:, ACROSS][:, :, ACROSS], c[:, ACROSS][:, :, ALONG]
@@ -51,7 +53,9 @@ def _to_layers(normal: Floats) -> Floats:
     """(cell, 3, 3): from strains (x, y, angle) to (normal, tangential, angle)."""
     c, s = normal.T
     return np.moveaxis(
-        np.array([[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]),
+        np.array(
+            [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
+        ),
         -1,
         0,
     )

@@ -65,8 +65,9 @@ class SlotFollowers(Followers):
         self._blocks = blocks(scene)
         evaluator = Evaluator(scene)
         varies = scene.constants.by_particle
-        self._evaluators = [evaluator.given(b.parameters) if varies else evaluator
-                            for b in self._blocks]
+        self._evaluators = [
+            evaluator.given(b.parameters) if varies else evaluator for b in self._blocks
+        ]
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""

@@ -90,8 +90,10 @@ class Surroundings:
     def _more_of(self, slot: Slot) -> tuple[Any, ...]:
         """w of cells of a stiffness of their own, where any is beside the slot."""
         cells, precision = self._scene.cells, self._scene.experiment.stepping.precision
-        found = []
-        for weights, shares in zip(cells.weights, cells.mixed, strict=True) if cells else ():
+        found = list[Any]()
+        if cells is None:
+            return ()
+        for weights, shares in zip(cells.weights, cells.mixed, strict=True):
             left, right = cells.beside(slot, self.where, precision, shares)
             if np.any(left) or np.any(right):
                 found.append(weights[slot]._replace(left=left, right=right))

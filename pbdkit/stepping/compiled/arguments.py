@@ -66,7 +66,7 @@ def rule_arrays(plan: Plan) -> Arrays:
     """The parameters of rules and solver."""
     solver = plan.scene.experiment.stepping
     # One more, so that no array is empty.
-    rules = {f"rule{n}": [*own.scene.constants.rule, 0.0] for n, own in enumerate(plan.levels)}
+    rules = {f"rule{n}": [*own.scene.constants.shared, 0.0] for n, own in enumerate(plan.levels)}
     numbers = {"solver": [solver.relaxation, solver.memory], **rules}
     return {name: np.array(values, solver.precision) for name, values in numbers.items()}
 
@@ -89,7 +89,7 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
     cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in beside]
     return {
         "rests": slot.rest,
-        "limits": scene.constants.limits[slot],
+        "limits": scene.constants.limits_of(slot),
         "signs": 1.0 if here else -1.0,
         "away": away,
         "bonds_away": home * math.prod(shape[1:]) + (0 if here else away),
@@ -106,7 +106,7 @@ def _of_plane(scene: Scene, plane: BondPlane) -> dict[str, Any]:
     return {
         "ends": (slot.source, slot.target, *slot.cell),
         "end_rests": slot.rest,
-        "end_limits": scene.constants.limits[slot],
+        "end_limits": scene.constants.limits_of(slot),
         "end_blocks": list(chain(*spans)),
     }
 

@@ -96,8 +96,8 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
     cracked = isinstance(fracture, StartsCracked) and fracture.segments()
-    remembered = particle_numbers(experiment) or bond_numbers(experiment)
-    remembered = remembered or scene.constants.by_particle or scene.constants.by_bond
+    fields = scene.constants.by_particle or scene.constants.by_bond
+    remembered = particle_numbers(experiment) or bond_numbers(experiment) or fields
     if not experiment.initial.at_rest or experiment.rule.uses_reference or cracked or remembered:
         return False
     for s, slots in enumerate(scene.neighbourhood.slots):

@@ -103,7 +103,9 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
     out.add(2, contributions(level, "r", values(level.seen.weights, named)))
     mixed = [
-        values(level.seen.weights, {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"mixed{m}_{{n}}"})
+        values(
+            level.seen.weights, {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"mixed{m}_{{n}}"}
+        )
         for m in range(plan.mixed)
     ]
     out.add(2, *more_contributions(plan, level, "r", mixed))

@@ -1,0 +1,208 @@
+"""Bodies of several materials against their closed forms, and the same from every engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from interpreted_kernels import interpreting
+from test_engines import assert_bitwise_equal
+
+import pbdkit
+from pbdkit.scene.laminate import laminate
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+
+PULL = 0.01
+
+
+def bar(length: float, height: float, spacing: float = 1.0, **rule: Any) -> dict[str, Any]:
+    """A bar along x, pulled by a hundredth of its length; ν = 0, so that nothing bars it
+    sideways."""
+    return {
+        "name": "bar",
+        "lattice": {"type": "square", "a": spacing},
+        "body": {"type": "rectangle", "width": length, "height": height},
+        "neighbours": {"type": "chebyshev"},
+        "rule": {"type": "elastic", "poisson_ratio": 0.0} | rule,
+        "frame": {"type": "natural"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "displace", "displacement": [PULL * length, 0.0]},
+            },
+        ],
+        "steps": 1,
+        "solver": {"type": "equilibrium", "tolerance": 1e-12},
+        "diagnostics": [{"type": "displacement"}, {"type": "reaction", "youngs_modulus": 1.0}],
+    }
+
+
+@pytest.mark.parametrize("contrast", [10.0, 1000.0])
+@pytest.mark.parametrize("border", [4.0, 4.5, 4.3, 4.01])
+def test_two_phases_in_series(contrast, border):
+    """On a line of cells, and across cells: the stress is one, and strains are as 1/E."""
+    length, height = 8.0, 3.0
+    stiff = {"type": "rectangle", "width": 9.0, "height": 5.0, "origin": [border, -1.0]}
+    given = bar(length, height, stiffness={"otherwise": 1.0, "stiff": contrast})
+    ds = pbdkit.run(given | {"regions": {"stiff": stiff}}, progress=False)
+    stress = PULL * length / (border + (length - border) / contrast)
+    x = ds["reference"].values[:, 0]
+    u = stress * (np.minimum(x, border) + np.maximum(x - border, 0.0) / contrast)
+    found = ds["u"].isel(time=-1).values
+    assert np.abs(found[:, 0] - u).max() < 1e-10 * PULL * length
+    assert np.abs(found[:, 1]).max() < 1e-10 * PULL * length
+    pulled = ds["reaction"].isel(time=-1).values[1]
+    np.testing.assert_allclose(pulled, [stress * height, 0.0], atol=1e-10 * stress * height)
+
+
+def errors_of(modulus: Any, exact: Any) -> list[float]:
+    """Of graded bars of length 1 with 5, 10 and 20 cells, over the pull."""
+    errors = []
+    for n in (5, 10, 20):
+        given = bar(1.0, 2.0 / n, 1.0 / n, stiffness=lambda x, y: modulus(x) + 0.0 * y)
+        given["solver"] = {"type": "equilibrium", "tolerance": 1e-11}
+        ds = pbdkit.run(given, progress=False)
+        x, u = ds["reference"].values[:, 0], ds["u"].isel(time=-1).values[:, 0]
+        errors.append(float(np.abs(u / PULL - exact(x)).max()))
+    return errors
+
+
+def test_an_exponentially_graded_bar_is_exact_at_its_particles():
+    """E = exp(2x): the mean of 1/E over a cell is that at its middle times a constant."""
+    errors = errors_of(
+        lambda x: np.exp(2.0 * x), lambda x: (1.0 - np.exp(-2.0 * x)) / (1.0 - np.exp(-2.0))
+    )
+    assert max(errors) < 1e-10
+
+
+def test_a_graded_bar_converges_at_second_order():
+    """E = 1 + 3x: u = ln(1 + 3x) / ln 4 of the end's."""
+    errors = errors_of(lambda x: 1.0 + 3.0 * x, lambda x: np.log(1.0 + 3.0 * x) / np.log(4.0))
+    assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 1.9
+
+
+def test_layers_at_an_angle_are_layers():
+    """Turned layers have the turned stiffness; equal layers are one material; and by themselves
+    they have the harmonic mean across and the arithmetic one along."""
+    one, other = (np.diag([e, e, e / 2])[None] for e in (1.0, 4.0))
+    share, across = np.array([0.25]), np.array([[1.0, 0.0]])
+    found = laminate(one, other, share, across)[0]
+    np.testing.assert_allclose(np.diag(found), [1 / 0.8125, 1.75, 0.5 / 0.8125])
+    np.testing.assert_allclose(laminate(other, other, share, across), other)
+    up = laminate(one, other, share, np.array([[0.0, 1.0]]))[0]
+    np.testing.assert_allclose(np.diag(up), np.diag(found)[[1, 0, 2]], atol=1e-14)
+    angle = np.array([[np.cos(0.3), np.sin(0.3)]])
+    turned = laminate(one, other, share, angle)[0]
+    n, t = angle[0], np.array([-angle[0, 1], angle[0, 0]])
+    strain = np.array([n[0] ** 2, n[1] ** 2, 2 * n[0] * n[1]])  # unit strain along the normal
+    assert strain @ turned @ strain == pytest.approx(found[0, 0])
+    strain = np.array([t[0] ** 2, t[1] ** 2, 2 * t[0] * t[1]])
+    assert strain @ turned @ strain == pytest.approx(found[1, 1])
+
+
+REGIONS = {
+    "a": {"type": "disc", "radius": 2.3, "centre": [4.2, 3.1]},
+    "b": {"type": "rectangle", "width": 3.3, "height": 9.0, "origin": [6.2, 1.4]},
+}
+SQUARE = {"lattice": {"type": "square", "a": 1.0}}
+SQUARE_CELLS = SQUARE | {"neighbours": {"type": "chebyshev"}, "frame": {"type": "natural"}}
+HEXAGONAL = {"lattice": {"type": "hexagonal", "a": 1.0}}
+
+
+def by_region(otherwise: float, a: float, b: float) -> dict[str, float]:
+    return {"otherwise": otherwise, "a": a, "b": b}
+
+
+STIFF = by_region(1.0, 10.0, 0.1)
+FIELDS: dict[str, dict[str, Any]] = {
+    "stiffness": SQUARE_CELLS
+    | {"rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness": STIFF}},
+    "poisson": SQUARE_CELLS
+    | {"rule": {"type": "elastic", "poisson_ratio": by_region(0.3, 0.4, 0.0)}},
+    "triangles": HEXAGONAL
+    | {
+        "frame": {"type": "natural"},
+        "rule": {"type": "elastic", "poisson_ratio": by_region(0.3, 0.4, 0.0), "stiffness": STIFF},
+    },
+    "orthotropic": SQUARE_CELLS
+    | {
+        "rule": {
+            "type": "orthotropic",
+            "poisson_ratio": 0.2,
+            "modulus_ratio": by_region(0.5, 1.0, 2.0),
+            "shear_ratio": 0.3,
+        }
+    },
+    "under a frame": SQUARE_CELLS
+    | {
+        "frame": {"type": "traction-free"},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness": STIFF},
+    },
+    "springs": HEXAGONAL
+    | {"frame": {"type": "natural"}, "rule": {"type": "springs", "stiffness": STIFF}},
+    "K": SQUARE | {"rule": {"type": "mixed-coordinate", "K": by_region(-0.002, 0.001, -0.004)}},
+    "strain": HEXAGONAL
+    | {
+        "rule": {"type": "barycentre"},
+        "fracture": {"type": "strain", "failure": by_region(0.1, 0.03, 0.2)},
+    },
+    "damage": HEXAGONAL
+    | {
+        "rule": {"type": "barycentre"},
+        "fracture": {
+            "type": "damage",
+            "onset": by_region(0.02, 0.01, 0.05),
+            "failure": {"x": [-2.0, 20.0], "y": [0.0], "values": [[0.1], [0.3]]},
+        },
+    },
+    "torn composite": SQUARE_CELLS
+    | {
+        "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness": STIFF},
+        "fracture": {"type": "strain", "failure": by_region(0.1, 0.03, 0.2)},
+    },
+}
+
+
+@pytest.mark.parametrize("parts", FIELDS.values(), ids=FIELDS)
+def test_engines_agree_and_the_dataset_says_all(parts):
+    width = 10.0 if "traction-free" in str(parts) else 9.7
+    given = {
+        "name": "composite",
+        "regions": REGIONS,
+        "body": {"type": "rectangle", "width": width, "height": 6.0},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "velocity", "velocity": [0.2, 0.03], "steps": 9},
+            },
+        ],
+        "steps": 12,
+        "solver": {"type": "stepping", "engine": "numpy", "relaxation": 0.5},
+    } | parts
+    scene = build_scene(pbdkit.Experiment(**given))
+    with interpreting():
+        assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 2, 9))
+    ds = pbdkit.run(given, progress=False)
+    assert pbdkit.rerun(ds, progress=False)["position"].identical(ds["position"])
+    uniform = given | {"regions": {}} | _uniform(given)
+    other = pbdkit.run(uniform, progress=False)["position"].values
+    assert not np.array_equal(other, ds["position"].values)
+
+
+def _uniform(given: dict[str, Any]) -> dict[str, Any]:
+    """The same with one number for all."""
+
+    def one(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        return value.get("otherwise", 0.1)
+
+    return {
+        part: {name: one(value) for name, value in given[part].items()}
+        for part in ("rule", "fracture")
+        if part in given
+    }
