@@ -47,8 +47,8 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "INTERFACES", "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated",
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "MixesCells", "Moment",
-    "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
+    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "MixesCells",
+    "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
+    "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
     "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
 ]  # fmt: skip

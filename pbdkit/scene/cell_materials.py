@@ -143,7 +143,7 @@ class _Cells:
         at = np.array([(x + r.x, y + r.y) for r in polygon.rest])
         at += np.array(raster.lattice.origin)[:, None]
         place = (polygon.source, *(n + a for n, a in zip(found, start, strict=True)))
-        inside = np.asarray(body[:, *found].all(axis=0))
+        inside = np.array([own[found] for own in body]).all(axis=0)
         return cls(experiment, polygon, place, at[:, 0], at[:, 1], inside)
 
     def materials(self) -> tuple[Floats, Floats]:
@@ -197,7 +197,7 @@ class _Cells:
         rule = self.experiment.rule
         field, base = rule.varying[STIFFNESS], getattr(rule, STIFFNESS)
         if not isinstance(field, ByRegion):
-            return otherwise / base
+            return np.asarray(otherwise / base)
         found = np.full(len(otherwise), field.otherwise)
         for region, (share, _) in self._cut():
             found += share * (dict(field.values)[region] - found)

@@ -73,11 +73,8 @@ class Evaluator:
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
         seen = self.seen(d, u, to)
-        found = as_values(self.rule.gather(seen, to.r, to.w, self._p), "gather")
-        for w in to.more:
-            more = self.rule.gather(seen, to.r, w, self._p)
-            found = tuple(a + b for a, b in zip(found, more, strict=True))
-        return found
+        parts = (self.rule.gather(seen, to.r, w, self._p) for w in (to.w, *to.more))
+        return summed((as_values(part, "gather"), None) for part in parts)
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""

@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.model import Version
+from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import brief, fault, report
 from pbdkit.experiment.schema import DIALECT
 from pbdkit.experiment.shipped import shipped_names, shipped_text
