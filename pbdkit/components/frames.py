@@ -141,15 +141,10 @@ class TractionFree(FramePolicy):
         """The points depend on one another along the edge: the map is what their equations make of
         a displacement of each body particle."""
         stiffness = material_of(frame.rule)
-        if stiffness is None:
+        if stiffness is None or frame.rule.varying.keys() - {"stiffness"}:
             raise ExperimentError(
-                f"'{self.type}' needs a rule that is calibrated to a material ('elastic', "
-                f"'orthotropic'), which '{frame.rule.type}' is not"
-            )
-        if others := frame.rule.varying.keys() - {"stiffness"}:
-            raise ExperimentError(
-                f"'{self.type}' balances edges of one material, up to a factor 'stiffness', and "
-                f"{min(others)} differs from place to place; take {{type: natural}}"
+                f"'{self.type}' needs a rule that is calibrated to one material ('elastic', "
+                f"'orthotropic'; 'stiffness' may differ), which '{frame.rule.type}' is not"
             )
         equations = _Equations(frame)
         equations.balance_edges(stiffness)

@@ -49,6 +49,6 @@ __all__ = [
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
     "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "MixesCells",
     "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
-    "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
+    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
 ]  # fmt: skip

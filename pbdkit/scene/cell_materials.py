@@ -143,7 +143,7 @@ class _Cells:
         at = np.array([(x + r.x, y + r.y) for r in polygon.rest])
         at += np.array(raster.lattice.origin)[:, None]
         place = (polygon.source, *(n + a for n, a in zip(found, start, strict=True)))
-        inside = np.array([own[found] for own in body]).all(axis=0)
+        inside = np.all([own[found] for own in body], axis=0)
         return cls(experiment, polygon, place, at[:, 0], at[:, 1], inside)
 
     def materials(self) -> tuple[Floats, Floats]:
