@@ -94,7 +94,7 @@ UNFIT = {
     "traction-free barycentre": (
         {"frame": FREE, "rule": {"type": "barycentre"}},
         "frame",
-        "needs a rule that is calibrated to a material",
+        "needs a rule that is calibrated to one material",
     ),
 }
 

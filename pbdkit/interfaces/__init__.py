@@ -50,5 +50,6 @@ __all__ = [
     "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "MixesCells",
     "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
     "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
-    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length",
+    "squared_length", "where",
 ]  # fmt: skip
