@@ -111,13 +111,31 @@ class StateCells(CellValues):
 
     @cached_property
     def _gradient(self) -> Floats:
-        weighed = self._scene.cells
-        cells = (
+        weighed, u = self._scene.cells, self._state.u.astype(float, copy=False)
+        cells = [
             (patch, (weighed.of(patch) if weighed else 1.0) * self._intact(patch))
             for patch in self._scene.patches
-        )
-        planes = displacement_gradient(self._state.u.astype(float, copy=False), cells)
-        return read_only(self._tables.of_body(planes).reshape(-1, 2, 2))
+        ]
+        whole = self._tables.of_body(displacement_gradient(u, cells))
+        if weighed is not None and weighed.phase is not None:
+            whole = self._by_phase(weighed.phase, u, cells, whole)
+        return read_only(whole.reshape(-1, 2, 2))
+
+    def _by_phase(
+        self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
+    ) -> Floats:
+        """The gradient from the cells of a particle's own material alone, where there is any: at a
+        border it jumps."""
+        found, own = whole.copy(), self._tables.phase
+        for number in np.unique(own).tolist():
+            alike = [
+                (patch, share * (patch.corners[0].of(phase[patch.polygon.kind]) == number))
+                for patch, share in cells
+            ]
+            within = self._tables.of_body(displacement_gradient(u, alike))
+            some = (own == number) & within.any(axis=1)
+            found[some] = within[some]
+        return found
 
     def inside_out(self) -> str | None:
         """A warning where cells have turned over or, if none has, corners of cells; None where none

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Stiffness
-from pbdkit.scene.cell_materials import stiffness_of_particles
+from pbdkit.scene.cell_materials import phases_of_particles, stiffness_of_particles
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
@@ -67,6 +67,11 @@ class Tables:
     def stiffness(self) -> Stiffness | None:
         """The rule's, of each particle where fields make it differ."""
         return stiffness_of_particles(self.scene.experiment, self.scene.raster)
+
+    @cached_property
+    def phase(self) -> NDArray[np.int64]:
+        """(particle,): of which material each is, by a number."""
+        return phases_of_particles(self.scene.experiment, self.scene.raster)
 
     @cached_property
     def surroundings(self) -> list[Surroundings]:

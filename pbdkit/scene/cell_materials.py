@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body
@@ -47,11 +47,14 @@ def weighed(
     _refuse_unmixable(experiment)
     shape = (1 + max(p.kind for p in setting.cells.polygons), *raster.shape)
     weight, mixed = np.ones(shape), {name: np.zeros(shape) for name in PLACES}
+    phase = np.zeros(shape, np.int64) if _regions_of(experiment) else None
     for polygon in setting.cells.polygons:
         if some := _Cells.of(experiment, raster, polygon):
             factor, stiffness = some.materials()
             there = (polygon.kind, *some.place)
             weight[there] = factor
+            if phase is not None:
+                phase[there] = some.phases()
             for name, at in PLACES.items():
                 mixed[name][there] = np.where(factor == 0.0, stiffness[(slice(None), *at)], 0.0)
     share = cells.share if cells else None
@@ -62,7 +65,8 @@ def weighed(
     used = [name for name, planes in mixed.items() if planes.any()]
     slots = [slot for own in setting.slots for slot in own]
     weights = tuple(_weights(experiment, setting, slots, name) for name in used)
-    return WeighedCells(setting.cells, share, weight, tuple(mixed[name] for name in used), weights)
+    planes = tuple(mixed[name] for name in used)
+    return WeighedCells(setting.cells, share, weight, planes, weights, phase)
 
 
 def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
@@ -75,6 +79,22 @@ def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness 
     values = values_at(experiment, "rule", x, y, raster.table_kind == FOLLOWER)
     matrices = _stiffness(experiment, values)
     return Stiffness(**{name: matrices[(slice(None), *at)] for name, at in PLACES.items()})
+
+
+def phases_of_particles(experiment: Experiment, raster: Raster) -> NDArray[np.int64]:
+    """(particle,): which regions of the rule's hold each, a bit a region."""
+    x, y = raster.reference().T
+    found, cell = np.zeros(len(x), np.int64), experiment.lattice.cell()
+    for bit, region in enumerate(_regions_of(experiment).values()):
+        found |= (signed_distance(region, cell, x, y) <= 0.0).astype(np.int64) << bit
+    return found
+
+
+def _regions_of(experiment: Experiment) -> dict[str, Body]:
+    """The regions that fields of the rule name, in the experiment's order."""
+    fields = experiment.rule.varying.values()
+    named = {n for field in fields if isinstance(field, ByRegion) for n, _ in field.values}
+    return {name: body for name, body in experiment.regions.items() if name in named}
 
 
 def _refuse_unmixable(experiment: Experiment) -> None:
@@ -153,20 +173,26 @@ class _Cells:
         values = dict(values_at(self.experiment, "rule", x, y, self.inside))
         if all(name == STIFFNESS for name in values) and not isinstance(rule, MixesCells):
             return self._factors(values[STIFFNESS]), np.zeros((len(x), 3, 3))
-        cut = [(name, *found) for name, found in self._cut()]
-        mixed = np.zeros(len(x), bool)
-        for _, share, _ in cut:
-            mixed |= (share > 0.0) & (share < 1.0)
+        mixed = self.phases() < 0
         factor = values.get(STIFFNESS, np.ones(len(x))) / getattr(rule, STIFFNESS, 1.0)
         others = [values[name] != getattr(rule, name) for name in values if name != STIFFNESS]
         apart = np.logical_or.reduce([mixed, *others])
         stiffness = np.zeros((len(x), 3, 3))
         some = np.flatnonzero(apart)
         if len(some):
-            stiffness[some] = self._mixed(values, cut, some)
+            stiffness[some] = self._mixed(values, some)
         return np.where(apart, 0.0, factor), stiffness
 
-    def _mixed(self, values: Values, cut: list[Any], some: Any) -> Floats:
+    def phases(self) -> NDArray[np.int64]:
+        """(cell,): the regions that hold each, a bit a region; -1 where a border cuts it."""
+        found = np.zeros(self.x.shape[1], np.int64)
+        for bit, (_, share, _) in enumerate(self._borders):
+            found |= (share == 1.0).astype(np.int64) << bit
+        for _, share, _ in self._borders:
+            found[(share > 0.0) & (share < 1.0)] = -1
+        return found
+
+    def _mixed(self, values: Values, some: Any) -> Floats:
         """The stiffness of some cells: region after region, as layers along its border."""
         here = {name: value[some] for name, value in values.items()}
         fields = self.experiment.rule.varying
@@ -174,7 +200,7 @@ class _Cells:
             if isinstance(field, ByRegion):
                 here[name] = np.full(len(some), field.otherwise)
         found = _stiffness(self.experiment, here)
-        for region, share, normal in cut:
+        for region, share, normal in self._borders:
             f, within = share[some], dict(here)
             for name, field in fields.items():
                 if isinstance(field, ByRegion) and region in dict(field.values):
@@ -199,18 +225,17 @@ class _Cells:
         if not isinstance(field, ByRegion):
             return np.asarray(otherwise / base)
         found = np.full(len(otherwise), field.otherwise)
-        for region, (share, _) in self._cut():
+        for region, share, _ in self._borders:
             found += share * (dict(field.values)[region] - found)
         return np.asarray(found / base)
 
-    def _cut(self) -> Iterator[tuple[str, tuple[Floats, Floats]]]:
+    @cached_property
+    def _borders(self) -> list[tuple[str, Floats, Floats]]:
         """The regions that some field names, each with the share of every cell inside and the
         normal of its border there."""
-        fields = self.experiment.rule.varying.values()
-        named = {n for field in fields if isinstance(field, ByRegion) for n, _ in field.values}
-        for name, region in self.experiment.regions.items():
-            if name in named:
-                yield name, self._shares(region)
+        return [
+            (name, *self._shares(region)) for name, region in _regions_of(self.experiment).items()
+        ]
 
     def _shares(self, region: Body) -> tuple[Floats, Floats]:
         signed = partial(signed_distance, region, self.experiment.lattice.cell())

@@ -86,13 +86,15 @@ class WeighedCells:
     corner is at that place of the raster, 0 to 1, None where all are whole; `weight` is the same
     times its stiffness over that of the rule. Cells whose stiffness is no multiple of that have the
     weight 0, and in `mixed` their share of each of some stiffnesses, whose `weights` by slot are
-    those of the rule for it."""
+    those of the rule for it. `phase` tells materials apart by a number, -1 where a cell is of
+    several; None where there is one."""
 
     tiling: Tiling
     share: Floats | None
     weight: Floats
     mixed: tuple[Floats, ...] = ()
     weights: tuple[dict[Slot, Any], ...] = ()
+    phase: NDArray[np.int64] | None = None
 
     def of(self, patch: Patch) -> Floats | float:
         """The shares of the cells of a patch."""
