@@ -13,9 +13,10 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-LARGEST_DIRECT = 20_000
-"""Particles up to which `auto` takes a direct solver (measured: compiling what works on stencils,
-once a machine, takes longer)."""
+LARGEST_DIRECT, LARGEST_DIRECT_KEPT = 20_000, 2_000
+"""Particles up to which `auto` takes a direct solver: compiling what works on stencils, once a
+machine, takes longer; where it is kept, and the system is set up but once, stencils are quicker
+beyond the other number (measured)."""
 
 T = TypeVar("T")
 
@@ -37,13 +38,24 @@ def linearised(
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)
 
-    large = scene.raster.count > LARGEST_DIRECT
-    if (method == "multigrid" or (method == "auto" and large)) and find_spec("numba"):
+    if find_spec("numba") and _on_stencils(scene, method):
         from pbdkit.equilibrium.grids.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
+
+
+def _on_stencils(scene: Scene, method: str) -> bool:
+    """Whether they serve best, where they serve."""
+    count, experiment = scene.raster.count, scene.experiment
+    if method != "auto" or count > LARGEST_DIRECT:
+        return method in ("auto", "multigrid")
+    if count <= LARGEST_DIRECT_KEPT or scene.has_fracture or not experiment.rule.linear:
+        return False
+    from pbdkit.equilibrium.grids.grid_functions import are_kept
+
+    return are_kept()
 
 
 class _Replaceable(System):
