@@ -174,7 +174,8 @@ class Function:
     def source(self) -> list[str]:
         """Its lines, with a head."""
         head = f"def {self.name}({', '.join([*self.own, *self.used])}):"
-        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in self._words()]
+        words = self._words()
+        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
         lines = ("    " + line for line in [*flat, *self.lines])
         return ["", "", '@njit(error_model="numpy")', head, *lines]
 
