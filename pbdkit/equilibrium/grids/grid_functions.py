@@ -21,7 +21,8 @@ def kernels() -> SimpleNamespace:
 
 def are_kept() -> bool:
     """Whether none of them is to be compiled."""
-    return kernels.cache_info().currsize > 0 or all(is_kept(source, {}, ()) for source in _sources())
+    loaded = kernels.cache_info().currsize > 0
+    return loaded or all(is_kept(source, {}, ()) for source in _sources())
 
 
 @cache
