@@ -13,10 +13,10 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
-LARGEST_DIRECT, LARGEST_DIRECT_KEPT = 20_000, 2_000
-"""Particles up to which `auto` takes a direct solver: compiling what works on stencils, once a
-machine, takes longer; where it is kept, and the system is set up but once, stencils are quicker
-beyond the other number (measured)."""
+LARGEST_DIRECT, LARGEST_ANEW = 3_000, 20_000
+"""Particles up to which `auto` takes a direct solver, and where systems are set up again and again:
+by differences of moves, which are compiled beyond, or at each change of a bond. What works on
+stencils is compiled once a machine."""
 
 T = TypeVar("T")
 
@@ -49,13 +49,9 @@ def linearised(
 def _on_stencils(scene: Scene, method: str) -> bool:
     """Whether they serve best, where they serve."""
     count, experiment = scene.raster.count, scene.experiment
-    if method != "auto" or count > LARGEST_DIRECT:
-        return method in ("auto", "multigrid")
-    if count <= LARGEST_DIRECT_KEPT or scene.has_fracture or not experiment.rule.linear:
-        return False
-    from pbdkit.equilibrium.grids.grid_functions import are_kept
-
-    return are_kept()
+    once = experiment.rule.linear and not scene.has_fracture
+    largest = LARGEST_DIRECT if once else LARGEST_ANEW
+    return method == "multigrid" or (method == "auto" and count > largest)
 
 
 class _Replaceable(System):

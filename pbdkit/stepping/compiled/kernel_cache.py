@@ -42,29 +42,16 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     The key covers the source of every function that rule and fracture model reach, so that an
     edited rule never runs an old kernel.
     """
-    key = _key(source, functions, arguments)
-    if (known := (_asked_folder(), key)) not in _loaded:
-        names = {name: compiled(function) for name, function in functions.items()}
-        kept = None if _interpreted() else _kept(source, key, names, arguments)
-        _loaded[known] = kept or _ready(source, names, arguments)
-    return _loaded[known]
-
-
-def is_kept(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> bool:
-    """Whether that kernel is at hand, so that nothing is to be compiled."""
-    key = _key(source, functions, arguments)
-    return (_asked_folder(), key) in _loaded or _is_whole(_asked_folder() / f"kernel_{key}")
-
-
-def _key(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> str:
+    interpreted = bool(vars(numba.config)["DISABLE_JIT"])
     processor = cpu_target.target_context.codegen().magic_tuple()
     parts = [source, source_key(*functions.values(), length), vars(numba)["typeof"](arguments)]
-    parts += [numba.__version__, np.__version__, sys.version, processor, _interpreted()]
-    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
-
-
-def _interpreted() -> bool:
-    return bool(vars(numba.config)["DISABLE_JIT"])
+    parts += [numba.__version__, np.__version__, sys.version, processor, interpreted]
+    key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
+    if (known := (_asked_folder(), key)) not in _loaded:
+        names = {name: compiled(function) for name, function in functions.items()}
+        kept = None if interpreted else _kept(source, key, names, arguments)
+        _loaded[known] = kept or _ready(source, names, arguments)
+    return _loaded[known]
 
 
 def cache_folder() -> Path | None:
