@@ -25,7 +25,7 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
     passes = [write_bond_pass(plan)] if plan.bonds_first else []
     functions = [events] if events else list(passes)
     for level in plan.levels:
-        functions += _sweep(plan, level, groups, events)
+        functions += write_sweep(plan, level, groups, events)
         passes.append(functions[-1])
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
     _write_run(run, plan, passes)
@@ -52,7 +52,7 @@ def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tu
     return "\n".join(lines) + "\n", run.used
 
 
-def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
+def write_sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
     """The functions for the rows that occur, and last the one that moves the particles of some rows
     with them."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
@@ -91,12 +91,12 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
             write_pass(out, plan, 1, sweep, "i0", "i1")
             if n + 1 < len(passes) and plan.scene.frame:
                 out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
-                _write_frame(out, plan, f"fz{n}", f"fz{n}")
+                write_frame(out, plan, f"fz{n}", f"fz{n}")
     out.add(1, "for e in range(led.size):")
     out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
     out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))
     if plan.scene.frame:
-        _write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
+        write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
     out.add(1, f"{u}, {v} = {v}, {u}")
 
@@ -111,7 +111,7 @@ def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, h
     out.add(depth + 1, one.call(*span))
 
 
-def _write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
+def write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
     """Frame points from flat planes of the body."""
     assert plan.scene.frame
     out.add(1, "for f in range(points.size):")

@@ -1,0 +1,141 @@
+"""Writes the kernel that settles a scene, renews and breaks its bonds, and settles again.
+
+Of the matrix only the rows of particles whose bonds have changed are found anew, from the moves
+that a nudge of each neighbour by 1 makes at rest: exact for linear rules.
+"""
+
+from __future__ import annotations
+
+from pbdkit.scene.homes import Home
+from pbdkit.stepping.compiled.bond_pass import write_bond_pass
+from pbdkit.stepping.compiled.emitter import Groups, write_frame, write_module, write_sweep
+from pbdkit.stepping.compiled.plan import Function, Plan
+from pbdkit.stepping.compiled.slot_loop import write_general
+
+GOES_ON, SETTLED, FAILED = 0, 1, 2
+"""What became of a call: bonds may still change, no bond changes any more, or the band does not
+serve; then followers stand where they were before the last settling."""
+ROWS = "0", "starts.shape[1] - 1"
+
+
+def write_settling(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
+    """The source of a module with ``run(given, step, tolerance, share, most)``, which settles at
+    most so often, to within the length `tolerance`, and leaves out changes of bonds within the
+    `share`; it returns how often bonds have changed, and what became of it."""
+    (level,) = plan.levels
+    general = write_general(plan, level, None)
+    sweeps = [f for f in write_sweep(plan, level, groups, None) if f.name != general.name]
+    follow = Function(plan.shared, "follow_body")
+    if plan.scene.frame:
+        follow.depth = -1
+        write_frame(follow, plan, "flat_u", "flat_u")
+    moves, derive = _write_moves(plan, follow, sweeps[-1]), _write_derivative(plan, general)
+    judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
+    known, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
+    run = Function(plan.shared, "run", "given", "step", "tolerance", "share", "most")
+    run.add(0, "for n in range(most):", f"    {mark.call()}")
+    run.add(1, f"if not {known.call()} or not {settle.call('tolerance')}:")
+    run.add(2, f"return n, {FAILED}")
+    run.add(1, judge.call(*ROWS), f"if not {changed.call('share')}:")
+    run.add(2, f"return n, {SETTLED}")
+    run.add(0, f"return most, {GOES_ON}")
+    functions = [general, *sweeps, moves, derive, judge, mark, changed, known, settle]
+    return write_module(plan, [follow, *functions] if follow.lines else functions, run)
+
+
+def _write_moves(plan: Plan, follow: Function, sweep: Function) -> Function:
+    """The function that writes r (follower, axis), the moves, with the frame in line."""
+    out = Function(plan.shared, "find_moves")
+    out.add(0, *[follow.call()] * bool(follow.lines), sweep.call(*ROWS))
+    out.add(0, "for e in range(place.size):")
+    out.add(1, *plan.each("r[e, #] = flat_v_@[place[e]] - flat_u_@[place[e]]"))
+    return out
+
+
+def _write_derivative(plan: Plan, general: Function) -> Function:
+    """The function that writes what each neighbour of a follower, and it itself, does to its move;
+    `u` are planes at rest."""
+    out = Function(plan.shared, "derive", "e", *plan.each("u_@"))
+    one = general.call("s", "e", "e + 1", "i", "i + 1")
+    out.add(0, "at, s, i = place[e], sublattice[e], runs[e, 0]")
+    out.add(0, *plan.each("f_@ = u_@.reshape(-1)"), one)
+    out.add(0, *plan.each("rest_@ = flat_v_@[at]"), "for k in range(counts[s] + 1):")
+    out.add(1, "there = at + away[s, k] if k < counts[s] else at")
+    for b, c in enumerate(plan.axes):
+        out.add(1, f"f_{c}[there] = 1.0", one)
+        out.add(1, *plan.each(f"blocks[e, k, #, {b}] = flat_v_@[at] - f_@[at] - rest_@"))
+        out.add(1, f"f_{c}[there] = 0.0")
+    return out
+
+
+def _bonds(plan: Plan, pattern: str) -> list[str]:
+    """The pattern for each number that is remembered of bonds."""
+    return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
+
+
+def _write_mark(plan: Plan) -> Function:
+    """The function that marks followers whose bonds are not as they were known; then they are."""
+    out = Function(plan.shared, "mark")
+    differs = _bonds(plan, " or flat_bond#[at] != flat_known#[at]")
+    out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")
+    out.add(1, "way = ends[n, 2] * kind.shape[2] + ends[n, 3]", "for e in range(cells):")
+    out.add(2, "at = n * cells + e")
+    out.add(2, f"if flat_broken[at] != flat_known_broken[at]{''.join(differs)}:")
+    out.add(3, "flat_known_broken[at] = flat_broken[at]")
+    out.add(3, *_bonds(plan, "flat_known#[at] = flat_bond#[at]"))
+    out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + way):")
+    out.add(4, "if 0 <= end < equation.size and equation[end] >= 0:")
+    out.add(5, "stale[equation[end]] = 1")
+    return out
+
+
+def _write_changed(plan: Plan) -> Function:
+    """The function that tells whether bonds broke or changed; else they are as they were known."""
+    out = Function(plan.shared, "changed", "share")
+    numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
+    changing = [str(n) for n, number in enumerate(numbers) if number.changes]
+    out.add(0, "for at in range(broken.size):")
+    out.add(1, "if flat_broken[at] >= 0 and flat_known_broken[at] < 0:", "    return True")
+    for n in changing:
+        out.add(1, f"new, old = flat_bond{n}[at], flat_known{n}[at]")
+        out.add(1, "if abs(new - old) > share * max(1.0, abs(old)):", "    return True")
+    if changing:
+        out.add(0, "for at in range(broken.size):")
+        out.add(1, *(f"flat_bond{n}[at] = flat_known{n}[at]" for n in changing))
+    out.add(0, "return False")
+    return out
+
+
+def _write_known(plan: Plan, derive: Function) -> Function:
+    """The function that brings the factors up to date; it tells whether they serve."""
+    out = Function(plan.shared, "know")
+    out.add(0, "first = place.size", "for e in range(place.size):", "    if stale[e]:")
+    out.add(2, derive.call("e", *plan.each("rest_@")), "stale[e], first = 0, min(first, e)")
+    out.add(0, "pattern = first_entry, entry_slot, entry_column, entry_weight")
+    out.add(0, "factors = diagonal, inverse, signs", "if first < place.size:")
+    out.add(1, "refactor(band, blocks, pattern, factors, facts, first, alike[0])")
+    out.add(0, "return facts[1] < facts[4]")
+    return out
+
+
+def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
+    """The function that moves the followers to where they rest, and tells whether it did."""
+    out = Function(plan.shared, "settle", "tolerance")
+    at = plan.each("flat_u_@[place[e]]")
+    out.add(0, "factors = diagonal, inverse, signs", "for e in range(place.size):")
+    out.add(1, *(f"kept[e, {a}] = {value}" for a, value in enumerate(at)))
+    out.add(0, moves.call(), "before = norm(r)", "for n in range(corrections[0]):")
+    out.add(1, "correct(band, factors, facts, r, c)")
+    sizes = ", ".join(plan.each("largest(u_@.reshape(-1, 1))"))
+    out.add(1, f"unsure = facts[2] * facts[5] * max({sizes})")
+    ways = " + ".join(plan.each("(largest(c[:, #:# + 1]) + facts[1] * unsure) ** 2"))
+    out.add(1, f"far = ({ways}) ** 0.5", "if n > 0 and far <= tolerance:", "    return True")
+    out.add(1, "if not far < np.inf:", "    break", "for e in range(place.size):")
+    out.add(2, *(f"{value} += c[e, {a}]" for a, value in enumerate(at)))
+    out.add(1, moves.call(), "after, floor = norm(r), unsure * r.size**0.5")
+    out.add(1, "if n == 0 and not after <= max(facts[6] * before + floor, 1e3 * floor):")
+    out.add(2, "break")
+    out.add(0, "for e in range(place.size):")
+    out.add(1, *(f"{value} = kept[e, {a}]" for a, value in enumerate(at)))
+    out.add(0, *[follow.call()] * bool(follow.lines), "return False")
+    return out
