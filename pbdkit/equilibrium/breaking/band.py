@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 SAME = 1e-12
 """By so much entries may differ that are alike but for rounding; they are shares of a move."""
 SAFETY = 3.0
@@ -43,7 +45,9 @@ def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> Non
     first_entry, slot, column, weight = pattern
     half, inner = band.shape[1] // 2, wide if wide > 1 else 1
     for e in range(first, len(blocks)):
-        band[e * wide : (e + 1) * wide] = 0.0
+        for i in range(e * wide, (e + 1) * wide):
+            for m in range(band.shape[1]):
+                band[i, m] = 0.0
         for n in range(first_entry[e], first_entry[e + 1]):
             away = half + (column[n] - e) * wide
             for a in range(wide):
@@ -53,7 +57,10 @@ def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> Non
                         value += blocks[e, slot[n], a, c] * weight[n, c, b]
                     band[e * wide + a, away + b - a] -= value
         for i in range(e * wide, (e + 1) * wide):
-            if not band[i].any():
+            most = 0.0
+            for m in range(band.shape[1]):
+                most = max(most, abs(band[i, m]))
+            if most == 0.0:
                 band[i, half] = 1.0
 
 
@@ -101,20 +108,25 @@ def refactor(
     wide = 1 if alike and are_alike(blocks) else axes
     if wide != known[0]:
         first = 0
-    known[0] = wide
+    known[0], known[2] = wide, 1.0
     band, size = rows_of(work, count, int(known[3]), wide), count * wide
     assemble(band, blocks, pattern, first, wide)
     factor(band, first * wide, diagonal, inverse)
-    x = signs[:size].copy().reshape(size, 1)
+    x = np.empty((size, 1))
+    for i in range(size):
+        x[i, 0] = signs[i]
+        known[2] = max(known[2], abs(diagonal[i]))
     solve(band, inverse, x)
-    known[1], known[2] = SAFETY * largest(x), max(1.0, largest(diagonal[:size].reshape(size, 1)))
+    known[1] = SAFETY * largest(x)
 
 
 def correct(work: Any, factors: Any, known: Any, r: Any, c: Any) -> None:
     """c (follower, axis) with A c = r."""
     count, axes = r.shape
     wide = 1 if known[0] == 1.0 else axes
-    c[...] = r
+    for e in range(count):
+        for a in range(axes):
+            c[e, a] = r[e, a]
     band = rows_of(work, count, int(known[3]), wide)
     solve(band, factors[1], c.reshape(count * wide, axes // wide))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Entry = tuple[Indices, Indices, Indices, Floats]
 
 

@@ -45,10 +45,15 @@ class Settler:
         self._scene, self._watch, self._tolerance = scene, watch, tolerance
         self._share = solver.tolerance
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
-        stepped = replace(scene, experiment=scene.experiment.model_copy(update={"solver": stepping}))
+        stepped = replace(
+            scene, experiment=scene.experiment.model_copy(update={"solver": stepping})
+        )
         levels = levels_of(stepped)
         self._plan = plan = Plan(stepped, levels, False, apart=True)
-        self._runs, self._starts, groups = find_runs(stepped, plan.long)
+        self._runs, starts, groups = find_runs(stepped, all_general=True)
+        self._body = [
+            [s, span[0, 0], span[-1, 1]] for (s, _), span in zip(groups, starts, strict=True)
+        ]
         size = np.array(scene.raster.shape[1:])
         box = np.stack([np.zeros_like(size), size], axis=1).ravel().astype(np.int64)
         self._constant = constant_arrays(plan) | {"box": box}
@@ -58,14 +63,19 @@ class Settler:
         start = unmoved_state(scene, scene.raster.shape[1:])
         self._take_roles(scene.experiment.steps, start)
         shared = ("step", *self._named(start))
-        source, self._names = write_settling(replace(plan, shared=shared), groups)
+        source, self._names = write_settling(replace(plan, shared=shared))
         functions = {function.__name__: function for function in FUNCTIONS}
         self._run = load_blamed(levels, source, self._given(start, 0.0, 0), functions)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether a band serves a body of this size and shape."""
+        return bool(self._of_roles["band"].size <= LARGEST_BAND)
 
     def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
         """Goes on, in place, from an equilibrium to that of a moment, until no bond changes any
         more, `most` times at most. Returns whether that is so, and how often bonds have changed;
-        where the band does not serve the state is as the last settling but one left it.
+        where the band does not serve the state is as the last settling left it.
 
         Raises ExperimentError for contradicting leaders, and StoppedError.
         """
@@ -107,12 +117,12 @@ class Settler:
         equation[pattern.place] = np.arange(count)
         slots = max(map(len, self._scene.neighbourhood.slots)) + 1
         facts = [0.0, 0.0, 1.0, pattern.reach, 1.0 / SINGULAR, ROUNDING, LINEAR]
-        planes = [f"{name}_{c}" for name in ("v", "rest") for c in self._plan.axes]
+        planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
         return {
             # First a run of each follower by itself.
             "runs": np.concatenate([alone, self._runs]).astype(np.int64),
-            "starts": (self._starts + count).astype(np.int64),
+            "body": np.array(self._body, np.int64) + np.array([0, count, count]),
             "place": pattern.place,
             "sublattice": s.astype(np.int64),
             "equation": equation.astype(np.int64),
@@ -126,10 +136,10 @@ class Settler:
             "band": np.empty(most),
             "diagonal": np.zeros(count * axes),
             "inverse": np.zeros(count * axes),
-            "signs": signs,
+            "randoms": signs,
             "facts": np.array(facts, float),
             "corrections": np.array([MOST_CORRECTIONS + 1]),
-            **{name: np.zeros((count, axes)) for name in ("r", "c", "kept")},
+            **{name: np.zeros((count, axes)) for name in ("residual", "correction", "kept")},
             **{name: np.zeros(raster.shape) for name in planes},
         }
 

@@ -25,7 +25,7 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
     passes = [write_bond_pass(plan)] if plan.bonds_first else []
     functions = [events] if events else list(passes)
     for level in plan.levels:
-        functions += write_sweep(plan, level, groups, events)
+        functions += _sweep(plan, level, groups, events)
         passes.append(functions[-1])
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
     _write_run(run, plan, passes)
@@ -52,7 +52,7 @@ def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tu
     return "\n".join(lines) + "\n", run.used
 
 
-def write_sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
+def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
     """The functions for the rows that occur, and last the one that moves the particles of some rows
     with them."""
     out = Function(plan.shared, f"sweep{level.number}", "first_row", "last_row")
