@@ -32,19 +32,19 @@ SCENES = {
 
 
 def scene_of(**parts):
-    motion = {"type": "displace", "displacement": [2.4, 0.3]}
+    motion = {"type": "displace", "displacement": [2.0, 0.3]}
     given = {
         "name": "breaking",
         "seed": 5,
         "lattice": {"type": "square", "a": 1.0},
-        "body": {"type": "grid", "columns": 6, "rows": 4},
+        "body": {"type": "grid", "columns": 5, "rows": 3},
         "rule": {"type": "barycentre"},
         "leaders": [
             {"select": {"edge": "left"}, "motion": {"type": "hold"}},
             {"select": {"edge": "right"}, "motion": motion},
         ],
         "steps": 1,
-        "solver": {"type": "equilibrium", "increments": 5},
+        "solver": {"type": "equilibrium", "increments": 3},
     }
     return build_scene(pbdkit.Experiment(version=1, **given | parts))
 
@@ -71,7 +71,7 @@ def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
     expected, certificate = equilibrium_state(scene)
     settled = by_kernel(monkeypatch)
     found, own = equilibrium_state(scene)
-    assert len(settled) == 5
+    assert len(settled) == 3
     assert any(well for well, _ in settled)
     assert (found.broken_step > 0).any() or any((v > 0).any() for v in found.bond_values)
     np.testing.assert_array_equal(found.broken_step, expected.broken_step)
@@ -79,7 +79,7 @@ def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
     for mine, others in zip(found.bond_values, expected.bond_values, strict=True):
         np.testing.assert_allclose(mine, others, rtol=0, atol=1e-10)
     assert own.method == certificate.method
-    assert own.distance <= scene.experiment.solver.tolerance * 2.4
+    assert own.distance <= scene.experiment.solver.tolerance * 2.0
 
 
 def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
@@ -87,7 +87,7 @@ def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
     scene = scene_of(fracture=DAMAGE)
     whole, kept = initial_state(scene), None
     for n, moment in enumerate(increments.increments(scene, whole, Watch())):
-        if n == 2:
+        if n == 0:
             kept, since = whole.copy(), moment
     for _ in increments.increments(scene, kept, Watch(), since):
         pass

@@ -19,9 +19,9 @@ ROWS = "int64(0)", "int64(kind.shape[1])"
 
 
 def write_settling(plan: Plan) -> tuple[str, list[str]]:
-    """The source of a module with ``run(given, step, tolerance, share, most)``, which settles at
+    """The source of a module with ``run(given, step, tolerance, slack, most)``, which settles at
     most so often, to within the length `tolerance`, and leaves out changes of bonds within the
-    `share`; it returns how often bonds have changed, and what became of it."""
+    share `slack`; it returns how often bonds have changed, and what became of it."""
     (level,) = plan.levels
     general = write_general(plan, level, None)
     follow = Function(plan.shared, "follow_body")
@@ -31,11 +31,11 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
     judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
     known, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
-    run = Function(plan.shared, "run", "given", "step", "tolerance", "share", "most")
+    run = Function(plan.shared, "run", "given", "step", "tolerance", "slack", "most")
     run.add(0, "for n in range(most):", f"    {mark.call()}")
     run.add(1, f"if not {known.call()} or not {settle.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")
-    run.add(1, judge.call(*ROWS), f"if not {changed.call('share')}:")
+    run.add(1, judge.call(*ROWS), f"if not {changed.call('slack')}:")
     run.add(2, f"return n, {SETTLED}")
     run.add(0, f"return most, {GOES_ON}")
     functions = [general, moves, derive, judge, mark, changed, known, settle]
@@ -93,14 +93,14 @@ def _write_mark(plan: Plan) -> Function:
 
 def _write_changed(plan: Plan) -> Function:
     """The function that tells whether bonds broke or changed; else they are as they were known."""
-    out = Function(plan.shared, "changed", "share")
+    out = Function(plan.shared, "changed", "slack")
     numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
     changing = [str(n) for n, number in enumerate(numbers) if number.changes]
     out.add(0, "for home in range(broken.size):")
     out.add(1, "if flat_broken[home] >= 0 and flat_known_broken[home] < 0:", "    return True")
     for n in changing:
         out.add(1, f"new, old = flat_bond{n}[home], flat_known{n}[home]")
-        out.add(1, "if abs(new - old) > share * max(1.0, abs(old)):", "    return True")
+        out.add(1, "if abs(new - old) > slack * max(1.0, abs(old)):", "    return True")
     if changing:
         out.add(0, "for home in range(broken.size):")
         out.add(1, *(f"flat_bond{n}[home] = flat_known{n}[home]" for n in changing))
