@@ -11,12 +11,8 @@ from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import asks_for_grids
 from pbdkit.stepping.state import State
-
-LARGEST_DIRECT, LARGEST_ANEW = 3_000, 20_000
-"""Particles up to which `auto` takes a direct solver, and where systems are set up again and again:
-by differences of moves, which are compiled beyond, or at each change of a bond. What works on
-stencils is compiled once a machine."""
 
 T = TypeVar("T")
 
@@ -38,20 +34,12 @@ def linearised(
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)
 
-    if find_spec("numba") and _on_stencils(scene, method):
+    if find_spec("numba") and asks_for_grids(scene.experiment, method, scene.raster.count):
         from pbdkit.equilibrium.grids.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
-
-
-def _on_stencils(scene: Scene, method: str) -> bool:
-    """Whether they serve best, where they serve."""
-    count, experiment = scene.raster.count, scene.experiment
-    once = experiment.rule.linear and not scene.has_fracture
-    largest = LARGEST_DIRECT if once else LARGEST_ANEW
-    return method == "multigrid" or (method == "auto" and count > largest)
 
 
 class _Replaceable(System):

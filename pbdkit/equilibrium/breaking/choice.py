@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pbdkit.equilibrium.linearisation import LARGEST_DIRECT
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import RenewsBonds
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import LARGEST_ANEW
 from pbdkit.stepping.choice import PATIENCE_S, obstacle
 
 if TYPE_CHECKING:
     from pbdkit.equilibrium.breaking.settler import Settler
 
 SETTLING_S, PARTICLE_S = 6e-3, 1e-5
-"""What a settling takes by numpy, and what it takes more a particle (measured)."""
+"""What a settling takes by numpy, about, and what it takes more a particle."""
 LITTLE_BY_LITTLE, AT_ONCE = 20, 2
 """Settlings an increment where bonds change little by little, and where they only break."""
 
@@ -26,7 +26,7 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
     so that what is resumed goes on as it began."""
     solver, plain = scene.experiment.solver.sought, scene.axes == 2 and scene.inner is None
     direct = solver.method == "lu" or (
-        solver.method == "auto" and scene.raster.count <= LARGEST_DIRECT
+        solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
     )
     if not (scene.has_fracture and direct and plain) or _seconds(scene) < PATIENCE_S or obstacle():
         return None
