@@ -69,7 +69,7 @@ def test_waves_that_change_their_sign_do_not_outlast_the_slowest_mode():
 
 def estimated(monkeypatch, **parts):
     """The analysis of a body that counts as large."""
-    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_DIRECT", 0)
+    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_ANEW", 0)
     return Analysis(body(**{"columns": 16, "rows": 12} | parts))
 
 
@@ -102,7 +102,7 @@ def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
     """At first one particle moves, around which an elastic body turns freely."""
     pull = {"type": "velocity", "velocity": [0.01, 0.0], "steps": 9}
     first = {"select": {"numbers": [30]}, "motion": pull, "until": 9}
-    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_DIRECT", 0)
+    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_ANEW", 0)
     parts = BODIES["elastic"] | {"leaders": [first, HOLD_LEFT | {"from": 10}], "steps": 40}
     analysis = Analysis(scene_of(16, 12, **parts))
     assert analysis.spectrum

@@ -10,6 +10,7 @@ import pbdkit
 from pbdkit.equilibrium import increments, linear_solver, linearisation, moves
 from pbdkit.equilibrium.increments import settle
 from pbdkit.interfaces import FollowerRule, Vector
+from pbdkit.scene import solver_sizes
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -175,7 +176,7 @@ def test_hats_do_not_bridge_cracks(cracks):
 def test_the_method_follows_the_size():
     for n, method in ((12, "lu"), (160, "multigrid, conjugate-gradients")):
         scene = build_scene(pbdkit.Experiment(**sheet(n, n)))
-        assert (scene.raster.count > linearisation.LARGEST_DIRECT) == (n > 100)
+        assert (scene.raster.count > solver_sizes.LARGEST_DIRECT) == (n > 100)
         assert settle(scene, initial_state(scene)).method == method
 
 

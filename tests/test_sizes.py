@@ -9,11 +9,9 @@ from pathlib import Path
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import linearisation
 from pbdkit.prediction.forecast import forecast
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.runs.course import Run, record
-from pbdkit.scene import solver_sizes
 from pbdkit.scene.scene import build_scene
 
 MIB = 2**20
@@ -134,7 +132,3 @@ def test_an_equilibrium_takes_what_check_says(side, settings, tmp_path):
     )
     used = peak - int(found.stdout.splitlines()[-1])
     assert said == pytest.approx(used, rel=0.3)
-
-
-def test_what_is_taken_to_be_solved_directly_is():
-    assert solver_sizes.LARGEST_DIRECT == linearisation.LARGEST_DIRECT

@@ -69,7 +69,7 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
         return count, label
     reach = (matrix != 0.0) | np.eye(len(matrix), dtype=bool)
     if not strongly:
-        reach |= reach.T
+        return _touching(reach | reach.T)
     while True:
         further = reach.astype(np.float32) @ reach.astype(np.float32) > 0.0
         if (further == reach).all():
@@ -78,6 +78,18 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
     first = np.argmax(reach & reach.T, axis=1)  # the lowest unknown of each group names it
     names, label = np.unique(first, return_inverse=True)
     return len(names), label
+
+
+def _touching(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
+    """The same where all lead both ways: each group from its lowest unknown outwards."""
+    count, label = 0, np.full(len(reach), -1)
+    for first in range(len(reach)):
+        front = np.array([first] if label[first] < 0 else [], int)
+        count += len(front)
+        while len(front):
+            label[front] = count - 1
+            front = np.flatnonzero(reach[front].any(axis=0) & (label < 0))
+    return count, label
 
 
 @dataclass

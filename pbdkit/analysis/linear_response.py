@@ -7,16 +7,16 @@ particles with the same neighbours present answer alike, and one of each kind is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.stencil import array_of, derivative
-from pbdkit.interfaces import Components, Slot, Softens
+from pbdkit.analysis.stencil import SMALL, array_of, derivative
+from pbdkit.interfaces import Components, Here, Slot, Softens
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
@@ -29,6 +29,9 @@ from pbdkit.stepping.surroundings import Surroundings
 
 Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
+Answer = Callable[[Contributions, Here], Any]
+AT_ONCE = 8192
+"""So many places are asked together, so that temporaries stay small."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +66,21 @@ def respond(
     with blaming(scene.experiment.rule, "when linearised"):
         if same and at_rest:
             kinds, place = _alike(scene, state, sublattice, place)
-        return [
-            _Followers(scene, state, sublattice, place, answer).response(kinds, at_rest)
-            for answer in answers
-        ]
+        parts = []
+        for some in np.split(place, range(AT_ONCE, len(place), AT_ONCE)):
+            followers = _Followers(scene, state, sublattice, some)
+            parts.append([followers.response(answer, at_rest) for answer in answers])
+        return [_joined(kinds, some) for some in zip(*parts, strict=True)]
+
+
+def _joined(kinds: Indices, parts: Sequence[Response]) -> Response:
+    """The answer of followers of these kinds, from those of the kinds."""
+    own, answer = (np.concatenate([getattr(p, of) for p in parts]) for of in ("own", "answer"))
+    neighbours = {
+        slot: np.concatenate([part.neighbours[slot] for part in parts])
+        for slot in parts[0].neighbours
+    }
+    return Response(kinds, own, neighbours, answer)
 
 
 def by_sublattice(scene: Scene, place: Indices) -> Iterator[tuple[int, Indices]]:
@@ -148,62 +162,73 @@ def _plain(scene: Scene, state: State, sublattice: int) -> Present:
 
 
 class _Followers:
-    """The rule on some places, with differences that can be nudged."""
+    """The rule on some places, asked what small steps do: answers to all of them at once, (axis,
+    step, place). The first step is none; then come a particle's own along each axis, with all
+    neighbours where they are; then those of the neighbour at each slot.
+    """
 
-    def __init__(
-        self, scene: Scene, state: State, sublattice: int, place: Indices, answer: str
-    ) -> None:
+    def __init__(self, scene: Scene, state: State, sublattice: int, place: Indices) -> None:
         around = Surroundings(scene, Places(scene.raster.shape, place), sublattice)
-        self._evaluator, self._name = Evaluator(scene).given(around.parameters), answer
-        self._answer = {"move": self._evaluator.move, "force": self._evaluator.force}[answer]
+        self._evaluator = Evaluator(scene).given(around.parameters)
         u = state.u.astype(float, copy=False)
         self._here, self._slots = around.here(u, state), around.slots
-        self._d = dict(zip(around.slots, around.differences(u), strict=True))
-        self._neighbours = dict(zip(around.slots, around.neighbours(state), strict=True))
-        self._still = self._contributions(self._d, self._here.u)
+        self._neighbours = list(zip(around.differences(u), around.neighbours(state), strict=True))
+        steps = 1 + scene.axes * (1 + len(around.slots))
+        self._shape, self._known = (steps, len(place)), dict[complex, Contributions]()
 
-    def response(self, kinds: Indices, finite: bool) -> Response:
-        """Of followers of these kinds, `finite` or refused."""
-        answer = self._standing.T
-        own, neighbours = self._derivative(None), {s: self._derivative(s) for s in self._slots}
-        if finite and not all(np.isfinite(v).all() for v in (answer, own, *neighbours.values())):
-            raise ValueError(f"its {self._name} at rest, or a derivative of it, is not finite")
-        return Response(kinds, own, neighbours, answer)
-
-    def _derivative(self, mover: Slot | None) -> Floats:
-        """∂answer/∂u_k through a slot or, for None, ∂answer/∂u_j with all neighbours where they
-        are; (place, axis of the answer, axis of u)."""
-        shape, axes = self._here.u.x.shape, np.eye(len(self._here.u))
+    def response(self, name: str, finite: bool) -> Response:
+        """The answer of that name, `finite` or refused."""
+        answer = {"move": self._evaluator.move, "force": self._evaluator.force}[name]
+        ask = partial(self._asked, answer)
         if self._evaluator.rule.linear:
-            columns = [array_of(self._moved(mover, e, 1.0), shape) - self._standing for e in axes]
+            answers = array_of(ask(1.0), self._shape)
+            still, changes = answers[:, 0], answers - answers[:, :1]
         else:
-            columns = [derivative(partial(self._moved, mover, e), shape) for e in axes]
-        return np.moveaxis(np.array(columns), (0, 1), (2, 1))
+            still = array_of(ask(SMALL), self._shape)[:, 0]
+            changes = derivative(ask, self._shape)
+        if finite and not (np.isfinite(still).all() and np.isfinite(changes).all()):
+            raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
+        # (mover, place, axis of the answer, axis of u)
+        own, *others = np.moveaxis(
+            changes[:, 1:].reshape(len(changes), -1, len(changes), self._shape[1]), 0, -1
+        ).transpose(0, 2, 3, 1)
+        kinds = np.arange(self._shape[1])
+        return Response(kinds, own, dict(zip(self._slots, others, strict=True)), still.T)
 
-    @cached_property
-    def _standing(self) -> Floats:
-        """(axis of the answer, place): the answers as they are."""
-        return array_of(self._applied(self._still, self._here.u), self._here.u.x.shape)
-
-    def _moved(self, mover: Slot | None, along: Floats, step: complex) -> Any:
-        """The answers (place) after a step of the neighbour at a slot, or of one's own."""
-        here, nudge = self._here.u, vector(step * component for component in along)
-        if mover is not None:
-            nudged = {mover: self._d[mover] + nudge}
-            return self._applied(self._still | self._contributions(nudged, here), here)
-        stepped = {slot: d - nudge for slot, d in self._d.items()}
-        return self._applied(self._contributions(stepped, here + nudge), here + nudge)
-
-    def _contributions(
-        self, differences: dict[Slot, Components], here: Components
-    ) -> dict[Slot, Contributions]:
+    def _asked(self, answer: Answer, step: complex) -> Any:
+        if step not in self._known:
+            self._known[step] = self._totals(step)
         with np.errstate(all="ignore"):
-            return {
-                slot: self._evaluator.contribution(d, here, self._neighbours[slot])
-                for slot, d in differences.items()
-            }
+            here = self._here.u + self._steps(step, 1, self._shape[0])
+            return answer(self._known[step], self._here._replace(u=here))
 
-    def _applied(self, contributions: dict[Slot, Contributions], here: Components) -> Any:
-        parts = [(contributions[slot], to.present) for slot, to in self._neighbours.items()]
+    def _totals(self, step: complex) -> Contributions:
+        """What the neighbours contribute together after each step: those of the neighbours change
+        one contribution."""
+        axes = len(self._here.u)
+        count = 1 + 2 * axes  # steps that a slot's own contribution knows: none, own, neighbour's
+        own, other = self._steps(step, 1, count), self._steps(step, 1 + axes, count)
+        here = self._here.u + own
         with np.errstate(all="ignore"):
-            return self._answer(summed(parts), self._here._replace(u=here))
+            parts = [
+                summed([(self._evaluator.contribution(d + (other - own), here, to), to.present)])
+                for d, to in self._neighbours
+            ]
+            return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
+
+    def _total(self, parts: Sequence[Any], kept: int) -> Any:
+        """Of one number or vector by slot."""
+        if isinstance(parts[0], Components):
+            return vector(self._total(along, kept) for along in zip(*parts, strict=True))
+        shape = (2 * kept - 1, self._shape[1])
+        parts = [np.broadcast_to(part, shape) for part in parts]
+        whole = sum(part[:kept] for part in parts)
+        return np.concatenate([whole, *(whole[:1] + (part[kept:] - part[0]) for part in parts)])
+
+    def _steps(self, step: complex, first: int, count: int) -> Any:
+        """A step along each axis as the `first` of so many and those after it, as a vector of
+        (step, 1)."""
+        steps = np.zeros((len(self._here.u), count, 1), type(step))
+        for axis, along in enumerate(steps):
+            along[first + axis] = step
+        return vector(steps)

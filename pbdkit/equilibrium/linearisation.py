@@ -11,11 +11,8 @@ from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import asks_for_grids
 from pbdkit.stepping.state import State
-
-LARGEST_DIRECT = 20_000
-"""Particles up to which `auto` takes a direct solver (measured: compiling what works on stencils,
-once a machine, takes longer)."""
 
 T = TypeVar("T")
 
@@ -37,8 +34,7 @@ def linearised(
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)
 
-    large = scene.raster.count > LARGEST_DIRECT
-    if (method == "multigrid" or (method == "auto" and large)) and find_spec("numba"):
+    if find_spec("numba") and asks_for_grids(scene.experiment, method, scene.raster.count):
         from pbdkit.equilibrium.grids.lattice_system import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):

@@ -17,10 +17,12 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State, initial_state
 
-MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 12
+MOST_CORRECTIONS = 12
 CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
+SERVES = 0.02
+"""What share of an error a correction may leave for its linearisation to serve once more."""
 NEAR = 1e-3
 """How accurately corrections are solved for at least, as a share of themselves."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
@@ -224,11 +226,12 @@ class _Newton(_Search):
         self._shift(self._system.solve(pull, max(self._wanted, NEAR * self._way)))
 
     def _correct(self) -> None:
-        far, size = self._way, math.inf
-        for _ in range(MOST_LINEARISATIONS):
-            self._system = self._linearised(self._state, "following the load")
-            self._system.refuse_moving_floats(self._left, self._rounding())
-            farther, far = far, self._distance()
+        far, size, farther = math.inf, math.inf, self._way
+        for _ in range(MOST_CORRECTIONS):
+            if far > SERVES * farther:
+                self._system = self._linearised(self._state, "following the load")
+                self._system.refuse_moving_floats(self._left, self._rounding())
+                far = self._distance()
             if far <= self._finder.tolerance or not math.isfinite(far):
                 return
             # Solved as well as it is linear (Eisenstat and Walker).
@@ -239,6 +242,7 @@ class _Newton(_Search):
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
+            farther, far = far, self._distance()
 
 
 def _size(moves: Floats) -> float:

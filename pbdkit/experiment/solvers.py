@@ -3,6 +3,7 @@ family."""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, SerializeAsAny
@@ -30,13 +31,23 @@ class Solver(Component):
     def stepping(self) -> Stepping:
         """How a step is made, where one is: the rule's own unless the experiment says more. Also of
         an equilibrium: so steps are made until roles change for the last time."""
-        return Stepping()
+        return _stepping()
 
     @property
     def sought(self) -> Equilibrium:
         """How an equilibrium is looked for, where one is: as by default, unless the experiment says
         more."""
-        return Equilibrium()
+        return _sought()
+
+
+@cache
+def _stepping() -> Stepping:
+    return Stepping()
+
+
+@cache
+def _sought() -> Equilibrium:
+    return Equilibrium()
 
 
 class Stepping(Solver):

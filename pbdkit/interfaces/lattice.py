@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,14 @@ class Offset:
         return math.hypot(*self.rest)
 
 
+@cache
+def _of_one_site(axes: int) -> tuple[tuple[BasisSite], Index, tuple[Index, ...]]:
+    """The sites, period and primitive steps of a cell with one site at its corner."""
+    nowhere, every = (0,) * axes, range(axes)
+    corner = BasisSite(vector(map(float, nowhere)), nowhere, nowhere)
+    return (corner,), (1,) * axes, tuple(tuple(int(a == b) for b in every) for a in every)
+
+
 @dataclass(frozen=True)
 class Cell:
     """The repeat cell of a lattice, with as many vectors as space has axes.
@@ -73,12 +82,9 @@ class Cell:
     primitive: tuple[Index, ...] = ()
 
     def __post_init__(self) -> None:
-        axes = range(len(self.vectors))
-        nowhere = tuple(0 for _ in axes)
-        corner = BasisSite(vector(map(float, nowhere)), nowhere, nowhere)
-        steps = tuple(tuple(int(axis == other) for other in axes) for axis in axes)
-        object.__setattr__(self, "sites", self.sites or (corner,))
-        object.__setattr__(self, "period", self.period or tuple(1 for _ in axes))
+        sites, period, steps = _of_one_site(len(self.vectors))
+        object.__setattr__(self, "sites", self.sites or sites)
+        object.__setattr__(self, "period", self.period or period)
         object.__setattr__(self, "primitive", self.primitive or steps)
 
     @property
@@ -98,14 +104,20 @@ class Cell:
         """
         here, there = self.sites[source], self.sites[target]
         axes = range(self.axes)
-        between = [there.primitive[p] - here.primitive[p] for p in axes]
         return Offset(
             target,
             cell,
             tuple(there.index[n] - here.index[n] + cell[n] * self.period[n] for n in axes),
-            tuple(between[p] + sum(cell[n] * self.primitive[n][p] for n in axes) for p in axes),
+            self.primitive_step(source, target, cell),
             (there.at - here.at) + self.shift(cell),
         )
+
+    def primitive_step(self, source: int, target: int, cell: Index) -> Index:
+        """The same offset in the primitive basis."""
+        here, there = self.sites[source].primitive, self.sites[target].primitive
+        steps = zip(*self.primitive, strict=True)
+        along = (sum(n * m for n, m in zip(cell, step, strict=True)) for step in steps)
+        return tuple(b - a + n for a, b, n in zip(here, there, along, strict=True))
 
     def offsets(self, source: int, radius: float) -> list[Offset]:
         """All offsets from a site of `source` with 0 < |rest| ≤ radius, the nearest first."""

@@ -17,7 +17,7 @@ from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, Sizes, sizes_of
-from pbdkit.scene.solver_sizes import LARGEST_DIRECT
+from pbdkit.scene.solver_sizes import LARGEST_ANEW
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _sizes(analysis: Analysis) -> Sizes:
     """Of a large equilibrium by what serves it."""
     scene = analysis.scene
     count, grids = scene.raster.count, True
-    if count > LARGEST_DIRECT and not scene.experiment.solver.makes_steps:
+    if count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
         grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
     return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 

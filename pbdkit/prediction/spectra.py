@@ -12,10 +12,10 @@ import numpy as np
 from pbdkit.analysis.couplings import Entries
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.analysis.spectrum import Spectrum, excess, modes, spectrum, spectrum_of
-from pbdkit.equilibrium.linearisation import LARGEST_DIRECT
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.prediction.estimate import Estimate
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import LARGEST_ANEW
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Spectra:
     @cached_property
     def _found(self) -> tuple[Spectrum | None, bool]:
         """Large bodies are estimated sooner, where that can be, as they are solved."""
-        large = self.scene.raster.count > LARGEST_DIRECT
+        large = self.scene.raster.count > LARGEST_ANEW
         if large and (found := self.estimate.spectrum):
             return found, True
         if found := self._spectrum_of(self.rule_matrix, self.scene.lag == 0):

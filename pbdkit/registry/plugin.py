@@ -8,6 +8,7 @@ import sys
 import warnings
 from contextlib import chdir, redirect_stdout, suppress
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import EntryPoint, distribution, version
 from typing import Any
 
@@ -29,6 +30,7 @@ class IncompatibleError(Exception):
     """A plugin was written for another version of the plugin API."""
 
 
+@cache
 def load_builtin() -> Plugin:
     """The components of pbdkit itself, by its own entry point, with no other looked at; they are
     not checked, for that is what the tests do."""

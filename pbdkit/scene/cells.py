@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import permutations
 from operator import sub
 from typing import Any
@@ -28,6 +29,7 @@ LEVEL = 1e-9
 """Corners whose heights differ by less than this share of their distance lie level."""
 
 
+@lru_cache(maxsize=32)
 def tiling_of(cell: Cell, slots: Slots) -> Tiling:
     """The polygons of a lattice, each once a repeat cell, and those beside its slots; none but
     in the plane."""

@@ -15,8 +15,10 @@ from pbdkit.interfaces import AppliesTwice
 from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.neighbourhood import Neighbourhood
 
-LARGEST_DIRECT = 20_000
-"""Particles up to which `auto` takes a direct solver (as in equilibrium/linearisation.py)."""
+LARGEST_DIRECT, LARGEST_ANEW = 3_000, 20_000
+"""Particles up to which `auto` takes a direct solver, and where systems are set up again and again:
+by differences of moves, which are compiled beyond, or at each change of a bond. What works on
+stencils is compiled once a machine."""
 
 KERNELS = 48 * 2**20
 """Bytes of the compiled functions of grids."""
@@ -45,11 +47,19 @@ def equilibrium_size(
     return particles * bytes_each * (1 if linear else TWO)
 
 
+def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
+    """Whether stencils serve best, where they serve."""
+    once = experiment.rule.linear and not experiment.fracture.can_break
+    largest = LARGEST_DIRECT if once else LARGEST_ANEW
+    return method == "multigrid" or (method == "auto" and particles > largest)
+
+
 def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
     """Whether the lattice's stencils serve."""
     method, cell = experiment.solver.sought.method, neighbourhood.cell
-    asked = method == "multigrid" or (method == "auto" and particles > LARGEST_DIRECT)
-    if not (asked and find_spec("numba")) or isinstance(experiment.rule, AppliesTwice):
+    if not (asks_for_grids(experiment, method, particles) and find_spec("numba")) or isinstance(
+        experiment.rule, AppliesTwice
+    ):
         return False
     if experiment.neighbours.nearness() or len(cell.primitive) != 2:
         return False

@@ -84,10 +84,24 @@ def prolong(first, begin, end, lone, place, coarse, halved, x):
 @njit(**FAST)
 def differences(still, moved, place, number, share, axis, out):
     """share · (still - moved) at flat places, into place `number` of each one's stencil, as what
-    moves along an axis do."""
+    moves along an axis do. Returns the largest."""
+    largest = 0.0
     for n in range(place.size):
         for v in range(2):
-            out[n, number[n], v, axis] = share * (still[v, place[n]] - moved[v, place[n]])
+            value = share * (still[v, place[n]] - moved[v, place[n]])
+            out[n, number[n], v, axis] = value
+            largest = max(largest, abs(value))
+    return largest
+
+
+@njit(**FAST)
+def clear_noise(stencils, noise):
+    """Zero where all four numbers of a place of a stencil are as small."""
+    for n in range(stencils.shape[0]):
+        for s in range(stencils.shape[1]):
+            c = stencils[n, s]
+            if max(abs(c[0, 0]), abs(c[0, 1]), abs(c[1, 0]), abs(c[1, 1])) <= noise:
+                c[:] = 0.0
 
 
 def run():
@@ -99,5 +113,6 @@ def run():
     dot(r, r)
     differences(r.reshape(2, -1), r.reshape(2, -1), np.zeros(1, int), np.zeros(1, int), 1.0, 0,
                 np.zeros((1, 9, 2, 2)))  # fmt: skip
+    clear_noise(np.zeros((1, 9, 2, 2)), 0.0)
     rows, some = np.zeros(9, np.int64), np.zeros(1, np.int32)
     prolong(rows, some, some, rows, some, np.zeros((2, 6, 6), np.float32), (1, 1), z)

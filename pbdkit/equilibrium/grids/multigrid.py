@@ -6,6 +6,7 @@ to them (Galerkin). Where one direction is much stiffer, only that one is made c
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -52,10 +53,14 @@ class Grid:
 
     def given(self, precision: type[np.floating[Any]]) -> Any:
         """The grid as kernels take it."""
-        middle = inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
+        middle = self._inverses
         same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
         own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
         return kernels().Grid(*self.lists, same, own, tuple(map(precision, middle[0])), inverse)
+
+    @cached_property
+    def _inverses(self) -> Floats:
+        return inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
 
     def field(self, precision: type[np.floating[Any]]) -> Floats:
         """Room for one number an axis and place."""
@@ -143,9 +148,9 @@ class Multigrid:
     def is_definite(self) -> bool:
         """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
         tell: one that is not there is not on the finest either."""
-        own = self.grid().stencils[:, OWN].reshape(-1, 2, 2)
+        a, b, c, d = self.grid().stencils[:, OWN].T
         K = (self._coarsest + self._coarsest.T) / 2.0
-        alone = (own[:, 0, 0] > 0.0) & (np.linalg.det(own) > 0.0)
+        alone = (a > 0.0) & (a * d > b * c)
         return bool(alone.all()) and bool(np.linalg.eigvalsh(K)[0] > 0.0)
 
     def __len__(self) -> int:

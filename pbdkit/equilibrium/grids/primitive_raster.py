@@ -71,5 +71,4 @@ class PrimitiveRaster:
 
 def primitive_step(scene: Scene, slot: Slot) -> Index:
     """Where a slot leads in the primitive basis."""
-    found = scene.raster.lattice.cell().offset(slot.source, slot.target, slot.cell)
-    return found.primitive
+    return scene.neighbourhood.cell.primitive_step(slot.source, slot.target, slot.cell)

@@ -81,16 +81,16 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
     nudged = replace(state, u=state.u.copy())
-    still = moves.at(nudged, step).reshape(2, -1).copy()
+    still, largest = moves.at(nudged, step).reshape(2, -1).copy(), 0.0
     for n in range(WINDOW):
         some, number = body[groups == n], numbers[n][group]
         for axis in range(2):
             nudged.u[...] = state.u
             nudged.u.reshape(2, -1)[axis, some] += NUDGE
             moved = moves.at(nudged, step).reshape(2, -1)
-            kernels().differences(still, moved, place, number, 1.0 / NUDGE, axis, stencils)
-    sizes = np.maximum.reduce(np.abs(stencils).reshape(-1, 4).T).reshape(-1, WINDOW)
-    stencils[sizes <= NOISE * sizes.max()] = 0.0
+            found = kernels().differences(still, moved, place, number, 1 / NUDGE, axis, stencils)
+            largest = max(largest, found)
+    kernels().clear_noise(stencils, NOISE * largest)
     code[place] = np.where(stencils[:, OWN].any(axis=(1, 2)), every, -1)
     scale = np.broadcast_to(np.eye(2).ravel(), (len(place), 4))
     return _on(grid, code, kind == LEADER, stencils.reshape(-1, WINDOW, 4), scale.copy())

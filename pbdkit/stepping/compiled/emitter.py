@@ -91,12 +91,12 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
             write_pass(out, plan, 1, sweep, "i0", "i1")
             if n + 1 < len(passes) and plan.scene.frame:
                 out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
-                _write_frame(out, plan, f"fz{n}", f"fz{n}")
+                write_frame(out, plan, f"fz{n}", f"fz{n}")
     out.add(1, "for e in range(led.size):")
     out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
     out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))
     if plan.scene.frame:
-        _write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
+        write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
     out.add(1, f"{u}, {v} = {v}, {u}")
 
@@ -111,7 +111,7 @@ def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, h
     out.add(depth + 1, one.call(*span))
 
 
-def _write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
+def write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
     """Frame points from flat planes of the body."""
     assert plan.scene.frame
     out.add(1, "for f in range(points.size):")

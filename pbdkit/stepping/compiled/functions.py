@@ -143,14 +143,15 @@ def _names(function: Function) -> dict[str, Any]:
     codes = [function.__code__]
     for code in codes:
         codes += [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    names = {name for code in codes for name in code.co_names}
+    # Sorted, since the order of a set differs from process to process.
+    names = sorted({name for code in codes for name in code.co_names})
     found = {n: function.__globals__[n] for n in names if n in function.__globals__}
     found |= inspect.getclosurevars(function).nonlocals
     modules = [v for v in found.values() if isinstance(v, types.ModuleType)]
     for module in modules:
         if module.__name__.split(".")[0] not in ("numpy", "math", "numba"):
             # pbdkit's own are loaded when first used.
-            members = {name: getattr(module, name) for name in names & set(dir(module))}
+            members = {name: getattr(module, name) for name in names if hasattr(module, name)}
             found |= {f"{module.__name__}.{name}": value for name, value in members.items()}
             modules += [v for v in members.values() if isinstance(v, types.ModuleType)]
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,10 +57,16 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
     return found
 
 
-def load_blamed(levels: Sequence[Level], source: str, arguments: tuple[Any, ...]) -> Any:
-    """The kernel; what does not compile is named as the part's whose it is."""
+def load_blamed(
+    levels: Sequence[Level],
+    source: str,
+    arguments: tuple[Any, ...],
+    more: Mapping[str, Callable[..., Any]] | None = None,
+) -> Any:
+    """The kernel, with `more` functions than those of its parts; what does not compile is named as
+    the part's whose it is."""
     try:
-        return load_kernel(source, functions_of(levels), arguments)
+        return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
     except Exception as error:
         with blaming(_culprit(levels, error), "to compile"):
             raise

@@ -53,12 +53,14 @@ class Level:
 @dataclass(frozen=True)
 class Plan:
     """A scene's levels, the last of which moves the particles, whether it is stepped on several
-    threads, and the names of what all functions of its kernel may use: mostly arrays."""
+    threads, the names of what all functions of its kernel may use: mostly arrays; and whether
+    bonds are judged apart from moves, whatever the model."""
 
     scene: Scene
     levels: tuple[Level, ...]
     parallel: bool
     shared: tuple[str, ...] = ("step",)
+    apart: bool = False
 
     @property
     def axes(self) -> str:
@@ -98,7 +100,8 @@ class Plan:
     @property
     def bonds_first(self) -> bool:
         """Whether bonds are judged in a pass of their own, and not by the sweep at both ends."""
-        return self.model is not None and (isinstance(self.model, RenewsBonds) or self.long)
+        renews = isinstance(self.model, RenewsBonds)
+        return self.model is not None and (self.apart or renews or self.long)
 
     @property
     def home_reach(self) -> tuple[int, int]:
@@ -189,7 +192,8 @@ class Function:
     def source(self) -> list[str]:
         """Its lines, with a head."""
         head = f"def {self.name}({', '.join([*self.own, *self.used])}):"
-        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in self._words()]
+        words = self._words()
+        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
         lines = ("    " + line for line in [*flat, *self.lines])
         return ["", "", '@njit(error_model="numpy")', head, *lines]
 

@@ -1,0 +1,48 @@
+"""Whether a kernel of its own settles a scene whose bonds break."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pbdkit.errors import PluginError
+from pbdkit.interfaces import RenewsBonds
+from pbdkit.results.progress import Watch
+from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import LARGEST_ANEW
+from pbdkit.stepping.choice import PATIENCE_S, obstacle
+
+if TYPE_CHECKING:
+    from pbdkit.equilibrium.breaking.settler import Settler
+
+SETTLING_S, PARTICLE_S = 6e-3, 1e-5
+"""What a settling takes by numpy, about, and what it takes more a particle."""
+LITTLE_BY_LITTLE, AT_ONCE = 20, 2
+"""Settlings an increment where bonds change little by little, and where they only break."""
+
+
+def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
+    """For a scene whose rule is linear; None where compiling would take longer than numpy, where
+    nothing compiles, or where the solver's method is not direct. Decided by the experiment alone,
+    so that what is resumed goes on as it began."""
+    solver, plain = scene.experiment.solver.sought, scene.axes == 2 and scene.inner is None
+    direct = solver.method == "lu" or (
+        solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
+    )
+    if not (scene.has_fracture and direct and plain) or _seconds(scene) < PATIENCE_S or obstacle():
+        return None
+    from pbdkit.equilibrium.breaking.settler import Settler
+
+    try:
+        found = Settler(scene, tolerance, watch)
+    except PluginError:
+        return None
+    return found if found.is_small else None
+
+
+def _seconds(scene: Scene) -> float:
+    """What numpy would take."""
+    renews = isinstance(scene.experiment.fracture, RenewsBonds)
+    settlings = scene.experiment.solver.sought.increments * (
+        LITTLE_BY_LITTLE if renews else AT_ONCE
+    )
+    return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)

@@ -1,0 +1,120 @@
+"""Scenes that a kernel of its own settles while their bonds break: as numpy does."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from interpreted_kernels import interpreting
+
+import pbdkit
+from pbdkit.equilibrium import increments
+from pbdkit.equilibrium.breaking import choice
+from pbdkit.equilibrium.breaking.settler import Settler
+from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit.results.progress import Watch
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+
+DAMAGE = {"type": "damage", "onset": 0.1, "failure": 0.5, "scatter": 0.3, "frame_bonds": False}
+SCENES = {
+    "damage": {"lattice": {"type": "hexagonal", "a": 1.0}, "fracture": DAMAGE},
+    "damage seen from the reference": {"fracture": DAMAGE | {"fictitious": "reference"}},
+    "axes that move each other": {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.2},
+        "frame": {"type": "natural"},
+        "fracture": {"type": "strain", "failure": 0.35, "scatter": 0.4, "frame_bonds": False},
+    },
+    "threshold, with frame bonds": {"fracture": {"type": "threshold", "thresholds": [1.4]}},
+}
+
+
+def scene_of(**parts):
+    motion = {"type": "displace", "displacement": [2.0, 0.3]}
+    given = {
+        "name": "breaking",
+        "seed": 5,
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": 5, "rows": 3},
+        "rule": {"type": "barycentre"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {"select": {"edge": "right"}, "motion": motion},
+        ],
+        "steps": 1,
+        "solver": {"type": "equilibrium", "increments": 3},
+    }
+    return build_scene(pbdkit.Experiment(version=1, **given | parts))
+
+
+@pytest.fixture(autouse=True)
+def _kernels(monkeypatch):
+    with interpreting():
+        yield
+
+
+def by_kernel(monkeypatch):
+    """Counts the increments that a kernel settles, each time."""
+    monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
+    settled, settle = [], Settler.settle
+    monkeypatch.setattr(
+        Settler, "settle", lambda *given: settled.append(settle(*given)) or settled[-1]
+    )
+    return settled
+
+
+@pytest.mark.parametrize("parts", SCENES.values(), ids=SCENES)
+def test_the_kernel_breaks_and_softens_as_numpy_does(parts, monkeypatch):
+    scene = scene_of(**parts)
+    expected, certificate = equilibrium_state(scene)
+    settled = by_kernel(monkeypatch)
+    found, own = equilibrium_state(scene)
+    assert len(settled) == 3
+    assert any(well for well, _ in settled)
+    assert (found.broken_step > 0).any() or any((v > 0).any() for v in found.bond_values)
+    np.testing.assert_array_equal(found.broken_step, expected.broken_step)
+    np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
+    for mine, others in zip(found.bond_values, expected.bond_values, strict=True):
+        np.testing.assert_allclose(mine, others, rtol=0, atol=1e-10)
+    assert own.method == certificate.method
+    assert own.distance <= scene.experiment.solver.tolerance * 2.0
+
+
+def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
+    by_kernel(monkeypatch)
+    scene = scene_of(fracture=DAMAGE)
+    whole, kept = initial_state(scene), None
+    for n, moment in enumerate(increments.increments(scene, whole, Watch())):
+        if n == 0:
+            kept, since = whole.copy(), moment
+    for _ in increments.increments(scene, kept, Watch(), since):
+        pass
+    assert (kept.bond_values[-1] > 0.0).any()
+    for mine, others in zip(kept._arrays(), whole._arrays(), strict=True):
+        np.testing.assert_array_equal(mine, others)
+
+
+def test_what_is_over_soon_is_not_compiled():
+    scene = scene_of(fracture=DAMAGE)
+    assert choice.settler_of(scene, 1e-8, Watch()) is None
+
+
+def test_a_kernel_is_found_again_whatever_the_order_of_sets():
+    program = (
+        "from pbdkit.components.strain_fracture import Damage\n"
+        "from pbdkit.stepping.compiled.functions import source_key\n"
+        "print(source_key(Damage.update))"
+    )
+    keys = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in "123"
+    }
+    assert len(keys) == 1
