@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Annotated, Any, Self
 
 from pydantic import (
@@ -38,6 +40,7 @@ from pbdkit.interfaces import (
     Softens,
 )
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.units import Scales, Units, given_by_units, of_one_material
 from pbdkit.registry.registry import Registry
 
 
@@ -62,7 +65,9 @@ Name = Annotated[
     str, AfterValidator(_valid_name), Field(json_schema_extra={"pattern": f"^{_WORD}(/{_WORD})*$"})
 ]
 Version = Annotated[int, AfterValidator(_known_version), Field(json_schema_extra={"const": 1})]
-AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
+AnyDiagnostic = Annotated[
+    SerializeAsAny[Diagnostic], open_part(Diagnostic), AfterValidator(of_one_material)
+]
 
 
 def _default(part: str) -> Any:
@@ -80,6 +85,7 @@ class Experiment(Strict):
     version: Version = 1
     name: Name
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    units: Units | None = None
     lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
     body: AnyBody
     neighbours: Annotated[SerializeAsAny[NeighbourMetric], open_part(NeighbourMetric)] = _default(
@@ -159,6 +165,11 @@ class Experiment(Strict):
         *single, many = (found[field] for field in INTERFACES)
         for part, dumped in zip(self.components(), [*single, *many], strict=True):
             dumped["type"] = self._registry.name_of(part)
+            for name in given_by_units(part):
+                if self.units and self.units.value(name):
+                    del dumped[name]  # there it is said
+        if self.units is None:
+            del found["units"]
         return found
 
     @classmethod
@@ -194,14 +205,24 @@ class Experiment(Strict):
         """The distributions that the parts come from, with their versions."""
         return self._registry.versions(self.components())
 
+    def as_written(self) -> dict[str, Any]:
+        """What can be changed and built again. With `units` that is what it was made of, whose
+        lengths may name a unit, where that holds plain values; else all of it in lattice units."""
+        if self.units and self._source.data is not None:
+            with suppress(TypeError, ValueError):
+                written: dict[str, Any] = json.loads(json.dumps(self._source.data))
+                return written
+        return self.model_dump(mode="json", by_alias=True)
+
     def located(self, error: ExperimentError) -> ExperimentError:
         """The error with the place of its field in the file."""
         return ExperimentError(self._source.message(error.where, str(error)), error.where)
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:
+            units = Scales.model_validate({"units": parts.get("units")}).units
             self.__pydantic_validator__.validate_python(
-                parts, self_instance=self, context={"registry": registry}
+                parts, self_instance=self, context={"registry": registry, "units": units}
             )
         except ValidationError as error:
             raise report(error, source) from None
