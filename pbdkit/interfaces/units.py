@@ -117,7 +117,10 @@ class Units(Strict):
         if lacking := self.lacks(quantity):
             raise _fault(f"a {quantity.meaning} needs units.{lacking[0]}, which is missing")
         powers = {name: getattr(quantity, name) for name in type(self).model_fields}
-        return math.prod((self.value(n) or 0.0) ** power for n, power in powers.items() if power)
+        scale: float = math.prod(
+            (self.value(n) or 0.0) ** power for n, power in powers.items() if power
+        )
+        return scale
 
 
 class Scales(Strict):

@@ -120,7 +120,9 @@ class Measured:
                         )
                     if when is not When.END:
                         _refuse_infinite(variable, value, now)
-                    values[variable.name] = np.array(value if factor == 1.0 else value * factor)
+                    values[variable.name] = (
+                        np.array(value) if factor == 1.0 else np.multiply(value, factor)
+                    )
         return values
 
 

@@ -105,12 +105,12 @@ def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
         kept = sorted({step for step in wanted if step <= steps}) or [0]
         data["record"] = {k: v for k, v in data["record"].items() if k != "every"} | {"at": kept}
     if keep.variables is not None:
-        wanted = {name for kept in keep.variables for name in (kept, kept.removesuffix(IN_MM))}
+        asked = {name for kept in keep.variables for name in (kept, kept.removesuffix(IN_MM))}
         measured = zip(experiment.diagnostics, data["diagnostics"], strict=True)
         data["diagnostics"] = [
             part
             for diagnostic, part in measured
-            if "bonds" in diagnostic.needs or {v.name for v in diagnostic.variables()} & wanted
+            if "bonds" in diagnostic.needs or {v.name for v in diagnostic.variables()} & asked
         ]
     if data["solver"].get("threads") == "auto":
         data["solver"]["threads"] = 1
