@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jsonschema
@@ -11,11 +12,15 @@ import pytest
 
 import pbdkit
 from pbdkit.experiment.schema import experiment_schema
+from pbdkit.experiment.source import Source
 from pbdkit.interfaces import units as units_module
 from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Units
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
+from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.snapshot import counted_in
+from pbdkit.runs.course import Run, record
+from pbdkit.scene.scene import build_scene
 
 UNITS = {"length": "0.25 mm", "youngs_modulus": "206 GPa", "thickness": "3.05 mm"}
 BAR: dict[str, Any] = {
@@ -44,7 +49,7 @@ BAR: dict[str, Any] = {
         {"type": "track", "numbers": [3]},
     ],
 }
-STEPPED = BAR | {"solver": {"type": "stepping"}, "steps": 4}
+STEPPED = {k: v for k, v in BAR.items() if k not in ("solver", "steps")}
 
 
 def run(given: dict[str, Any], **changes: Any) -> Any:
@@ -124,23 +129,24 @@ def test_a_dataset_runs_again_and_records_in_single_precision(bar: Any) -> None:
     assert single.reference_mm.dtype == np.float64
 
 
-def test_a_file_is_continued_and_reads_without_pint(tmp_path: Any, monkeypatch: Any) -> None:
-    from click.testing import CliRunner
+def test_a_file_is_continued_to_the_bit(tmp_path: Any) -> None:
+    def made(steps: int) -> Any:
+        path, scene = (
+            tmp_path / f"{steps}.nc",
+            build_scene(pbdkit.Experiment(**STEPPED, steps=steps)),
+        )
+        record(Run(scene), NetcdfSink(path))
+        return path
 
-    from pbdkit.cli import cli
-
-    monkeypatch.chdir(tmp_path)
-    for name, steps in (("short", 2), ("long", 4)):
-        (tmp_path / f"{name}.yaml").write_text(json.dumps(STEPPED | {"name": name, "steps": steps}))
-        done = CliRunner().invoke(cli, ["run", f"{name}.yaml", "--quiet"])
-        assert done.exit_code == 0, done.output
-    with pbdkit.resume("short.nc", steps=4, progress=False) as ds, pbdkit.open("long.nc") as whole:
+    with pbdkit.resume(made(2), steps=4, progress=False) as ds, pbdkit.open(made(4)) as whole:
         assert ds.equals(whole)
-        assert "u_mm" in ds
-    check = CliRunner().invoke(cli, ["check", "short.yaml"])
-    assert "size       4 × 2 mm" in check.output
-    sizes = CliRunner().invoke(cli, ["check", "short.yaml", "--json"])
-    assert json.loads(sizes.output)["size_mm"] == [4.0, 2.0]
+        assert ds.u_mm.equals(0.25 * ds.u)
+
+
+def test_check_says_how_large_the_body_is(call: Any) -> None:
+    Path("bar.json").write_text(json.dumps(BAR))
+    assert "size       4 × 2 mm" in call("check", "bar.json").out
+    assert json.loads(call("check", "bar.json", "--json").out)["size_mm"] == [4.0, 2.0]
 
 
 def test_a_sweep_over_the_lattice_unit_refines_what_is_written_in_mm() -> None:
@@ -180,20 +186,16 @@ def test_a_component_of_anybody_takes_units(quantity: Any, text: str, number: fl
         by: Annotated[float, quantity]
 
         @staticmethod
-        def gather(d: Any, u: Any, r: Any, p: Any, w: Any) -> Any:
+        def gather(d: Any, r: Any, w: Any, p: Any) -> Any:
             return (d,)
 
         @staticmethod
-        def apply(sums: Any, here: Any, p: Any, c: Any) -> Any:
-            return sums[0] / here.count
+        def apply(sums: Any, here: Any, p: Any) -> Any:
+            return p.by * sums[0]
 
     for given in (text, number):
-        made = pbdkit.Experiment.build(
-            pbdkit.experiment.source.Source(
-                data=changed(rule={"type": "pulled", "by": given}, diagnostics=[], frame=None)
-            ),
-            [Pulled],
-        )
+        parts = changed(rule={"type": "pulled", "by": given}, diagnostics=[], frame=None)
+        made = pbdkit.Experiment.build(Source(data=parts), [Pulled])
         assert made.rule.by == pytest.approx(number, rel=1e-14)  # type: ignore[attr-defined]
 
 
