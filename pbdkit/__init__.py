@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     )
     from pbdkit.experiment.model import Experiment as Experiment
     from pbdkit.interfaces import (
+        AREA as AREA,
+        ENERGY as ENERGY,
+        FORCE as FORCE,
+        LENGTH as LENGTH,
+        STRESS as STRESS,
         Anchors as Anchors,
         AppliesTwice as AppliesTwice,
         BasisSite as BasisSite,
@@ -56,6 +61,7 @@ if TYPE_CHECKING:
         Offset as Offset,
         Pair as Pair,
         Particles as Particles,
+        Quantity as Quantity,
         Remembered as Remembered,
         Remembers as Remembers,
         RenewsBonds as RenewsBonds,
@@ -83,11 +89,12 @@ _HOME = {
     ),
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
-        "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
-        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here Lattice "
-        "LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles Remembered Remembers "
-        "RenewsBonds RenewsParticles Setting Slot Softens SpaceVector StartsCracked Stiffness "
-        "StoresEnergy Variable Vector dot length squared_length where"
+        "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
+        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel "
+        "FrameMap FramePolicy FrameSites Here Lattice LeaderRows Moment Nearness NeighbourMetric "
+        "Offset Pair Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
+        "Slot Softens SpaceVector StartsCracked Stiffness StoresEnergy Variable Vector dot length "
+        "squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

@@ -24,6 +24,7 @@ TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
 STEPPED = "solver={type: stepping, relaxation: 0.2}"
 SMALLER = {
     "material/bar": ["lattice.a=0.2"],
+    "modelling/strip": ["units.length=3.125 mm"],
     "material/cantilever": ["lattice.a=0.25"],
     "material/hole": ["lattice.a=0.2"],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],

@@ -86,6 +86,8 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
     click.echo(f"  steps      {loaded.steps}, of which {records} are recorded (time 0 included)")
     click.echo(f"  particles  {found.particles}, of which {found.followers} follow in step 1")
     click.echo(f"  bonds      {found.bonds}")
+    if found.size_mm:
+        click.echo(f"  size       {' × '.join(f'{side:.6g}' for side in found.size_mm)} mm")
     click.echo(f"  memory     about {found.memory_mib:.3g} MiB")
     click.echo(f"  output     about {found.output_mib:.3g} MiB")
     _tell_of_steps(loaded, found)

@@ -13,8 +13,7 @@ from pbdkit.interfaces import Diagnostic, Moment, Variable, Vector, length
 from pbdkit.interfaces.diagnostic import Need
 from pbdkit.interfaces.fracture_model import breaking_order
 from pbdkit.interfaces.polygons import area_share
-
-LENGTH = "lattice unit"
+from pbdkit.interfaces.units import AREA, LENGTH
 
 
 class PE1(Diagnostic):
@@ -29,7 +28,7 @@ class PE1(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`pe1`."""
-        return (Variable("pe1", ("particle",), "pseudo-energy PE1", f"{LENGTH}^2"),)
+        return (Variable("pe1", ("particle",), "pseudo-energy PE1", AREA.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """Squared length changes, summed."""
@@ -46,7 +45,7 @@ class PE1Intact(Diagnostic):
     def variables(self) -> tuple[Variable, ...]:
         """`pe1_intact`."""
         name = "pseudo-energy PE1 of intact bonds"
-        return (Variable("pe1_intact", ("particle",), name, f"{LENGTH}^2"),)
+        return (Variable("pe1_intact", ("particle",), name, AREA.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """Squared length changes of intact bonds, summed."""
@@ -60,7 +59,7 @@ class PE2(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`pe2`."""
-        return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH),)
+        return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The length of the last step."""
@@ -75,7 +74,7 @@ class Displacement(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`u`."""
-        return (Variable("u", ("particle", "axis"), "displacement", LENGTH),)
+        return (Variable("u", ("particle", "axis"), "displacement", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The displacements."""
@@ -94,7 +93,9 @@ class Track(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`track`."""
-        return (Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH),)
+        return (
+            Variable("track", ("tracked", "axis"), "position of tracked particles", LENGTH.lattice),
+        )
 
     def check(self, particles: int, leader_groups: int) -> None:
         """Refuses numbers that no particle has."""
@@ -163,7 +164,7 @@ class CrackPath(Diagnostic):
             Variable("crack_bond", ("crack",), bond, "1", dtype="i8"),
             Variable("crack_step", ("crack",), "step at which the bond broke", "step", dtype="i4"),
             Variable("crack_strain", ("crack",), strain, "1"),
-            Variable("crack_midpoint", ("crack", "axis"), where, LENGTH),
+            Variable("crack_midpoint", ("crack", "axis"), where, LENGTH.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:

@@ -21,6 +21,7 @@ from pbdkit.interfaces import (
     Vector,
     where,
 )
+from pbdkit.interfaces.units import LENGTH
 
 Factor = Annotated[
     float,
@@ -202,7 +203,7 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
     """
 
     type: Literal["strain-gradient"] = "strain-gradient"
-    length: Annotated[float, Field(ge=0.0, le=1e6)] = Field(
+    length: Annotated[float, Field(ge=0.0, le=1e6), LENGTH] = Field(
         description="The internal length l (lattice units).", examples=[0.5]
     )
 

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from pbdkit.interfaces import Diagnostic, Moment, Variable
 from pbdkit.interfaces.diagnostic import Need
+from pbdkit.interfaces.units import STRESS, FromUnits, unset
 
 Floats = NDArray[np.floating[Any]]
 Measure = Annotated[
@@ -20,9 +21,14 @@ Measure = Annotated[
         examples=["green-lagrange"],
     ),
 ]
-Positive = Annotated[float, Field(gt=0.0)]
 Modulus = Annotated[
-    float, Field(gt=0.0, description="E, in the units that stresses shall have.", examples=[210e9])
+    float,
+    Field(
+        gt=0.0,
+        description="E, in the units that stresses shall have, unless `units` gives it.",
+        examples=[210e9],
+    ),
+    FromUnits("youngs_modulus"),
 ]
 COMPONENTS = ("xx", "yy", "xy")
 
@@ -83,7 +89,7 @@ class Stress(Diagnostic):
     """
 
     type: Literal["stress"] = "stress"
-    youngs_modulus: Modulus
+    youngs_modulus: Modulus = Field(default_factory=unset)
     measure_: Measure = "small"
 
     needs: ClassVar[frozenset[Need]] = frozenset({"cells", "material"})
@@ -92,7 +98,7 @@ class Stress(Diagnostic):
         """`stress_xx`, or `piola_kirchhoff_xx`, and so on."""
         name = "stress" if self.measure_ == "small" else "piola_kirchhoff"
         meaning = "stress" if self.measure_ == "small" else "second Piola-Kirchhoff stress"
-        return _components(name, meaning, "unit of youngs_modulus")
+        return _components(name, meaning, STRESS.lattice)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """(xx, yy, xy)."""

@@ -9,21 +9,27 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pbdkit.components.diagnostics import refuse_numbers_beyond
-from pbdkit.components.fields import Modulus, Positive
+from pbdkit.components.fields import Modulus
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Diagnostic, Moment, Pair, Variable
+from pbdkit.interfaces import Diagnostic, Moment, Variable
 from pbdkit.interfaces.diagnostic import Need
+from pbdkit.interfaces.units import ENERGY, FORCE, LENGTH, STRESS, FromUnits, Place, unset
 
 Floats = NDArray[np.floating[Any]]
-FORCE = "unit of youngs_modulus * unit of thickness * lattice unit"
 Thickness = Annotated[
-    float, Field(gt=0.0, description="Of the body, out of its plane.", examples=[2.0])
+    float,
+    Field(
+        gt=0.0,
+        description="Of the body, out of its plane; 1 unless `units` gives it.",
+        examples=[2.0],
+    ),
+    FromUnits("thickness", otherwise=1.0),
 ]
 Group = Annotated[int, Field(ge=0)]
 TwoNumbers = Annotated[
     tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)
 ]
-TwoPoints = Annotated[tuple[Pair, Pair], Field(strict=False)]
+TwoPoints = Annotated[tuple[Place, Place], Field(strict=False)]
 
 
 class StrainEnergy(Diagnostic):
@@ -34,14 +40,14 @@ class StrainEnergy(Diagnostic):
     """
 
     type: Literal["strain-energy"] = "strain-energy"
-    youngs_modulus: Modulus
-    thickness: Thickness = 1.0
+    youngs_modulus: Modulus = Field(default_factory=unset)
+    thickness: Thickness = Field(default_factory=unset)
 
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`strain_energy`."""
-        return (Variable("strain_energy", (), "strain energy", f"{FORCE}^2"),)
+        return (Variable("strain_energy", (), "strain energy", ENERGY.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """E t times the rule's."""
@@ -57,15 +63,15 @@ class Reaction(Diagnostic):
     """
 
     type: Literal["reaction"] = "reaction"
-    youngs_modulus: Modulus
-    thickness: Thickness = 1.0
+    youngs_modulus: Modulus = Field(default_factory=unset)
+    thickness: Thickness = Field(default_factory=unset)
 
     needs: ClassVar[frozenset[Need]] = frozenset({"forces"})
 
     def variables(self) -> tuple[Variable, ...]:
         """`reaction`."""
         name = "force that the leader group exerts"
-        return (Variable("reaction", ("leader_group", "axis"), name, FORCE),)
+        return (Variable("reaction", ("leader_group", "axis"), name, FORCE.lattice),)
 
     def check(self, particles: int, leader_groups: int) -> None:
         """Refuses experiments without leaders."""
@@ -88,8 +94,8 @@ class StressStrain(Diagnostic):
     """
 
     type: Literal["stress-strain"] = "stress-strain"
-    youngs_modulus: Modulus
-    width: Positive = Field(
+    youngs_modulus: Modulus = Field(default_factory=unset)
+    width: Annotated[float, Field(gt=0.0), LENGTH] = Field(
         description="Of the initial cross-section (lattice units).", examples=[2.5]
     )
     axis: Literal["x", "y"] = Field("x", description="The axis of the pull.", examples=["x"])
@@ -115,7 +121,7 @@ class StressStrain(Diagnostic):
     def variables(self) -> tuple[Variable, ...]:
         """`nominal_stress`, `nominal_strain`."""
         return (
-            Variable("nominal_stress", (), "nominal stress", "unit of youngs_modulus"),
+            Variable("nominal_stress", (), "nominal stress", STRESS.lattice),
             Variable("nominal_strain", (), "nominal strain", "1"),
         )
 

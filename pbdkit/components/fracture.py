@@ -20,8 +20,10 @@ from pbdkit.interfaces import (
     where,
 )
 from pbdkit.interfaces.fracture_model import Segment
+from pbdkit.interfaces.units import LENGTH
 
-Thresholds = Annotated[tuple[Annotated[float, Field(gt=0.0, le=1e150)], ...], Field(strict=False)]
+Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
+Thresholds = Annotated[tuple[Limit, ...], Field(strict=False)]
 
 Cracks = Annotated[tuple[Annotated[Segment, Field(strict=False)], ...], Field(strict=False)]
 

@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from pbdkit.interfaces import BasisSite, Cell, Lattice, Vector
+from pbdkit.interfaces.units import LENGTH
 
-Spacing = Annotated[float, Field(ge=1e-100, le=1e100)]
+Spacing = Annotated[float, Field(ge=1e-100, le=1e100), LENGTH]
 """A lattice constant; the range keeps squared lengths finite."""
 
 A = Field(description="Distance of the sites along a row (lattice units).", examples=[1.0])

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset, Vector
+from pbdkit.interfaces.units import LENGTH
 
 MOST_NEIGHBOURS = 4224
 """As many as 32 shells of chebyshev neighbours."""
@@ -93,7 +94,7 @@ class Euclidean(NeighbourMetric):
     """
 
     type: Literal["euclidean"] = "euclidean"
-    radius: Annotated[float, Field(gt=0.0)] = Field(
+    radius: Annotated[float, Field(gt=0.0), LENGTH] = Field(
         description="Weighted distance up to which particles are neighbours (lattice units).",
         examples=[1.5],
     )

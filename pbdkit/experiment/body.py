@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pbdkit.interfaces import Component, Pair
+from pbdkit.interfaces import Component
+from pbdkit.interfaces.units import LENGTH, Place
 
 Floats = NDArray[np.float64]
 Count = Annotated[int, Field(ge=1, le=2**31)]
-Positive = Annotated[float, Field(gt=0.0, le=1e100)]
-Vertices = Annotated[tuple[Pair, ...], Field(strict=False, min_length=3, max_length=100_000)]
+Positive = Annotated[float, Field(gt=0.0, le=1e100), LENGTH]
+Vertices = Annotated[tuple[Place, ...], Field(strict=False, min_length=3, max_length=100_000)]
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Rectangle(Body):
     type: Literal["rectangle"] = "rectangle"
     width: Positive
     height: Positive
-    origin: Pair = (0.0, 0.0)
+    origin: Place = (0.0, 0.0)
 
     def boxes(self) -> list[Box]:
         """Itself."""
@@ -101,7 +102,7 @@ class Disc(Body):
 
     type: Literal["disc"] = "disc"
     radius: Positive
-    centre: Pair
+    centre: Place
 
     def boxes(self) -> list[Box]:
         """The square around it."""
@@ -118,7 +119,7 @@ class Ring(Body):
     type: Literal["ring"] = "ring"
     inner: Positive
     outer: Positive
-    centre: Pair
+    centre: Place
 
     @model_validator(mode="after")
     def _in_order(self) -> Ring:
@@ -186,7 +187,7 @@ class Dogbone(Body):
     gauge_length: Positive
     gauge_width: Positive
     radius: Positive
-    origin: Pair = (0.0, 0.0)
+    origin: Place = (0.0, 0.0)
 
     @model_validator(mode="after")
     def _fits(self) -> Dogbone:
@@ -225,12 +226,12 @@ class Dogbone(Body):
         return True
 
 
-def _square(centre: Pair, radius: float) -> Box:
+def _square(centre: Place, radius: float) -> Box:
     x, y = centre
     return Box((x - radius, y - radius), (x + radius, y + radius))
 
 
-def _from(centre: Pair, sites: Sites) -> Floats:
+def _from(centre: Place, sites: Sites) -> Floats:
     x, y = sites.at
     distance: Floats = np.hypot(x - centre[0], y - centre[1])
     return distance

@@ -11,11 +11,13 @@ from pydantic import Field, SerializeAsAny
 
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
+from pbdkit.interfaces.units import LENGTH
 
 Floats = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]
 Share = Annotated[float, Field(ge=-1e100, le=1e100)]
 Shares = Annotated[tuple[Share, Share], Field(strict=False)]
+Shift = Annotated[tuple[Annotated[Share, LENGTH], Annotated[Share, LENGTH]], Field(strict=False)]
 Gradient = Annotated[tuple[Shares, Shares], Field(strict=False)]
 
 
@@ -48,7 +50,7 @@ class Noise(Initial):
     from the experiment's seed in the order of the numbers; leaders of step 1 start on theirs."""
 
     type: Literal["noise"] = "noise"
-    amplitude: Annotated[float, Field(ge=0.0, le=1e100)]
+    amplitude: Annotated[float, Field(ge=0.0, le=1e100), LENGTH]
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """Uniform in [-amplitude, amplitude)."""
@@ -61,7 +63,7 @@ class Affine(Initial):
 
     type: Literal["affine"] = "affine"
     gradient: Gradient
-    shift: Shares = (0.0, 0.0)
+    shift: Shift = (0.0, 0.0)
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """u_a = Σ_b gradient[a][b] X_b + shift_a."""

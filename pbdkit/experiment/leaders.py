@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SerializeAsAny, model_serializer, model_validator
 
 from pbdkit.experiment.parts import brief, closed_part
-from pbdkit.interfaces import Component, Pair
+from pbdkit.interfaces import Component
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.units import LENGTH, Place
 
 Floats = NDArray[np.floating[Any]]
 Steps = Annotated[int, Field(ge=1, le=2**62)]
-Box = Annotated[tuple[float, float, float, float], Field(strict=False)]
+Length = Annotated[float, LENGTH]
+Box = Annotated[tuple[Length, Length, Length, Length], Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
-Points = Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)]
+Points = Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
 
 
 class Motion(Component):
@@ -62,7 +64,7 @@ class Velocity(Motion):
     """Moves by `velocity` in each of `steps` steps, then holds."""
 
     type: Literal["velocity"] = "velocity"
-    velocity: Pair
+    velocity: Place
     steps: Steps
 
     def offset(self, n: float, start: Floats) -> Floats:
@@ -78,7 +80,7 @@ class Displace(Motion):
     """Moves by `displacement` in the first step, then holds."""
 
     type: Literal["displace"] = "displace"
-    displacement: Pair
+    displacement: Place
 
     def offset(self, n: float, start: Floats) -> Floats:
         """The displacement, from the first step on."""
@@ -95,7 +97,7 @@ class Path(Motion):
 
     type: Literal["path"] = "path"
     steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1)]
-    displacements: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)]
+    displacements: Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
 
     @model_validator(mode="after")
     def _in_order(self) -> Path:
@@ -124,7 +126,7 @@ class Rotation(Motion):
     """Turns about `centre` by `angle` degrees a step, counterclockwise, for `steps` steps."""
 
     type: Literal["rotation"] = "rotation"
-    centre: Pair
+    centre: Place
     angle: Annotated[float, Field(ge=-1e6, le=1e6)]
     steps: Steps
 
@@ -146,7 +148,7 @@ class Oscillation(Motion):
 
     type: Literal["oscillation"] = "oscillation"
     rests: ClassVar[bool] = False
-    amplitude: Pair
+    amplitude: Place
     period: Annotated[float, Field(ge=1e-6, le=1e12)]
 
     def offset(self, n: float, start: Floats) -> Floats:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Annotated, Any, Self
 
 from pydantic import (
+    AfterValidator,
     Field,
     PrivateAttr,
     SerializeAsAny,
@@ -39,9 +42,12 @@ from pbdkit.interfaces import (
 )
 from pbdkit.interfaces.component import Strict
 from pbdkit.interfaces.fields import TakesFields, unknown_regions
+from pbdkit.interfaces.units import Scales, Units, given_by_units, of_one_material
 from pbdkit.registry.registry import Registry
 
-AnyDiagnostic = Annotated[SerializeAsAny[Diagnostic], open_part(Diagnostic)]
+AnyDiagnostic = Annotated[
+    SerializeAsAny[Diagnostic], open_part(Diagnostic), AfterValidator(of_one_material)
+]
 
 
 def _default(part: str) -> Any:
@@ -59,6 +65,7 @@ class Experiment(Strict):
     version: Version = 1
     name: Name
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    units: Units | None = None
     lattice: Annotated[SerializeAsAny[Lattice], open_part(Lattice)]
     body: AnyBody
     regions: dict[RegionName, AnyBody] = Field(default_factory=dict)
@@ -154,6 +161,12 @@ class Experiment(Strict):
             dumped["type"] = self._registry.name_of(part)
             if isinstance(part, TakesFields):
                 dumped |= {name: field.written() for name, field in part.varying.items()}
+            for name in given_by_units(part):
+                if self.units and self.units.value(name):
+                    del dumped[name]  # there it is said
+        for name in ("units", "regions"):
+            if not found[name]:
+                del found[name]
         return found
 
     @classmethod
@@ -200,16 +213,26 @@ class Experiment(Strict):
         """The distributions that the parts come from, with their versions."""
         return self._registry.versions(self.components())
 
+    def as_written(self) -> dict[str, Any]:
+        """What can be changed and built again. With `units` that is what it was made of, whose
+        lengths may name a unit, where that holds plain values; else all of it in lattice units."""
+        if self.units and self._source.data is not None:
+            with suppress(TypeError, ValueError):
+                written: dict[str, Any] = json.loads(json.dumps(self._source.data))
+                return written
+        return self.model_dump(mode="json", by_alias=True)
+
     def located(self, error: ExperimentError) -> ExperimentError:
         """The error with the place of its field in the file."""
         return ExperimentError(self._source.message(error.where, str(error)), error.where)
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:
+            units = Scales.model_validate({"units": parts.get("units")}).units
             self.__pydantic_validator__.validate_python(
                 parts,
                 self_instance=self,
-                context={"registry": registry, "folder": source.folder},
+                context={"registry": registry, "folder": source.folder, "units": units},
             )
         except ValidationError as error:
             raise report(error, source) from None

@@ -18,6 +18,7 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.fields import TakesFields
+from pbdkit.interfaces.units import TEXT
 from pbdkit.registry.blame import blame
 from pbdkit.registry.registry import Registry
 
@@ -78,6 +79,8 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
         hint = f"; write {int(given)}"
     if fault["type"] == "literal_error" and isinstance(given, str):
         hint = did_you_mean(given, re.findall(r"'([^']*)'", context["expected"]))
+    if fault["type"] == "float_type" and isinstance(given, str) and TEXT.fullmatch(given):
+        hint = "; this takes a plain number, and no unit"
     return where, f"{message}, got {brief(given)}{hint}"
 
 

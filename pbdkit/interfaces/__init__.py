@@ -23,6 +23,7 @@ from pbdkit.interfaces.rule import (
     Stiffness,
     StoresEnergy,
 )
+from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Quantity
 from pbdkit.interfaces.values import Bonds, Draws, Particles, Remembered, Remembers
 from pbdkit.interfaces.vector import (
     Components,
@@ -45,11 +46,11 @@ INTERFACES: dict[str, type[Component]] = {
 """The open interfaces by the field of the experiment in which their components stand."""
 
 __all__ = [
-    "INTERFACES", "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated",
-    "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "MixesCells",
-    "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
-    "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
-    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length",
-    "squared_length", "where",
+    "AREA", "ENERGY", "FORCE", "INTERFACES", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
+    "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "Component", "Components",
+    "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
+    "Here", "Lattice", "LeaderRows", "MixesCells", "Moment", "Nearness", "NeighbourMetric",
+    "Offset", "Pair", "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds",
+    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
+    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
 ]  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pydantic import PrivateAttr, ValidationError, model_validator
+from pydantic import PrivateAttr, ValidationError, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
 from pbdkit.interfaces.component import Component, did_you_mean
@@ -69,7 +69,7 @@ class TakesFields(Component):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _with_fields(cls, data: Any, handler: Any) -> Any:
+    def _with_fields(cls, data: Any, handler: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return handler(data)
         varying = {}
@@ -81,7 +81,7 @@ class TakesFields(Component):
             if found:
                 varying[name] = found
         if varying:
-            cls._refuse_wrong(data, varying)
+            cls._refuse_wrong(data, varying, info.context)
         part = handler(data | {name: _first(field) for name, field in varying.items()})
         part._varying = varying
         return part
@@ -103,12 +103,12 @@ class TakesFields(Component):
         return {name for name, field in cls.model_fields.items() if field.annotation is float}
 
     @classmethod
-    def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Varying]) -> None:
+    def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Varying], context: Any) -> None:
         """Validates with the values of each place that is told apart."""
         for label in dict.fromkeys(label for field in varying.values() for label in field.samples):
             here = {n: field.samples.get(label, _first(field)) for n, field in varying.items()}
             try:
-                cls.model_validate(data | here)
+                cls.model_validate(data | here, context=context)
             except ValidationError as error:
                 for fault in error.errors(include_url=False):
                     name = next((w for w in fault["loc"] if w in here), None)

@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces.component import Pair
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.neighbour_metric import Slot
+from pbdkit.interfaces.units import Place
 from pbdkit.interfaces.values import Remembers
 
-Segment = tuple[Pair, Pair]
+Segment = tuple[Place, Place]
 """A straight crack, from one point to another (lattice units)."""
 
 

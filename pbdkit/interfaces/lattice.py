@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from pbdkit.interfaces.component import Component, Pair
+from pbdkit.interfaces.component import Component
+from pbdkit.interfaces.units import Place
 from pbdkit.interfaces.vector import Components, Vector, vector
 
 Index = tuple[int, ...]
@@ -156,7 +157,7 @@ class Lattice(Component):
     To add a lattice, write `cell`. A site has an integer index (i, j); (0, 0) lies at `origin`.
     """
 
-    origin: Pair = Field((0.0, 0.0), description="Where site (0, 0) lies (lattice units).")
+    origin: Place = Field((0.0, 0.0), description="Where site (0, 0) lies (lattice units).")
 
     @abstractmethod
     def cell(self) -> Cell:

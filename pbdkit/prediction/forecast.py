@@ -10,6 +10,7 @@ import numpy as np
 from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
+from pbdkit.interfaces.units import LENGTH
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.leader_groups import kinds_at
@@ -27,8 +28,9 @@ class Forecast:
     memory, the period in steps of the slowest mode that swings and by what it shrinks a step, None
     where nothing swings; by how much the body trails its equilibrium in the leaders' fastest steps,
     in lattice units, once that is steady and when these steps end, None where no leader moves
-    steadily; whether what the analysis found is exact, or linearised at the start; whether it is
-    estimated, 1 - ρ to 1 %; warnings."""
+    steadily; how far the body's particles reach along each axis, in mm, None without `units`;
+    whether what the analysis found is exact, or linearised at the start; whether it is estimated,
+    1 - ρ to 1 %; warnings."""
 
     particles: int
     followers: int
@@ -48,6 +50,7 @@ class Forecast:
     estimated: bool
     lag: float | None
     lag_reached: float | None
+    size_mm: tuple[float, ...] | None
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
@@ -80,9 +83,17 @@ def forecast(scene: Scene) -> Forecast:
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
+        size_mm=_size_mm(scene),
         warnings=[*_doubts(scene), *analysis.warnings(), *waves],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
+
+
+def _size_mm(scene: Scene) -> tuple[float, ...] | None:
+    if (units := scene.experiment.units) is None:
+        return None
+    body = scene.raster.reference(scene.raster.body_rows)
+    return tuple((np.ptp(body, axis=0) * units.scale(LENGTH)).tolist())
 
 
 def _sizes(analysis: Analysis) -> Sizes:

@@ -15,6 +15,7 @@ from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageEr
 from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
+from pbdkit.results.physical import in_physical_units
 from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
@@ -183,3 +184,8 @@ class PbdAccessor:
             assert whole is not None
             return whole
         return picture.draw(self._dataset, [time], ax=ax, **look)[0]
+
+    def physical(self) -> xarray.Dataset:
+        """The dataset in mm, mm² and, of stresses, forces and energies, MPa, N and mJ, as far as
+        variables say their scale: those of experiments with `units`."""
+        return in_physical_units(self._dataset)

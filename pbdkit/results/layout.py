@@ -13,6 +13,7 @@ import numpy as np
 
 from pbdkit.experiment.schema import DIALECT
 from pbdkit.interfaces import Component, Diagnostic, Remembered, Variable
+from pbdkit.interfaces.units import LENGTH, QUANTITIES
 from pbdkit.registry.registry import Registry
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
@@ -23,7 +24,6 @@ ATTRIBUTES = (
     "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
     "prediction", "status", "stop_reason", "created",
 )  # fmt: skip
-LENGTH = "lattice unit"
 
 
 Values = dict[str, Any]
@@ -85,8 +85,8 @@ def base_columns() -> list[Column]:
         Column("number", (each,), "i8", at, number, coordinate=True),
         coordinate("axis", "coordinate axis", "str"),
         Column("site", (each, "index"), "i4", at, "lattice index (i, j)"),
-        Column("reference", (each, "axis"), "f8", at, "reference position X", LENGTH),
-        Column("position", ("time", each, "axis"), "f8", on, "position x", LENGTH),
+        Column("reference", (each, "axis"), "f8", at, "reference position X", LENGTH.lattice),
+        Column("position", ("time", each, "axis"), "f8", on, "position x", LENGTH.lattice),
         Column("kind", ("time", each), "i1", on, role, more=flags),
     ]
 
@@ -179,6 +179,8 @@ def _columns_of(diagnostic: type[Component]) -> list[Column]:
 def _schema_of(column: Column) -> dict[str, Any]:
     said = {k: v for k, v in column.attributes.items() if not isinstance(v, np.ndarray)}
     attributes = {name: {"const": value} for name, value in said.items()}
+    if (quantity := QUANTITIES.get(column.units)) and quantity.youngs_modulus:
+        attributes["units"] = {"enum": [column.units, quantity.unit]}
     parts = {"dims": {"const": list(column.dims)}, "attrs": _object(attributes, sorted(attributes))}
     if column.dtype != "str":
         parts["dtype"] = {"const": np.dtype(column.dtype).name}

@@ -12,6 +12,7 @@ from pbdkit.interfaces import Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values, When
+from pbdkit.results.physical import Physical
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 
@@ -25,6 +26,7 @@ class Measured:
         particles_change = isinstance(experiment.rule, RenewsParticles)
         self._scene = scene
         self._diagnostics = experiment.diagnostics
+        self.physical = Physical(experiment.units)
         numbers = [
             *((n, "bond", bonds_change) for n in bond_numbers(experiment)),
             *((n, "particle", particles_change) for n in particle_numbers(experiment)),
@@ -66,7 +68,7 @@ class Measured:
                 _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
             columns += [layout.coordinate(n, n, v.dtype.str[1:]) for n, v in own.items()]
             known = {*self.sizes, "time", "step", diagnostic.own_dimension}
-            for variable in diagnostic.variables():
+            for variable, _ in self.physical.scaled(diagnostic):
                 _refuse_taken(variable.name, taken, f"{whose} the variable '{variable.name}'")
                 if unknown := [dim for dim in variable.dims if dim not in known]:
                     raise PluginError(
@@ -105,7 +107,9 @@ class Measured:
             sizes, own = dict(self.sizes), diagnostic.own_dimension
             with blaming(diagnostic, told, "diagnostics", n):
                 found = diagnostic.measure(now)
-                for variable, value in zip(diagnostic.variables(), found, strict=True):
+                for (variable, factor), value in zip(
+                    self.physical.scaled(diagnostic), found, strict=True
+                ):
                     if own in variable.dims and np.ndim(value) == len(variable.dims):
                         # The first variable that has it gives its length, the others keep to it.
                         sizes.setdefault(own, np.shape(value)[variable.dims.index(own)])
@@ -116,7 +120,9 @@ class Measured:
                         )
                     if when is not When.END:
                         _refuse_infinite(variable, value, now)
-                    values[variable.name] = np.array(value)
+                    values[variable.name] = (
+                        np.array(value) if factor == 1.0 else np.multiply(value, factor)
+                    )
         return values
 
 

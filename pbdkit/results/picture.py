@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.errors import ExperimentError
-from pbdkit.results.snapshot import Snapshot, label, plain, take_snapshots, variable_label
+from pbdkit.results.snapshot import (
+    Snapshot,
+    counted_in,
+    label,
+    plain,
+    take_snapshots,
+    variable_label,
+)
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 if TYPE_CHECKING:
@@ -149,7 +156,7 @@ def _paint(ax: Axes, dataset: xarray.Dataset, now: Snapshot, look: Look) -> None
     """One configuration in one pair of axes, without title and legend."""
     from matplotlib.collections import LineCollection
 
-    (left, right, bottom, top), units = look.box, dataset["position"].attrs.get("units", "")
+    (left, right, bottom, top), units = look.box, counted_in(dataset["position"].attrs)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal",
            xlabel=label("x", units), ylabel=label("y", units))  # fmt: skip
     inches = ax.bbox.transformed(ax.figure.dpi_scale_trans.inverted())

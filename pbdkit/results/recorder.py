@@ -16,6 +16,7 @@ from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.results.measured import Measured
 from pbdkit.results.moment import StateMoment
+from pbdkit.results.physical import Twins
 from pbdkit.results.sink import Sink
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
@@ -46,6 +47,8 @@ class Recorder:
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
         self._tables, self._measured = Tables(scene), Measured(scene)
+        self._columns = columns_of(scene)
+        self._twins = Twins(self._columns)
         self.seen = Seen()
         self.warnings: tuple[str, ...] = ()
 
@@ -54,8 +57,8 @@ class Recorder:
         it the `history` of a run that is gone on with."""
         steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
         planned = {"time": recording.count(steps), "step": steps + 1}
-        self.sink.begin(columns_of(self._scene), self._measured.sizes, planned)
-        for values in self._known() if history is None else history:
+        self.sink.begin(self._columns, self._measured.sizes, planned)
+        for values in map(self._twins.beside, self._known()) if history is None else history:
             self.sink.put(values)
 
     def _known(self) -> Iterator[Values]:
@@ -96,7 +99,7 @@ class Recorder:
         if self._measured.every_step and stepped and not last:
             values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
         if values:
-            self.sink.put(values)
+            self.sink.put(self._twins.beside(values))
         self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
 
     def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
@@ -111,7 +114,7 @@ class Recorder:
             steps, strains = moment.broken_step(), moment.broken_strain()
             self.sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
-            self.sink.put(self._measured.diagnosed(When.END, moment))
+            self.sink.put(self._twins.beside(self._measured.diagnosed(When.END, moment)))
         self.sink.finish(self._attributes(outcome, prediction))
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
@@ -140,7 +143,8 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.shows_leaders,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
-    columns = [*layout.base_columns(), *some, *measured.columns()]
+    all_of_them = [*layout.base_columns(), *some, *measured.columns()]
+    columns = measured.physical.columns(all_of_them)
     if scene.experiment.record.dtype == "float64":
         return columns
     return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]

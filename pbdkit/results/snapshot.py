@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +78,15 @@ def variable_label(dataset: xarray.Dataset, name: str) -> str:
     attributes = dataset[name].attrs
     meaning = attributes.get("long_name", name)
     vector = "axis" in dataset[name].dims
-    return label(f"length of {meaning}" if vector else meaning, attributes.get("units", ""))
+    return label(f"length of {meaning}" if vector else meaning, counted_in(attributes))
+
+
+def counted_in(attributes: Mapping[Any, Any]) -> str:
+    """The units of a variable, those of the lattice with what they are."""
+    units = str(attributes.get("units", ""))
+    if "physical_factor" not in attributes:
+        return units
+    return f"{units} of {attributes['physical_factor']:g} {attributes['physical_units']}"
 
 
 def plain(text: object) -> str:

@@ -60,8 +60,8 @@ def weighed(
     share = cells.share if cells else None
     if share is not None:
         weight *= share
-        for planes in mixed.values():
-            planes *= share
+        for of_name in mixed.values():
+            of_name *= share
     used = [name for name, planes in mixed.items() if planes.any()]
     slots = [slot for own in setting.slots for slot in own]
     weights = tuple(_weights(experiment, setting, slots, name) for name in used)

@@ -11,6 +11,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.units import LENGTH
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
@@ -93,7 +94,13 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     each_time, every_step = 2 * recorded + 1.0, 0
-    once = 2 * 8 + 2 * 4 + 2 * 8 + experiment.shows_bonds * planes * (17 + 12 * fracture.can_break)
+    once = (
+        (1 + bool(experiment.units)) * 2 * 8
+        + 2 * 8
+        + 2 * 4
+        + 2 * 8
+        + experiment.shows_bonds * planes * (17 + 12 * fracture.can_break)
+    )
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
     of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
     for numbers, owners, renews in (of_bonds, of_particles):
@@ -104,7 +111,7 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
                 once += owners * _bytes_of(number.dtype, 8)
     per_record = math.ceil(particles * each_time)
     for diagnostic in (d for d in experiment.diagnostics if not d.at_end):
-        entry = _bytes_an_entry(diagnostic, particles, recorded)
+        entry = _bytes_an_entry(diagnostic, particles, recorded, in_mm=bool(experiment.units))
         if diagnostic.every_step:
             every_step += entry
         else:
@@ -136,10 +143,13 @@ def _bytes_of(dtype: str, value: int) -> int:
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
-def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int) -> int:
+def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool) -> int:
+    """With `in_mm` lengths stand there twice."""
     sizes = {"particle": particles, "axis": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     return sum(
-        math.prod(sizes.get(dim, 1) for dim in v.dims) * _bytes_of(v.dtype, recorded)
+        (1 + (in_mm and v.units == LENGTH.lattice))
+        * math.prod(sizes.get(dim, 1) for dim in v.dims)
+        * _bytes_of(v.dtype, recorded)
         for v in diagnostic.variables()
     )

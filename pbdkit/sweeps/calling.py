@@ -35,7 +35,7 @@ def called(
     progress: bool,
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
-    data = experiment.model_dump(mode="json", by_alias=True)
+    data = experiment.as_written()
     given = _given(experiment)
     if given and folder is not None:
         raise ExperimentError(

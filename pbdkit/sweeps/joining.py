@@ -75,6 +75,8 @@ class _Frame:
         self._members += 1
         for name, variable in variables.items():
             first, kind = self._first.setdefault(name, variable), variable.values.dtype
+            for key in [k for k in first.attributes if not _alike(k, first, variable)]:
+                del first.attributes[key]  # it does not hold of all
             if variable.dims != first.dims:
                 raise ExperimentError(
                     f"'{name}' has the dimensions {variable.dims} in some members and {first.dims} "
@@ -140,6 +142,10 @@ class _Frame:
         seen = self._seen.get(name, [])
         alike = len(set(seen)) == 1 and len(seen) == self._members
         return name not in self._labels and not alike
+
+
+def _alike(said: str, one: Variable, other: Variable) -> bool:
+    return said in other.attributes and np.array_equal(one.attributes[said], other.attributes[said])
 
 
 def _digest(variable: Variable) -> bytes:

@@ -17,6 +17,7 @@ from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.results.layout import reserved_names
+from pbdkit.results.physical import IN_MM
 from pbdkit.sweeps.grid import Dimension, Setting, dimensions, places, words
 from pbdkit.sweeps.specification import Keep, Sweep
 
@@ -104,12 +105,12 @@ def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
         kept = sorted({step for step in wanted if step <= steps}) or [0]
         data["record"] = {k: v for k, v in data["record"].items() if k != "every"} | {"at": kept}
     if keep.variables is not None:
+        asked = {name for kept in keep.variables for name in (kept, kept.removesuffix(IN_MM))}
         measured = zip(experiment.diagnostics, data["diagnostics"], strict=True)
         data["diagnostics"] = [
             part
             for diagnostic, part in measured
-            if "bonds" in diagnostic.needs
-            or {v.name for v in diagnostic.variables()} & {*keep.variables}
+            if "bonds" in diagnostic.needs or {v.name for v in diagnostic.variables()} & asked
         ]
     if data["solver"].get("threads") == "auto":
         data["solver"]["threads"] = 1

@@ -19,7 +19,7 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.sweeps.member import named
 from pbdkit.sweeps.specification import Keep
 
-SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics")
+SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics", "units")
 """The parts of an experiment on which the shape of its dataset depends, besides its times."""
 SHARE = 0.5
 """Of the memory of this machine that the dataset of a sweep may take."""
@@ -61,7 +61,7 @@ class Outlook:
         steps, recording = experiment.steps, experiment.recording
         self._times.add((steps, recording.at, recording.every))
         data = experiment.model_dump(mode="json", by_alias=True)
-        shape = json.dumps([data[part] for part in SHAPING])
+        shape = json.dumps([data.get(part) for part in SHAPING])
         if shape in self._seen:
             return
         self._seen.add(shape)

@@ -1,0 +1,225 @@
+"""Units: what the lattice's own units are outside, and which numbers can be written with one."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic_core import PydanticCustomError, core_schema
+
+from pbdkit.interfaces.component import Component, Strict
+
+NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
+WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"
+TEXT = re.compile(rf"\s*({NUMBER})\s*([^\W\d].*?)\s*", re.DOTALL)
+"""A number and what follows it; of units only words, products and quotients are taken, with small
+exponents, as a tower of exponents could take for ever."""
+UNIT = re.compile(rf"{WORD}(?:(?:\s*[*/]\s*|\s+){WORD}){{0,5}}")
+PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*[A-Za-zµμ°Å].*$"
+LONGEST = 60
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number that is counted in lattice units, and can be written with a unit where the
+    experiment has `units`.
+
+    It annotates a parameter: ``a: Annotated[float, Field(gt=0.0), LENGTH]``. `lattice` is what it
+    is counted in, as variables of the dataset say it: of the lattice's length L, Young's modulus E
+    and thickness t, L^length · E^youngs_modulus · t^thickness; `unit` is the same of mm and MPa.
+    """
+
+    meaning: str
+    lattice: str
+    unit: str
+    length: int = 0
+    youngs_modulus: int = 0
+    thickness: int = 0
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.with_info_before_validator_function(self._number, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return _or_text(handler(schema))
+
+    def _number(self, value: Any, info: ValidationInfo) -> Any:
+        """The number of lattice units; what is no number with a unit stays as it is."""
+        if not isinstance(value, str) or not TEXT.fullmatch(value):
+            return value
+        return magnitude(value, self.unit, self.meaning) / _units(value, info).scale(self)
+
+
+LENGTH = Quantity("length", "lattice unit", "mm", length=1)
+AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
+STRESS = Quantity("stress", "unit of youngs_modulus", "MPa", youngs_modulus=1)
+FORCE = Quantity(
+    "force", "unit of youngs_modulus * unit of thickness * lattice unit", "N",
+    length=1, youngs_modulus=1, thickness=1,
+)  # fmt: skip
+ENERGY = Quantity(
+    "energy", "unit of youngs_modulus * unit of thickness * lattice unit^2", "mJ",
+    length=2, youngs_modulus=1, thickness=1,
+)  # fmt: skip
+QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, FORCE, ENERGY)}
+"""By what they are counted in."""
+
+Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
+"""Two lengths, (x, y); an experiment file writes them as a list of two."""
+
+
+def _positive(unit: str, meaning: str) -> BeforeValidator:
+    """A text that stands for a positive quantity."""
+
+    def look(value: Any) -> Any:
+        if not isinstance(value, str) or not TEXT.fullmatch(value):
+            raise _fault(f"expected a {meaning} with its unit, as in 1 {unit}, got {value!r:.50}")
+        if not 0.0 < (found := magnitude(value, unit, meaning)) < math.inf:
+            raise _fault(f"should be greater than 0 and finite, got {found:g} {unit}")
+        return value
+
+    return BeforeValidator(look)
+
+
+class Units(Strict):
+    """What the lattice's own units are: a lattice unit of length, Young's modulus, the thickness of
+    the body. Numbers in the experiment stay in lattice units; lengths may be written with a unit.
+
+    Results carry mm, MPa and N. Read with pint (the extra `units`).
+    """
+
+    length: Annotated[str, _positive("mm", "length")] = Field(
+        description="A lattice unit of length.", examples=["0.25 mm"]
+    )
+    youngs_modulus: Annotated[str, _positive("MPa", "stress")] | None = Field(
+        None, description="Young's modulus; needed for stresses and forces.", examples=["206 GPa"]
+    )
+    thickness: Annotated[str, _positive("mm", "length")] | None = Field(
+        None, description="Of the body, out of its plane; needed for forces.", examples=["3.05 mm"]
+    )
+
+    def value(self, name: str) -> float | None:
+        """One of them in mm or MPa; None where it is not given."""
+        text = getattr(self, name)
+        unit, meaning = ("MPa", "stress") if name == "youngs_modulus" else ("mm", "length")
+        return None if text is None else magnitude(text, unit, meaning)
+
+    def lacks(self, quantity: Quantity) -> list[str]:
+        """What the quantity would need besides."""
+        return [n for n in type(self).model_fields if getattr(quantity, n) and not getattr(self, n)]
+
+    def scale(self, quantity: Quantity) -> float:
+        """What 1 of the lattice's is in the quantity's unit. Raises PydanticCustomError where a
+        part of `units` is missing."""
+        if lacking := self.lacks(quantity):
+            raise _fault(f"a {quantity.meaning} needs units.{lacking[0]}, which is missing")
+        powers = {name: getattr(quantity, name) for name in type(self).model_fields}
+        scale: float = math.prod(
+            (self.value(n) or 0.0) ** power for n, power in powers.items() if power
+        )
+        return scale
+
+
+class Scales(Strict):
+    """Where an experiment's `units` are looked at before the rest of it, which is read by them."""
+
+    units: Units | None = None
+
+
+@dataclass(frozen=True)
+class FromUnits:
+    """Annotates a parameter of diagnostics that `units` gives: `youngs_modulus` in MPa, `thickness`
+    in mm. Where neither says it, it is `otherwise`, or missing. The field's default is `unset`."""
+
+    name: str
+    otherwise: float | None = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.with_info_before_validator_function(self._given, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return _or_text(handler(schema))
+
+    def _given(self, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, str) and TEXT.fullmatch(value):
+            unit = ("MPa", "stress") if self.name == "youngs_modulus" else ("mm", "length")
+            _units(value, info)
+            return magnitude(value, *unit)
+        if value is not None:
+            return value
+        units: Units | None = (info.context or {}).get("units")
+        found = self.otherwise if units is None else units.value(self.name)
+        if found is None:
+            raise _fault(f"is missing; give it here, or as units.{self.name}")
+        return found
+
+
+def unset() -> Any:
+    """The default of what `units` may give."""
+    return None
+
+
+def given_by_units(part: Component) -> list[str]:
+    """The parameters of a part that `units` gives."""
+    fields = type(part).model_fields.items()
+    return [n for n, field in fields if any(isinstance(m, FromUnits) for m in field.metadata)]
+
+
+def of_one_material(part: Component, info: ValidationInfo) -> Component:
+    """The part; PydanticCustomError where `units` says another modulus or thickness than it does
+    itself: which of them holds nobody could tell."""
+    units: Units | None = (info.context or {}).get("units")
+    for name in given_by_units(part) if units else ():
+        said, own = units.value(name) if units else None, getattr(part, name)
+        if said is not None and not math.isclose(said, own):
+            text = f"{own:g} is not the {said:g} of units.{name}; leave it out here"
+            raise PydanticCustomError("clash", "{text}", {"text": text, "key": name})
+    return part
+
+
+def magnitude(text: str, unit: str, meaning: str) -> float:
+    """The number of that unit. Raises PydanticCustomError for what is none, and without pint."""
+    found = TEXT.fullmatch(text)
+    number, given = found.groups() if found else (text, "")
+    if len(text) > LONGEST or not UNIT.fullmatch(given):
+        raise _fault(f"{text[:LONGEST]!r} is no number with a unit, as in 1 {unit}")
+    pint, registry = _registry()
+    try:
+        return float(registry.Quantity(float(number), registry.parse_units(given)).m_as(unit))
+    except pint.UndefinedUnitError:
+        raise _fault(
+            f"'{text}': nobody knows the unit '{given}'; write for instance {unit}"
+        ) from None
+    except (pint.PintError, ArithmeticError, ValueError):
+        raise _fault(f"'{text}' is no {meaning}; write for instance {unit}") from None
+
+
+@cache
+def _registry() -> Any:
+    """pint and its units; nothing of it is there where no experiment has units."""
+    try:
+        import pint
+    except ImportError:
+        raise _fault("units are read with pint: pip install 'pbdkit[units]'") from None
+    return pint, pint.UnitRegistry()
+
+
+def _units(text: str, info: ValidationInfo) -> Units:
+    units: Units | None = (info.context or {}).get("units")
+    if units is None:
+        raise _fault(
+            f"'{text[:LONGEST]}' names a unit, and nothing says what a lattice unit is: add for "
+            "instance units: {length: 0.25 mm}, or write a number of lattice units"
+        )
+    return units
+
+
+def _or_text(number: dict[str, Any]) -> dict[str, Any]:
+    return {"anyOf": [number, {"type": "string", "pattern": PATTERN}]}
+
+
+def _fault(text: str) -> PydanticCustomError:
+    return PydanticCustomError("units", "{text}", {"text": text})

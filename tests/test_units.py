@@ -1,0 +1,269 @@
+"""Units: inputs that name one, results in mm, MPa and N, the lattice's own numbers as they were."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jsonschema
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.experiment.schema import experiment_schema
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import units as units_module
+from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Units
+from pbdkit.registry.registry import Registry
+from pbdkit.results.layout import dataset_schema
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.snapshot import counted_in
+from pbdkit.runs.course import Run, record
+from pbdkit.scene.scene import build_scene
+
+UNITS = {"length": "0.25 mm", "youngs_modulus": "206 GPa", "thickness": "3.05 mm"}
+BAR: dict[str, Any] = {
+    "name": "bar",
+    "units": UNITS,
+    "lattice": {"type": "square", "a": "0.5 mm"},
+    "body": {"type": "rectangle", "width": "4 mm", "height": "0.2 cm"},
+    "neighbours": {"type": "chebyshev"},
+    "rule": {"type": "elastic", "poisson_ratio": 0.0},
+    "frame": {"type": "natural"},
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+        {
+            "select": {"edge": "right"},
+            "motion": {"type": "displace", "displacement": ["4 µm", 0.0]},
+        },
+    ],
+    "steps": 1,
+    "solver": {"type": "equilibrium"},
+    "diagnostics": [
+        {"type": "displacement"},
+        {"type": "stress"},
+        {"type": "reaction"},
+        {"type": "strain-energy"},
+        {"type": "pe1"},
+        {"type": "track", "numbers": [3]},
+    ],
+}
+STEPPED = {k: v for k, v in BAR.items() if k not in ("solver", "steps")}
+
+
+def run(given: dict[str, Any], **changes: Any) -> Any:
+    return pbdkit.run(given | changes, progress=False)
+
+
+def changed(**parts: Any) -> dict[str, Any]:
+    """The bar with parts replaced; None leaves one out."""
+    return {key: value for key, value in (BAR | parts).items() if value is not None}
+
+
+@pytest.fixture(scope="module")
+def bar() -> Any:
+    return run(BAR)
+
+
+def test_a_bar_has_the_stress_the_force_and_the_energy_of_the_textbook(bar: Any) -> None:
+    """Without Poisson's effect: ε = 1e-3, σ = E ε, N = σ w t, W = N Δ / 2."""
+    last = bar.isel(time=-1)
+    assert last.stress_xx.values == pytest.approx(206.0, rel=1e-9)
+    assert last.reaction.values[1, 0] == pytest.approx(206.0 * 2.0 * 3.05, rel=1e-9)
+    assert last.strain_energy.item() == pytest.approx(206.0 * 2.0 * 3.05 * 4e-3 / 2, rel=1e-9)
+    assert last.u_mm.values[:, 0] == pytest.approx(1e-3 * last.reference_mm.values[:, 0], abs=1e-12)
+    units = {name: bar[name].units for name in ("stress_xx", "reaction", "strain_energy", "u_mm")}
+    assert [*units.values()] == ["MPa", "N", "mJ", "mm"]
+
+
+def test_the_shipped_strip_gives_back_its_modulus_and_its_force() -> None:
+    ds = run(json.loads(pbdkit.load("modelling/strip").model_dump_json())).isel(time=-1)
+    stress = ds.nominal_stress.item()
+    assert stress / ds.nominal_strain.item() == pytest.approx(206e3, rel=1e-6)
+    assert ds.reaction.values[1, 0] == pytest.approx(stress * 12.5 * 3.05, rel=1e-12)
+    middle = np.isclose(ds.reference_mm.values[:, 0], 50.0)
+    assert ds.stress_xx.values[middle] == pytest.approx(stress, rel=1e-6)
+
+
+def test_numbers_of_the_lattice_are_those_without_units_to_the_bit(bar: Any) -> None:
+    plain = json.loads(pbdkit.Experiment(**BAR).model_dump_json())
+    del plain["units"]
+    moduli = {"youngs_modulus": 206e3}, {"youngs_modulus": 206e3, "thickness": 3.05}
+    given = dict(zip(("stress", "reaction", "strain-energy"), (*moduli, moduli[1]), strict=True))
+    plain["diagnostics"] = [d | given.get(d["type"], {}) for d in plain["diagnostics"]]
+    other = run(plain)
+    assert {*bar.variables} - {*other.variables} == {"reference_mm", "u_mm", "track_mm"}
+    for name in {*other.variables} - {"reaction", "strain_energy"}:
+        np.testing.assert_array_equal(bar[name], other[name])
+    np.testing.assert_array_equal(bar.reaction, 0.25 * other.reaction)
+    assert "units" not in json.loads(other.experiment)
+    assert "physical_factor" not in other.position.attrs
+
+
+def test_variables_say_both_scales(bar: Any) -> None:
+    assert bar.position.attrs["units"] == "lattice unit"
+    said = bar.pe1.attrs
+    assert (said["physical_units"], said["physical_factor"]) == ("mm^2", 0.0625)
+    assert counted_in(bar.position.attrs) == "lattice unit of 0.25 mm"
+    own = bar.reaction.attrs
+    assert own["lattice_units"] == "youngs_modulus * thickness * lattice unit"
+    assert own["lattice_factor"] == pytest.approx(1 / (206e3 * 3.05 * 0.25))
+    jsonschema.validate(bar.to_dict(data=False), dataset_schema(Registry()))
+
+
+def test_the_accessor_turns_all_that_says_its_scale(bar: Any) -> None:
+    physical = bar.pbd.physical()
+    assert physical.position.units == "mm"
+    np.testing.assert_array_equal(physical.position, 0.25 * bar.position)
+    np.testing.assert_array_equal(physical.u, bar.u_mm)
+    np.testing.assert_array_equal(physical.reaction, bar.reaction)
+    assert "u_mm" not in physical
+    assert {*physical.coords} == {*bar.coords}
+
+
+def test_a_dataset_runs_again_and_records_in_single_precision(bar: Any) -> None:
+    assert pbdkit.rerun(bar, progress=False).equals(bar)
+    single = run(BAR, record={"dtype": "float32"})
+    assert single.u_mm.dtype == np.float32
+    assert single.reference_mm.dtype == np.float64
+
+
+def test_a_file_is_continued_to_the_bit(tmp_path: Any) -> None:
+    def made(steps: int) -> Any:
+        path, scene = (
+            tmp_path / f"{steps}.nc",
+            build_scene(pbdkit.Experiment(**STEPPED, steps=steps)),
+        )
+        record(Run(scene), NetcdfSink(path))
+        return path
+
+    with pbdkit.resume(made(2), steps=4, progress=False) as ds, pbdkit.open(made(4)) as whole:
+        assert ds.equals(whole)
+        assert ds.u_mm.equals(0.25 * ds.u)
+
+
+def test_check_says_how_large_the_body_is(call: Any) -> None:
+    Path("bar.json").write_text(json.dumps(BAR))
+    assert "size       4 × 2 mm" in call("check", "bar.json").out
+    assert json.loads(call("check", "bar.json", "--json").out)["size_mm"] == [4.0, 2.0]
+
+
+def test_a_sweep_over_the_lattice_unit_refines_what_is_written_in_mm() -> None:
+    vary = {"units.length": ["0.25 mm", "0.5 mm"], "units.youngs_modulus": ["206 GPa", "70 GPa"]}
+    bar = changed(lattice={"type": "square", "a": 2.0}, diagnostics=BAR["diagnostics"][:3])
+    ds = pbdkit.sweep(bar, vary, keep={"times": "last"}, workers=1, progress=False).isel(time=-1)
+    force = ds.reaction.isel(leader_group=1, axis=0)
+    assert force.values == pytest.approx(2 * 3.05 * np.array([[206.0, 70.0]] * 2))
+    assert ds.u_mm.max("particle").values[..., 0] == pytest.approx(np.full((2, 2), 4e-3))
+    assert "physical_factor" not in ds.position.attrs  # the scale differs from member to member
+    assert ds.position.attrs["physical_units"] == "mm"
+
+
+def test_a_sweep_of_an_experiment_in_lattice_units_changes_the_scale_alone() -> None:
+    numbers = pbdkit.Experiment(**json.loads(pbdkit.Experiment(**BAR).model_dump_json()))
+    vary = {"units.youngs_modulus": ["206 GPa", "103 GPa"]}
+    kept = {"times": "last", "variables": ["u_mm", "stress_xx"]}
+    ds = pbdkit.sweep(numbers, vary, keep=kept, workers=1, progress=False).isel(time=-1)
+    assert ds.stress_xx.mean("particle").values == pytest.approx([206.0, 103.0])
+    assert {*ds.data_vars} == {"u_mm", "stress_xx", "status", "message"}
+
+
+@pytest.mark.parametrize(
+    ("quantity", "text", "number"),
+    [
+        (LENGTH, "5 mm", 20.0),
+        (LENGTH, "1e-3 m", 4.0),
+        (AREA, "1 mm²", 16.0),
+        (STRESS, "206 N/mm**2", 1e-3),
+        (FORCE, "1 kN", 1e3 / (206e3 * 3.05 * 0.25)),
+        (ENERGY, "2 N mm", 2 / (206e3 * 3.05 * 0.0625)),
+    ],
+)
+def test_a_component_of_anybody_takes_units(quantity: Any, text: str, number: float) -> None:
+    class Pulled(pbdkit.FollowerRule):
+        type: Literal["pulled"] = "pulled"
+        by: Annotated[float, quantity]
+
+        @staticmethod
+        def gather(d: Any, r: Any, w: Any, p: Any) -> Any:
+            return (d,)
+
+        @staticmethod
+        def apply(sums: Any, here: Any, p: Any) -> Any:
+            return p.by * sums[0]
+
+    for given in (text, number):
+        parts = changed(rule={"type": "pulled", "by": given}, diagnostics=[], frame=None)
+        made = pbdkit.Experiment.build(Source(data=parts), [Pulled])
+        assert made.rule.by == pytest.approx(number, rel=1e-14)  # type: ignore[attr-defined]
+
+
+SHIFTED = {"type": "affine", "gradient": [["1 mm", 0.0], [0.0, 0.0]]}
+STRESS_OF = [{"type": "stress", "youngs_modulus": 70e3}]
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"units": None}, "lattice.a: '0.5 mm' names a unit, and nothing says what a lattice unit"),
+        ({"units": {"length": 0.25}}, "units.length: expected a length with its unit, as in 1 mm"),
+        ({"units": {"length": "0 mm"}}, "units.length: should be greater than 0 and finite"),
+        ({"units": {"length": "3 kg"}}, "units.length: '3 kg' is no length; write for instance mm"),
+        ({"units": {"length": "3 mn"}}, "units.length: '3 mn': nobody knows the unit 'mn'"),
+        ({"units": {"length": "3 mm**9**9**9"}}, "units.length: '3 mm**9**9**9' is no number with"),
+        ({"units": {"lenght": "3 mm"}}, "units.lenght: unknown key; did you mean 'length'?"),
+        ({"units": UNITS | {"thickness": "2 GPa"}}, "units.thickness: '2 GPa' is no length"),
+        ({"lattice": {"type": "square", "a": "2 s"}}, "lattice.a: '2 s' is no length"),
+        ({"lattice": {"type": "square", "a": "2"}}, "lattice.a: should be a valid number, got '2'"),
+        ({"lattice": {"type": "square", "a": "-1 mm"}}, "lattice.a: should be greater than"),
+        ({"initial": SHIFTED}, "got '1 mm'; this takes a plain number, and no unit"),
+        (
+            {"units": {"length": "1 mm"}},
+            "diagnostics.1.youngs_modulus: is missing; give it here, or",
+        ),
+        (
+            {"units": {"length": "1 mm", "youngs_modulus": "1 GPa"}},
+            "diagnostics.2.thickness: is missing; give it here, or as units.thickness",
+        ),
+        ({"diagnostics": STRESS_OF}, "70000 is not the 206000 of units.youngs_modulus; leave it"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        pbdkit.Experiment(**changed(**parts))
+    assert message in str(caught.value)
+
+
+def test_a_diagnostics_own_modulus_counts_where_units_say_none() -> None:
+    ds = run(changed(units={"length": "0.25 mm"}, diagnostics=STRESS_OF))
+    assert ds.stress_xx.attrs["units"] == "unit of youngs_modulus"
+    assert ds.stress_xx.isel(time=-1).values == pytest.approx(70.0)
+
+
+def test_a_force_needs_a_modulus() -> None:
+    with pytest.raises(ValueError, match=r"a force needs units.youngs_modulus, which is missing"):
+        Units(length="1 mm").scale(FORCE)
+
+
+def test_the_schema_takes_numbers_and_texts() -> None:
+    schema = experiment_schema(Registry(), installed=False)
+    jsonschema.validate(BAR, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(changed(lattice={"type": "square", "a": "mm"}), schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(changed(lattice={"type": "square", "a": -1.0}), schema)
+
+
+def test_without_pint_it_is_said_what_to_install(monkeypatch: Any) -> None:
+    units_module._registry.cache_clear()
+    monkeypatch.setitem(sys.modules, "pint", None)
+    with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[units\]'"):
+        pbdkit.Experiment(**BAR)
+
+
+def test_pint_is_imported_where_an_experiment_has_units_only() -> None:
+    look = "import sys, pbdkit; pbdkit.load('{}'); print('pint' in sys.modules)"
+    for name, there in (("material/bar", "False"), ("modelling/strip", "True")):
+        command = [sys.executable, "-c", look.format(name)]
+        assert subprocess.run(command, capture_output=True, text=True).stdout.strip() == there
