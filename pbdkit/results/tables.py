@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Stiffness
-from pbdkit.scene.cell_materials import phases_of_particles, stiffness_of_particles
+from pbdkit.scene.particle_materials import phases_of_particles, stiffness_of_particles
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers

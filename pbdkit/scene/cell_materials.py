@@ -47,7 +47,7 @@ def weighed(
     _refuse_unmixable(experiment)
     shape = (1 + max(p.kind for p in setting.cells.polygons), *raster.shape)
     weight, mixed = np.ones(shape), {name: np.zeros(shape) for name in PLACES}
-    phase = np.zeros(shape, np.int64) if _regions_of(experiment) else None
+    phase = np.zeros(shape, np.int64) if regions_of(experiment) else None
     for polygon in setting.cells.polygons:
         if some := _Cells.of(experiment, raster, polygon):
             factor, stiffness = some.materials()
@@ -69,28 +69,7 @@ def weighed(
     return WeighedCells(setting.cells, share, weight, planes, weights, phase)
 
 
-def stiffness_of_particles(experiment: Experiment, raster: Raster) -> Stiffness | None:
-    """The stiffness over Young's modulus at each particle, (particle,) a component; that of the
-    rule where it is one."""
-    rule = experiment.rule
-    if not (rule.varying and rule.uses_cells):
-        return material_of(rule)
-    x, y = raster.reference().T
-    values = values_at(experiment, "rule", x, y, raster.table_kind == FOLLOWER)
-    matrices = _stiffness(experiment, values)
-    return Stiffness(**{name: matrices[(slice(None), *at)] for name, at in PLACES.items()})
-
-
-def phases_of_particles(experiment: Experiment, raster: Raster) -> NDArray[np.int64]:
-    """(particle,): which regions of the rule's hold each, a bit a region."""
-    x, y = raster.reference().T
-    found, cell = np.zeros(len(x), np.int64), experiment.lattice.cell()
-    for bit, region in enumerate(_regions_of(experiment).values()):
-        found |= (signed_distance(region, cell, x, y) <= 0.0).astype(np.int64) << bit
-    return found
-
-
-def _regions_of(experiment: Experiment) -> dict[str, Body]:
+def regions_of(experiment: Experiment) -> dict[str, Body]:
     """The regions that fields of the rule name, in the experiment's order."""
     fields = experiment.rule.varying.values()
     named = {n for field in fields if isinstance(field, ByRegion) for n, _ in field.values}
@@ -118,7 +97,7 @@ def _weights(
     return {s: named_weights(rule.cell_weights(s, setting, one), rule) for s in slots}
 
 
-def _stiffness(experiment: Experiment, values: Values) -> Floats:
+def stiffness_at(experiment: Experiment, values: Values) -> Floats:
     """(place, 3, 3) over Young's modulus, for parameters at places; NaN where there is none."""
     rule, size = experiment.rule, len(next(iter(values.values())))
     others = {name: value for name, value in values.items() if name != STIFFNESS}
@@ -199,13 +178,13 @@ class _Cells:
         for name, field in fields.items():
             if isinstance(field, ByRegion):
                 here[name] = np.full(len(some), field.otherwise)
-        found = _stiffness(self.experiment, here)
+        found = stiffness_at(self.experiment, here)
         for region, share, normal in self._borders:
             f, within = share[some], dict(here)
             for name, field in fields.items():
                 if isinstance(field, ByRegion) and region in dict(field.values):
                     within[name] = np.full(len(some), dict(field.values)[region])
-            inner = _stiffness(self.experiment, within)
+            inner = stiffness_at(self.experiment, within)
             part = (f > 0.0) & (f < 1.0)
             found[part] = laminate(found[part], inner[part], f[part], normal[some][part])
             found[f == 1.0] = inner[f == 1.0]
@@ -234,7 +213,7 @@ class _Cells:
         """The regions that some field names, each with the share of every cell inside and the
         normal of its border there."""
         return [
-            (name, *self._shares(region)) for name, region in _regions_of(self.experiment).items()
+            (name, *self._shares(region)) for name, region in regions_of(self.experiment).items()
         ]
 
     def _shares(self, region: Body) -> tuple[Floats, Floats]:
