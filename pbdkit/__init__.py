@@ -61,12 +61,14 @@ if TYPE_CHECKING:
         RenewsBonds as RenewsBonds,
         RenewsParticles as RenewsParticles,
         Setting as Setting,
+        SharesParticles as SharesParticles,
         Slot as Slot,
         Softens as Softens,
         SpaceVector as SpaceVector,
         StartsCracked as StartsCracked,
         Stiffness as Stiffness,
         StoresEnergy as StoresEnergy,
+        TurnsParticles as TurnsParticles,
         Variable as Variable,
         Vector as Vector,
         dot as dot,
@@ -86,8 +88,9 @@ _HOME = {
         "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
         "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here Lattice "
         "LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles Remembered Remembers "
-        "RenewsBonds RenewsParticles Setting Slot Softens SpaceVector StartsCracked Stiffness "
-        "StoresEnergy Variable Vector dot length squared_length where"
+        "RenewsBonds RenewsParticles Setting SharesParticles Slot Softens SpaceVector "
+        "StartsCracked Stiffness StoresEnergy TurnsParticles Variable Vector dot length "
+        "squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

@@ -19,8 +19,10 @@ from pbdkit.interfaces.rule import (
     Here,
     RenewsParticles,
     Setting,
+    SharesParticles,
     Stiffness,
     StoresEnergy,
+    TurnsParticles,
 )
 from pbdkit.interfaces.values import Bonds, Draws, Particles, Remembered, Remembers
 from pbdkit.interfaces.vector import (
@@ -48,6 +50,7 @@ __all__ = [
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
     "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "Moment", "Nearness",
     "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens", "SpaceVector",
+    "StartsCracked", "Stiffness", "StoresEnergy", "TurnsParticles", "Variable", "Vector", "dot",
+    "length", "squared_length", "where",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ from pbdkit.scene.bonds import BondTable, build_bond_table
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
+from pbdkit.scene.directions import check_directions
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
@@ -124,6 +125,7 @@ def _build(experiment: Experiment) -> Scene:
     leading = build_leading(raster, experiment)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
+    check_directions(experiment, has_frame=following is not None)
     cells = filling.on(raster, neighbourhood.tiling)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     return with_inner(Scene(experiment, *parts, tuple(warnings)))

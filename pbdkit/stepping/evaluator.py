@@ -7,7 +7,7 @@ against this.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from pbdkit.interfaces import (
     where,
 )
 from pbdkit.interfaces.component import as_values, as_vector, as_verdict
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
@@ -41,13 +42,15 @@ Contributions = tuple[Any, ...]
 class Neighbour:
     """One neighbour of some particles, or of one: its rest offset r and the rule's weights w; where
     it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
-    constants c of the bond, what is remembered of it included."""
+    constants c of the bond, what is remembered of it included; for rules that see it, as `shared`,
+    what is remembered of the particle and of the neighbour."""
 
     r: Components
     w: Any
     present: Mask | None = None
     broken: Mask | None = None
     c: Any = None
+    shared: tuple[Any, ...] = ()
 
 
 class Evaluator:
@@ -63,7 +66,8 @@ class Evaluator:
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        return as_values(self.rule.gather(self.seen(d, u, to), to.r, to.w, self._p), "gather")
+        gather: Callable[..., Any] = self.rule.gather
+        return as_values(gather(self.seen(d, u, to), to.r, to.w, self._p, *to.shared), "gather")
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
@@ -123,9 +127,11 @@ class Evaluator:
         return as_verdict(self._model.breaks(d, r, c, self._q))
 
     def everywhere(self, slots: Iterable[Slot]) -> list[Neighbour]:
-        """The neighbours in the middle of a body: all are there, and no bond has broken."""
+        """The neighbours in the middle of a body: all are there, no bond has broken, and what is
+        remembered is as at the start."""
         weights = self._scene.constants.weights
-        return [Neighbour(slot.rest, weights[slot]) for slot in slots]
+        shared = (self.initial_own(),) * 2 if shares_particles(self.rule) else ()
+        return [Neighbour(slot.rest, weights[slot], shared=shared) for slot in slots]
 
     def at_rest(self, slots: Sequence[Slot]) -> Any:
         """The move of a particle at rest with all these neighbours."""

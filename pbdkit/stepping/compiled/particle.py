@@ -71,11 +71,20 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
     return [*lines, f"d = {plan.vector('f.@ if is_lost else d.@')}"]
 
 
-def contributions(level: Level, r: str, weights: str) -> str:
-    """What a neighbour contributes, by name."""
+def contributions(plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = ()) -> str:
+    """What a neighbour contributes, by name; `there` is what is remembered of it, where the rule
+    sees that."""
     n = level.number
     names = _pattern(level, [f"c{total[1:]}" for total in level.totals], "")
-    return f"{names}, = gather{n}(d, {r}, Weights{n}({weights}), p)"
+    given = ["d", r, f"Weights{n}({weights})", "p"]
+    if plan.shares:
+        given += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
+    return f"{names}, = gather{n}({', '.join(given)})"
+
+
+def _own(level: Level) -> str:
+    """What is remembered of the particle."""
+    return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
 
 
 def target_lines(
@@ -91,8 +100,7 @@ def target_lines(
         lines = [f"X{c} = {value}" for c, value in zip(plan.axes, local, strict=True)]
         X = _shifted(plan, "+", plan.scene.raster.lattice.origin)
         centred = _shifted(plan, "-", plan.scene.middle)
-    own = values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
-    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({own}))")
+    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({_own(level)}))")
     lines.append(f"move = apply{n}(({sums},), here, p)")
     changing: list[int] = []
     if isinstance(level.scene.experiment.rule, RenewsParticles):

@@ -81,6 +81,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
+    shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
     since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
     out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
@@ -95,7 +96,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     can = f"({kind} == {FOLLOWER})" if spares else "is_there"
     breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
-    out.add(2, contributions(level, "r", values(level.seen.weights, named)))
+    out.add(2, contributions(plan, level, "r", values(level.seen.weights, named), shown))
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")
