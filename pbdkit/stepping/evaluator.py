@@ -7,7 +7,7 @@ against this.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,8 +66,9 @@ class Evaluator:
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        gather: Callable[..., Any] = self.rule.gather
-        return as_values(gather(self.seen(d, u, to), to.r, to.w, self._p, *to.shared), "gather")
+        rule: Any = self.rule  # some are given more than others
+        seen = self.seen(d, u, to)
+        return as_values(rule.gather(seen, to.r, to.w, self._p, *to.shared), "gather")
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
