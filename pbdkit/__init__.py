@@ -67,12 +67,14 @@ if TYPE_CHECKING:
         RenewsBonds as RenewsBonds,
         RenewsParticles as RenewsParticles,
         Setting as Setting,
+        SharesParticles as SharesParticles,
         Slot as Slot,
         Softens as Softens,
         SpaceVector as SpaceVector,
         StartsCracked as StartsCracked,
         Stiffness as Stiffness,
         StoresEnergy as StoresEnergy,
+        TurnsParticles as TurnsParticles,
         Variable as Variable,
         Vector as Vector,
         dot as dot,
@@ -90,10 +92,11 @@ _HOME = {
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
-        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel "
-        "FrameMap FramePolicy FrameSites Here Lattice LeaderRows Moment Nearness NeighbourMetric "
-        "Offset Pair Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
-        "Slot Softens SpaceVector StartsCracked Stiffness StoresEnergy Variable Vector dot length "
+        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel FrameMap "
+        "FramePolicy FrameSites Here Lattice LeaderRows Moment Nearness NeighbourMetric Offset "
+        "Pair Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
+        "SharesParticles Slot Softens SpaceVector StartsCracked Stiffness StoresEnergy "
+        "TurnsParticles Variable Vector dot length "
         "squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",

@@ -87,3 +87,38 @@ class Tiring(pbdkit.Draws, pbdkit.RenewsParticles, pbdkit.FollowerRule):
     def remember(total, here, p):
         move = total[0].x / total[2]
         return (here.own.way + pbdkit.where(move > 0.0, move, -move),)
+
+
+class Vanes(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.FollowerRule):
+    """Each particle has a direction, goes halfway to the mean of its neighbours, of which those
+    that point as it does count more, and turns halfway to theirs."""
+
+    type: Literal["vanes"] = "vanes"
+    pull: float = 0.5
+
+    def remembered(self):
+        return (
+            pbdkit.Remembered("vane_cos", "cosine of the vane's rotation", "1", 1.0),
+            pbdkit.Remembered("vane_sin", "sine of the vane's rotation", "1"),
+            pbdkit.Remembered("lift", "lift of the vane", "1", 0.1, changes=False),
+        )
+
+    def rotations(self):
+        return (("vane_cos", "vane_sin"),)
+
+    @staticmethod
+    def gather(d, r, w, p, own, there):
+        weight = 1.5 + 0.5 * (own.vane_cos * there.vane_cos + own.vane_sin * there.vane_sin)
+        v = r + d
+        turned = (own.vane_cos * v.x + own.vane_sin * v.y) * there.lift
+        return weight * d, weight, there.vane_cos - turned * v.y, there.vane_sin + turned * v.x
+
+    @staticmethod
+    def apply(total, here, p):
+        return p.pull * total[0] / total[1]
+
+    @staticmethod
+    def remember(total, here, p):
+        c, s = here.own.vane_cos + total[2], here.own.vane_sin + total[3]
+        size = pbdkit.length(pbdkit.Vector(c, s)) + 1e-9
+        return c / size, s / size

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from typing import Literal
 
 import pytest
-from faulty import others, remembering, rules
+from faulty import directions, others, remembering, rules
 from faulty.kagome import Kagome, OnKagome
 from interpreted_kernels import interpreting
 from pydantic import Field
@@ -55,6 +55,7 @@ SOUND = [
     remembering.Wearing(),
     remembering.Tired(),
     remembering.LastOnes(),
+    directions.Vane(),
 ]
 
 FAULTS = [
@@ -140,6 +141,10 @@ FAULTS = [
     (remembering.WearsOneWay, "is-seen-alike-from-both-ends", "`update` answers otherwise for"),
     (remembering.Misstates, "breaks-beyond-its-strain", "`breaking_strain` and `breaks` disagree"),
     (remembering.Sags, "rests", "a body at rest moves by"),
+    (directions.Compass, "follows-rotations", "count its neighbours' places from its own"),
+    (directions.PointsNowhere, "declares-what-it-remembers", "names 'vane_tan' in `rotations`"),
+    (directions.WritesThere, "changes-no-input", "`gather` writes into `shared"),
+    (directions.Creeps, "rests", "a body at rest moves by 1e-09"),
     (remembering.Ragged, "measures-what-it-declares", "'last_square' has the shape"),
     (remembering.Untimely, "measures-what-it-declares", "a length only where it declares `at_end`"),
 ]

@@ -37,6 +37,8 @@ CAPABILITIES = {
         pbdkit.Remembers,
         pbdkit.Draws,
         pbdkit.RenewsParticles,
+        pbdkit.SharesParticles,
+        pbdkit.TurnsParticles,
         pbdkit.AppliesTwice,
     ),
     "FractureModel": (

@@ -97,6 +97,8 @@ def check(experiment: str, settings: tuple[str, ...], as_json: bool) -> None:
 
 def _tell_of_steps(loaded: Experiment, found: Forecast) -> None:
     """What is known of steps before the first one."""
+    from pbdkit.interfaces import RenewsParticles
+
     if loaded.stepping.is_open:
         why = "the rule is not linear or bonds can break"
         near = "" if found.exact else f", of the step linearised at rest: {why}"
@@ -105,6 +107,8 @@ def _tell_of_steps(loaded: Experiment, found: Forecast) -> None:
     if found.spectral_radius is not None:
         verdict = "stable" if found.stable else "not stable"
         near = "" if found.exact else ", linearised at the start"
+        if isinstance(loaded.rule, RenewsParticles):
+            near += ", what particles remember held as it is there"
         near += ", estimated: the steps to 1 %" if found.estimated else ""
         click.echo(f"  spectrum   radius {found.spectral_radius:.9g}: {verdict}{near}")
         steps = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)

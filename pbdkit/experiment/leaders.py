@@ -45,6 +45,10 @@ class Motion(Component):
         default it always does."""
         return ()
 
+    def turned(self, n: float) -> float:
+        """By what angle the motion has turned at the end of its n-th step, radians."""
+        return 0.0
+
     def rests_after(self) -> int | None:
         """The step n from which on the offset stays as it is; None where it never does."""
         return max((1, *self.knots())) if self.rests else None
@@ -132,11 +136,15 @@ class Rotation(Motion):
 
     def offset(self, n: float, start: Floats) -> Floats:
         """(Q - 1)(start - centre), Q the rotation by angle · min(n, steps)."""
-        turned = math.radians(self.angle * min(n, self.steps))
+        turned = self.turned(n)
         # 1 - cos without cancellation, so that small turns keep their digits.
         less, sine = 2 * math.sin(turned / 2) ** 2, math.sin(turned)
         x, y = (np.asarray(start) - self.centre).T
         return np.stack([-less * x - sine * y, sine * x - less * y], axis=-1)
+
+    def turned(self, n: float) -> float:
+        """angle · min(n, steps)."""
+        return math.radians(self.angle * min(n, self.steps))
 
     def knots(self) -> tuple[int, ...]:
         """The end of the motion."""
@@ -196,13 +204,15 @@ class Selection(Strict):
 class LeaderGroup(Strict):
     """Particles that lead from step `from` to step `until`, both included, and follow otherwise.
 
-    The motion counts its steps from `from` and starts where the particle then is.
+    The motion counts its steps from `from` and starts where the particle then is. `clamped` leaders
+    prescribe their directions too, which turn with the motion; others turn freely.
     """
 
     select: Selection
     motion: AnyMotion
     from_: Annotated[int, Field(ge=1, alias="from")] = 1
     until: Annotated[int, Field(ge=1)] | None = None
+    clamped: bool = False
 
     @model_validator(mode="after")
     def _in_order(self) -> LeaderGroup:

@@ -20,8 +20,10 @@ from pbdkit.interfaces.rule import (
     MixesCells,
     RenewsParticles,
     Setting,
+    SharesParticles,
     Stiffness,
     StoresEnergy,
+    TurnsParticles,
 )
 from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Quantity
 from pbdkit.interfaces.values import Bonds, Draws, Particles, Remembered, Remembers
@@ -51,6 +53,7 @@ __all__ = [
     "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
     "Here", "Lattice", "LeaderRows", "MixesCells", "Moment", "Nearness", "NeighbourMetric",
     "Offset", "Pair", "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens", "SpaceVector",
+    "StartsCracked", "Stiffness", "StoresEnergy", "TurnsParticles", "Variable", "Vector", "dot",
+    "length", "squared_length", "where",
 ]  # fmt: skip

@@ -72,7 +72,7 @@ class FollowerRule(TakesFields):
     has no neighbour stays. A fictitious neighbour counts as present.
 
     What only some rules can do is a class that they take on besides: `Calibrated`, `StoresEnergy`,
-    `Remembers`, `Draws`, `RenewsParticles`, `AppliesTwice`.
+    `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`, `TurnsParticles`, `AppliesTwice`.
     """
 
     linear: ClassVar[bool] = False
@@ -158,6 +158,28 @@ class RenewsParticles(Remembers):
         """
 
 
+class SharesParticles(Remembers):
+    """A rule whose particles see what is remembered of each other: its `gather` is given two
+    arguments more. Frame points and fictitious ones remember nothing, so that it goes with neither
+    a frame nor bonds that break."""
+
+    @staticmethod
+    @abstractmethod
+    def gather(d: Any, r: Any, w: Any, p: Any, own: Any, there: Any) -> tuple[Any, ...]:
+        """The contributions of one neighbour, elementwise. ``own.name`` is what is remembered of
+        the particle, ``there.name`` what is remembered of the neighbour, both before the step."""
+
+
+class TurnsParticles(RenewsParticles):
+    """A rule whose particles have directions: some remembered numbers are rotations, each by its
+    cosine and sine. Leaders that are clamped prescribe them, and turn with their motion."""
+
+    @abstractmethod
+    def rotations(self) -> tuple[tuple[str, str], ...]:
+        """The names of the cosine and the sine of each rotation from the reference, which is
+        counterclockwise."""
+
+
 class AppliesTwice(ABC):
     """A rule that works on the moves of another, for operators that are applied twice: `gather` and
     `apply` are given its moves z, of followers and leaders alike, in place of displacements:
@@ -166,6 +188,11 @@ class AppliesTwice(ABC):
     @abstractmethod
     def inner(self) -> FollowerRule:
         """The rule whose moves this rule works on."""
+
+
+def shares_particles(rule: object) -> bool:
+    """Whether neighbours see what is remembered of each other."""
+    return isinstance(rule, SharesParticles)
 
 
 def material_of(rule: FollowerRule) -> Stiffness | None:

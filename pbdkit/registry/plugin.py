@@ -15,7 +15,7 @@ from typing import Any
 import pluggy
 from pydantic import ValidationError
 
-from pbdkit.interfaces import INTERFACES, Component
+from pbdkit.interfaces import INTERFACES, Component, SharesParticles
 from pbdkit.registry import BUILTIN, GROUP
 from pbdkit.registry.blame import interface_of, one_line, worded
 from pbdkit.registry.discovery import API, Hooks, Offer, Plugin
@@ -134,7 +134,9 @@ def _check_functions(component: type[Component]) -> None:
         if name.startswith("_") or not callable(getattr(interface, name)):
             continue
         own = inspect.getattr_static(component, name)
-        given = list(inspect.signature(getattr(interface, name)).parameters)
+        more = issubclass(component, SharesParticles) and name in vars(SharesParticles)
+        asked = getattr(SharesParticles if more else interface, name)
+        given = list(inspect.signature(asked).parameters)
         called = f"{name}({', '.join(given)})"
         if isinstance(declared, staticmethod) and not isinstance(own, staticmethod):
             how = f"write @staticmethod above it, and no `self` in {called}"

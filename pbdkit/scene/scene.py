@@ -19,6 +19,7 @@ from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
+from pbdkit.scene.directions import check_directions
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
@@ -128,6 +129,7 @@ def _build(experiment: Experiment) -> Scene:
     leading = build_leading(raster, experiment)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
+    check_directions(experiment, has_frame=following is not None)
     cells = filling.on(raster, neighbourhood.tiling)
     cells = weighed(experiment, raster, setting, cells)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)

@@ -28,6 +28,7 @@ from pbdkit.interfaces import (
     where,
 )
 from pbdkit.interfaces.component import as_values, as_vector, as_verdict
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
@@ -43,7 +44,8 @@ class Neighbour:
     """One neighbour of some particles, or of one: its rest offset r and the rule's weights w; where
     it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
     constants c of the bond, what is remembered of it included. `more` are weights besides w, of
-    cells that are of a stiffness of their own: what they contribute is added."""
+    cells that are of a stiffness of their own: what they contribute is added. For rules that see
+    it, `shared` is what is remembered of the particle and of the neighbour."""
 
     r: Components
     w: Any
@@ -51,6 +53,7 @@ class Neighbour:
     broken: Mask | None = None
     c: Any = None
     more: tuple[Any, ...] = ()
+    shared: tuple[Any, ...] = ()
 
 
 class Evaluator:
@@ -72,8 +75,9 @@ class Evaluator:
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
+        rule: Any = self.rule  # some are given more than others
         seen = self.seen(d, u, to)
-        parts = (self.rule.gather(seen, to.r, w, self._p) for w in (to.w, *to.more))
+        parts = (rule.gather(seen, to.r, w, self._p, *to.shared) for w in (to.w, *to.more))
         return summed((as_values(part, "gather"), None) for part in parts)
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
@@ -134,9 +138,11 @@ class Evaluator:
         return as_verdict(self._model.breaks(d, r, c, self._q))
 
     def everywhere(self, slots: Iterable[Slot]) -> list[Neighbour]:
-        """The neighbours in the middle of a body: all are there, and no bond has broken."""
+        """The neighbours in the middle of a body: all are there, no bond has broken, and what is
+        remembered is as at the start."""
         weights = self._scene.constants.weights
-        return [Neighbour(slot.rest, weights[slot]) for slot in slots]
+        shared = (self.initial_own(),) * 2 if shares_particles(self.rule) else ()
+        return [Neighbour(slot.rest, weights[slot], shared=shared) for slot in slots]
 
     def at_rest(self, slots: Sequence[Slot]) -> Any:
         """The move of a particle at rest with all these neighbours."""

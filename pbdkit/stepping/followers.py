@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from operator import add
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import Components, Here, StoresEnergy
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
@@ -126,9 +128,12 @@ class SlotFollowers(Followers):
 
     def _summed(self, m: Floats, state: State) -> Iterator[Summed]:
         """Every block with the sums of its neighbours' contributions and what stands there."""
-        seen = self._seen(m, state)
+        seen, before = self._seen(m, state), state
+        if shares_particles(self._scene.experiment.rule):
+            # Neighbours see what was before the step, also where a block has been renewed.
+            before = replace(state, particle_values=tuple(v.copy() for v in state.particle_values))
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
-            total = around.sums(evaluator.contribution, seen, state)
+            total = around.sums(evaluator.contribution, seen, before)
             yield around, evaluator, total, around.here(seen, state)
 
 
@@ -165,13 +170,16 @@ class GatheringFollowers(Followers):
         flat, count = new.reshape(len(new), -1), len(self.place)
         u, before = m.reshape(len(m), -1)[:, self.place], flat[:, self.place]
         j, k, rest = self.pairs(m)
-        to = Neighbour(vector(rest), self._none)
+        own = [value.ravel()[self.place] for value in state.particle_values]
+        of_particle = self._scene.constants.of_particle
+        shared: tuple[Any, ...] = ()
+        if shares_particles(self._evaluator.rule):
+            shared = tuple(of_particle(*(value[rows] for value in own)) for rows in (j, k))
+        to = Neighbour(vector(rest), self._none, shared=shared)
         d = vector(u[:, k] - u[:, j])
         parts = self._evaluator.contribution(d, vector(u[:, j]), to)
         total = tuple(_summed(part, j, count) for part in parts)
-        own = [value.ravel()[self.place] for value in state.particle_values]
-        of_particle = self._scene.constants.of_particle(*own)
-        here = Here(vector(u), self._at, self._centred, of_particle)
+        here = Here(vector(u), self._at, self._centred, of_particle(*own))
         move = self._evaluator.move(total, here)
         movable = self.body[np.bincount(j, minlength=count)[self.body] > 0]
         place = self.place[movable]

@@ -10,6 +10,7 @@ import numpy as np
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.clamps import Clamps
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State
@@ -37,6 +38,7 @@ class Stepper(Engine):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        self._clamps = Clamps(scene)
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
 
@@ -53,9 +55,13 @@ class Stepper(Engine):
         place(u, led)
         if self._fracturing:
             self._fracturing.break_bonds(u, state, step)
+        clamped = self._clamps.turn(state, step)
+        kept = [(values, values[clamped]) for values in self._clamps.directions(state)]
         # What leaves the finite numbers is found at recording.
         with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
             self._followers.move(u, new, state)
+        for values, prescribed in kept:
+            values[clamped] = prescribed
         place(new, led)
         place(u, before)
         if self._scene.frame:

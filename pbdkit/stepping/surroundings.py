@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Components, Here, Slot, Softens
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.places import Where
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
@@ -55,7 +56,9 @@ class Surroundings:
         """The neighbours through each slot, as they are in a state."""
         parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
         return [
-            Neighbour(slot.rest, w, present, *self._bond(slot, state), more)
+            Neighbour(
+                slot.rest, w, present, *self._bond(slot, state), more, self._shared(slot, state)
+            )
             for slot, w, present, more in parts
         ]
 
@@ -66,7 +69,7 @@ class Surroundings:
 
     def here(self, u: NDArray[Any], state: State) -> Here:
         """What stands at the particles."""
-        own = self._scene.constants.of_particle(*shown(self.own(state)))
+        own = self._remembered(self.where, state)
         return Here(vector(shown(self.where.of(u))), *self._reference, own)
 
     def own(self, state: State) -> list[NDArray[Any]]:
@@ -98,6 +101,18 @@ class Surroundings:
             if np.any(left) or np.any(right):
                 found.append(weights[slot]._replace(left=left, right=right))
         return tuple(found)
+
+    def _remembered(self, where: Where, state: State) -> Any:
+        """What is remembered of the particles somewhere, by name."""
+        values = (where.of(value) for value in state.particle_values)
+        return self._scene.constants.of_particle(*shown(values))
+
+    def _shared(self, slot: Slot, state: State) -> tuple[Any, ...]:
+        """What is remembered of the particles and of their neighbours, for rules that see it."""
+        if not shares_particles(self._scene.experiment.rule):
+            return ()
+        ends = self.where, self.where.seen_through(slot)
+        return tuple(self._remembered(end, state) for end in ends)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
         """Where the bond along a slot is broken, and its constants where they reach the rule."""

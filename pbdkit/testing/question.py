@@ -7,8 +7,8 @@ in dataclasses.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
-from functools import singledispatch
+from dataclasses import dataclass, is_dataclass, replace
+from functools import partial, singledispatch
 from typing import Any
 
 import numpy as np
@@ -41,9 +41,11 @@ from pbdkit.testing.states import (
     differences,
     frame_showing,
     here,
+    measured_by,
     moment_of,
     owners,
     remembers,
+    shared,
 )
 
 Arrays = dict[str, Any]
@@ -103,11 +105,15 @@ def questions_of(component: Component, scene: Scene, seed: int) -> list[Question
     raise TypeError(f"{type(component).__name__} is of no interface")
 
 
-def gathered(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
-    """The contributions of every slot."""
-    evaluator = Evaluator(scene)
-    neighbours = zip(d, evaluator.everywhere(scene.neighbourhood.slots[0]), strict=True)
-    return [evaluator.contribution(one, one, to) for one, to in neighbours]
+def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ...]]:
+    """The contributions of every slot; `shared` is what is remembered of the particle and of the
+    neighbour there, by slot, unless it is as at the start."""
+    evaluator, named = Evaluator(scene), scene.constants.of_particle
+    neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
+    if shared:
+        ends = [tuple(named(*values) for values in pair) for pair in shared]
+        neighbours = [replace(to, shared=e) for to, e in zip(neighbours, ends, strict=True)]
+    return [evaluator.contribution(v, v, to) for v, to in zip(d, neighbours, strict=True)]
 
 
 def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
@@ -126,7 +132,8 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
     where it has them."""
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
-    gather = Question("gather", {"d": d}, lambda d: gathered(scene, d), elementwise=True)
+    given = {"d": d, "shared": shared(scene, at["own"])}
+    gather = Question("gather", given, partial(gathered, scene), elementwise=True)
     if len({len(flat(parts)) for parts in contributions}) > 1:
         return [gather]  # they cannot be summed, which is found elsewhere
     sums = summed((c, None) for c in contributions)
@@ -225,12 +232,6 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
         return found
 
     return [Question("measure", Shown(moment).tables, measure)]
-
-
-def measured_by(diagnostic: Diagnostic, now: Any) -> Arrays:
-    """What a diagnostic measures of a moment, by variable."""
-    names = [variable.name for variable in diagnostic.variables()]
-    return dict(zip(names, diagnostic.measure(now), strict=True))
 
 
 @questions_of.register

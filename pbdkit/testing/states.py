@@ -16,12 +16,14 @@ from pbdkit.errors import PluginError
 from pbdkit.interfaces import (
     Bonds,
     Component,
+    Diagnostic,
     FollowerRule,
     LeaderRows,
     Particles,
     Remembered,
     Vector,
 )
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
@@ -119,10 +121,25 @@ def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
     return tuple(column[rows] for column in columns)
 
 
+def shared(scene: Scene, own: tuple[Any, ...]) -> list[Any]:
+    """Along each slot of the first sublattice what is remembered of particles and of neighbours,
+    for rules that see it: each neighbour is another of the particles."""
+    if not shares_particles(scene.experiment.rule):
+        return []
+    slots = range(1, len(scene.neighbourhood.slots[0]) + 1)
+    return [(own, tuple(np.roll(value, n) for value in own)) for n in slots]
+
+
 def moment_of(scene: Scene, seed: int) -> StateMoment:
     """The scene two steps after a random start; bonds may have broken."""
     state = state_with(scene, displacements(scene, seed, share=0.6))
     return StateMoment(Stepper(scene).advance(state, 2), Tables(scene))
+
+
+def measured_by(diagnostic: Diagnostic, now: Any) -> dict[str, Any]:
+    """What a diagnostic measures of a moment, by variable."""
+    names = [variable.name for variable in diagnostic.variables()]
+    return dict(zip(names, diagnostic.measure(now), strict=True))
 
 
 class Shown:

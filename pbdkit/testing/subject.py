@@ -22,6 +22,7 @@ from pbdkit.interfaces import (
     Lattice,
     NeighbourMetric,
 )
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.testing.question import Question, questions_of
@@ -69,7 +70,7 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
         "lattice": list(LATTICES.values()),
         "neighbours": neighbours,
         "rule": _rules(component),
-        "frame": [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN],
+        "frame": _frames(component),
     }
     given[field] = [component] if field == "diagnostics" else component
     for name in choices.keys() & given.keys():
@@ -77,6 +78,12 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
         choices[name] = list(part) if isinstance(part, (list, tuple)) else [part]
     for choice in product(*choices.values()):
         yield Experiment(**given | dict(zip(choices, choice, strict=True)))
+
+
+def _frames(component: Component) -> list[dict[str, Any]]:
+    if shares_particles(component):
+        return [{"type": "none"}]
+    return [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN]
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:

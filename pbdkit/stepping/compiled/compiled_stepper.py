@@ -11,6 +11,7 @@ import numpy as np
 
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.clamps import Clamps
 from pbdkit.stepping.compiled.arguments import (
     Arrays,
     bits_for,
@@ -60,6 +61,9 @@ class CompiledStepper(Engine):
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)
         self._arrays |= dict(zip(inner, self._moves, strict=True))
+        self._clamps, self._clamped = Clamps(scene), np.zeros(0, np.intp)
+        own = start.particle_values
+        self._arrays |= {f"was{m}": np.zeros(scene.raster.shape, own[m].dtype) for m in plan.kept}
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
         shared = (*plan.shared, *self._named(start, []))
@@ -88,6 +92,7 @@ class CompiledStepper(Engine):
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
         led, starts = prescribe(self._scene, state, step)
+        self._clamped = self._clamps.turn(state, step)
         count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
@@ -103,7 +108,7 @@ class CompiledStepper(Engine):
         led_values = np.concatenate(values, axis=1).astype(state.u.dtype)
         leaders = {"led": np.concatenate(places), "led_values": led_values}
         leaders["led_kept"] = np.empty_like(led_values)
-        reached = {"box": self._reach.box, "growth": self._reach.growth}
+        reached = {"box": self._reach.box, "growth": self._reach.growth, "clamped": self._clamped}
         moved = state_arrays(self._plan, state.u, state.previous, state)
         return self._arrays | moved | leaders | reached
 

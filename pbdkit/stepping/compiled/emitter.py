@@ -75,6 +75,7 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     for placing in ("led_kept[#, e] = fu_@[led[e]]", "fu_@[led[e]] = led_values[#, e]"):
         out.add(1, "for e in range(led.size):")
         out.add(2, *plan.each(placing))
+    out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
     if plan.bonds_first:
@@ -92,6 +93,9 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
             if n + 1 < len(passes) and plan.scene.frame:
                 out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
                 write_frame(out, plan, f"fz{n}", f"fz{n}")
+    for m in plan.rotations:
+        out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
+        out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
     out.add(1, "for e in range(led.size):")
     out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
     out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))

@@ -48,7 +48,8 @@ class PairFollowers(Followers):
     def _named(self, m: Floats, new: Floats, state: State, **pairs: Any) -> Arrays:
         """By name the arrays of the kernel: `first_pair` is by particle of the body, `partner` and
         `rests` by pair, `place` and `local` by row of the table."""
-        return self._arrays | state_arrays(self._plan, m, new, state) | pairs
+        was = {f"was{n}": state.particle_values[n].copy() for n in self._plan.kept}
+        return self._arrays | state_arrays(self._plan, m, new, state) | was | pairs
 
 
 def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
@@ -63,7 +64,9 @@ def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
     sweep.add(1, *(f"{t} = double(0.0)" for t in level.totals))
     sweep.add(1, "for n in range(first_pair[e], first_pair[e + 1]):")
     sweep.add(2, "there = place[partner[n]]", difference(plan, level, "flat_u_@[there]"))
-    sweep.add(2, f"r = {plan.vector('rests[#, n]')}", contributions(level, "r", ""))
+    shown = [f"flat_{array}[there]" for array in plan.shown]
+    sweep.add(2, f"r = {plan.vector('rests[#, n]')}")
+    sweep.add(2, contributions(plan, level, "r", "", shown))
     sweep.add(2, *(f"{t} = {t} + c{n}" for n, t in enumerate(level.totals)))
     sweep.add(1, "moves = first_pair[e + 1] > first_pair[e]")
     sweep.add(1, *target_lines(plan, level, plan.each("local[#, row]"), level.totals, "moves"))

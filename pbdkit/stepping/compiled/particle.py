@@ -78,24 +78,37 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
     return [*lines, f"d = {plan.vector('f.@ if is_lost else d.@')}"]
 
 
-def contributions(level: Level, r: str, weights: str) -> str:
-    """What a neighbour contributes, by name."""
-    return _gathered(level, r, weights, "c")
+def contributions(plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = ()) -> str:
+    """What a neighbour contributes, by name; `there` is what is remembered of it, where the rule
+    sees that."""
+    return _gathered(plan, level, r, weights, there, "c")
 
 
-def more_contributions(plan: Plan, level: Level, r: str, weights: Sequence[str]) -> list[str]:
+def more_contributions(
+    plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
+) -> list[str]:
     """What cells of a stiffness of their own add to it, with these weights."""
     lines = list[str]()
     for w in weights:
-        lines.append(_gathered(level, r, w, "e"))
+        lines.append(_gathered(plan, level, r, w, there, "e"))
         lines += [f"c{n} = c{n} + {plan.rounded(f'e{n}')}" for n in range(len(level.totals))]
     return lines
 
 
-def _gathered(level: Level, r: str, weights: str, into: str) -> str:
+def _gathered(
+    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str], into: str
+) -> str:
     n = level.number
     names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
-    return f"{names}, = gather{n}(d, {r}, Weights{n}({weights}), p)"
+    given = ["d", r, f"Weights{n}({weights})", "p"]
+    if plan.shares:
+        given += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
+    return f"{names}, = gather{n}({', '.join(given)})"
+
+
+def _own(level: Level) -> str:
+    """What is remembered of the particle."""
+    return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
 
 
 def target_lines(
@@ -111,8 +124,7 @@ def target_lines(
         lines = [f"X{c} = {value}" for c, value in zip(plan.axes, local, strict=True)]
         X = _shifted(plan, "+", plan.scene.raster.lattice.origin)
         centred = _shifted(plan, "-", plan.scene.middle)
-    own = values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
-    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({own}))")
+    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({_own(level)}))")
     lines.append(f"move = apply{n}(({sums},), here, p)")
     changing: list[int] = []
     if isinstance(level.scene.experiment.rule, RenewsParticles):

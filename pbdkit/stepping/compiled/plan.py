@@ -11,8 +11,10 @@ from itertools import count
 from typing import Any
 
 from pbdkit.interfaces import RenewsBonds
+from pbdkit.interfaces.rule import shares_particles
 from pbdkit.scene.homes import Home, Number, Seen, numbers_of
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.clamps import Clamps
 
 MOST_BITS = 32
 """Neighbours of a sublattice up to which its slots are written out and lost bonds are bits."""
@@ -86,6 +88,31 @@ class Plan:
     def bonds(self) -> int:
         """How many numbers are remembered of each bond."""
         return sum(number.home is Home.BOND for number in self.levels[-1].seen.bond)
+
+    @cached_property
+    def rotations(self) -> tuple[int, ...]:
+        """The numbers of each particle that clamped leaders prescribe."""
+        return Clamps(self.scene).numbers
+
+    @cached_property
+    def kept(self) -> tuple[int, ...]:
+        """The numbers of each particle that are kept as they were before the step: all that change
+        where neighbours see them, else those that clamped leaders prescribe."""
+        if not self.shares:
+            return self.rotations
+        own = self.levels[-1].seen.own
+        return tuple(m for m, number in enumerate(own) if number.changes)
+
+    @property
+    def shares(self) -> bool:
+        """Whether neighbours see what is remembered of each other."""
+        return shares_particles(self.scene.experiment.rule)
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """The arrays of what neighbours see of each other."""
+        count = len(self.levels[-1].seen.own) if self.shares else 0
+        return tuple(f"was{m}" if m in self.kept else f"own{m}" for m in range(count))
 
     @property
     def limits(self) -> int:

@@ -30,6 +30,8 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     for k, slot in enumerate(slots):
         there = plan.row(f"{level.source}_@", slot.target, slot.cell)
         out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
+        shown = (plan.row(array, slot.target, slot.cell) for array in plan.shown)
+        out.add(0, *(f"e{k}_{m} = {row}" for m, row in enumerate(shown)))
     shares: dict[str, str] = {}
     if kind == WITH_CELLS:
         rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
@@ -66,11 +68,11 @@ def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, 
     weights = {name: plan.number(value) for name, value in literal.items()}
     if shares:
         weights["left"], weights["right"] = (f"{shares[row]}[j]" for row in _beside(plan, slot))
-    r = plan.literal(slot.rest)
+    r, there = plan.literal(slot.rest), (f"e{k}_{m}[j]" for m in range(len(plan.shown)))
     return [
         difference(plan, level, f"n{k}@[j]"),
         *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", f"f{k}[j]"),
-        contributions(level, r, listed(weights.values())),
+        contributions(plan, level, r, listed(weights.values()), there),
         *(
             f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
             for n in range(len(level.totals))

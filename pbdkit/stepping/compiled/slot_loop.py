@@ -85,6 +85,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
             for m in range(plan.mixed):
                 shares = f"flat_mixed{m}[at_j + cells_away[s, k, {side}]]"
                 out.add(depth, f"mixed{m}_{side} = {shares}")
+    shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
     fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
     since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
@@ -101,14 +102,14 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     can = f"({kind} == {FOLLOWER})" if spares else "is_there"
     breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
-    out.add(2, contributions(level, "r", values(level.seen.weights, named)))
+    out.add(2, contributions(plan, level, "r", values(level.seen.weights, named), shown))
     mixed = [
         values(
             level.seen.weights, {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"mixed{m}_{{n}}"}
         )
         for m in range(plan.mixed)
     ]
-    out.add(2, *more_contributions(plan, level, "r", mixed))
+    out.add(2, *more_contributions(plan, level, "r", mixed, shown))
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")

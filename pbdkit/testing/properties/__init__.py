@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pbdkit.interfaces import Component
 from pbdkit.testing.properties import (
+    directions,
     elementwise,
     every,
     lattice_parts,
@@ -16,7 +17,16 @@ from pbdkit.testing.subject import Property
 
 PROPERTIES: tuple[Property, ...] = tuple(
     found
-    for page in (every, lattice_parts, start, repetition, elementwise, particulars, steps)
+    for page in (
+        every,
+        lattice_parts,
+        start,
+        repetition,
+        elementwise,
+        particulars,
+        steps,
+        directions,
+    )
     for found in vars(page).values()
     if isinstance(found, Property)
 )

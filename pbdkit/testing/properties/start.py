@@ -11,6 +11,7 @@ import numpy as np
 from pbdkit.interfaces import Diagnostic, Draws, FollowerRule, FractureModel, Remembered
 from pbdkit.results.layout import reserved_names
 from pbdkit.scene.declarations import remembered_names
+from pbdkit.scene.directions import rotations_of
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.states import SEED, numbers_of, owners
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of
@@ -58,6 +59,7 @@ def declares_what_it_remembers(subject: Subject) -> None:
                 raise PropertyError(f"every dataset has a '{number.name}': give it another name")
             _refuse_unlabelled(number, f"'{number.name}'", "my_number")
             _refuse_unheld(number, number.initial, "starts at")
+        rotations_of(scene.experiment)  # refuses what is not remembered
 
 
 def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:

@@ -26,12 +26,20 @@ from pbdkit.runs.course import Run, record
 from pbdkit.runs.standing import standing_of, take_up
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
+from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.storage.standing import Standing
 from pbdkit.testing.properties.repetition import differing
-from pbdkit.testing.question import flat, measured_by
-from pbdkit.testing.states import Floats, advanced, displacements, spacing, state_with
+from pbdkit.testing.question import flat
+from pbdkit.testing.states import (
+    Floats,
+    advanced,
+    displacements,
+    measured_by,
+    spacing,
+    state_with,
+)
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
 STEPPED = (FollowerRule, NeighbourMetric, Lattice, FramePolicy, FractureModel)
@@ -50,6 +58,8 @@ def rests(subject: Subject) -> None:
         raise NotAskedError("it warns that bonds break at rest in every scene that was tried")
     for scene in quiet:
         engine, state = Stepper(scene), initial_state(scene)
+        if scene.frame is None:
+            _refuse_to_leave_rest(scene)
         for _ in range(STEPS):
             state = engine.advance(state)
             where = f"in step {state.step} {place_of(scene.experiment)}"
@@ -57,10 +67,22 @@ def rests(subject: Subject) -> None:
                 broken = int((state.broken_step > 0).sum())
                 raise PropertyError(f"{broken} bonds of a body at rest break {where}")
             if scene.frame and state.u.any():
-                fault = f"a body at rest moves by {np.abs(state.u).max():.3g} {where}"
-                wanted = "zero differences must give a move of exactly zero"
-                remedy = "let terms of opposite neighbours cancel one by one"
-                raise PropertyError(f"{fault}: {wanted}; {remedy}")
+                raise PropertyError(_restless(np.abs(state.u).max(), where))
+
+
+def _refuse_to_leave_rest(scene: Scene) -> None:
+    """Raises PropertyError where a particle moves that has all its neighbours, at rest: without a
+    frame those at edges may."""
+    for slots in scene.neighbourhood.slots:
+        most = max(abs(float(component)) for component in Evaluator(scene).at_rest(slots))
+        if most > 0.0:
+            raise PropertyError(_restless(most, place_of(scene.experiment)))
+
+
+def _restless(most: float, where: str) -> str:
+    wanted = "zero differences must give a move of exactly zero"
+    remedy = "let terms of opposite neighbours cancel one by one"
+    return f"a body at rest moves by {most:.3g} {where}: {wanted}; {remedy}"
 
 
 @asked_of(FollowerRule, NeighbourMetric, Lattice, FramePolicy)

@@ -20,7 +20,8 @@ import numpy as np
 
 import pbdkit
 
-FILE = Path(__file__).parent / "bias-extension.yaml"
+FOLDER = Path(__file__).parent
+FILE = "bias-extension.yaml"
 
 
 class Cells(NamedTuple):
@@ -35,8 +36,9 @@ class Cells(NamedTuple):
     width: float
 
 
-def pulled(across, along, pull, *settings):
-    """The dataset of a sheet of along × across cells, pulled by a share of D."""
+def pulled(across, along, pull, *settings, file=FILE):
+    """The dataset of a sheet of along × across cells, pulled by a share of D, with the rule and
+    the grips of an experiment beside this file."""
     size = 2.0**0.5
     length, width = along * size, across * size
     share = pull * (length - width)
@@ -48,7 +50,7 @@ def pulled(across, along, pull, *settings):
         f"leaders.1.motion={{type: velocity, velocity: [{share / 2000!r}, 0.0], steps: 2000}}",
         *settings,
     ]
-    return pbdkit.run(pbdkit.load(FILE, settings=given), progress=False)
+    return pbdkit.run(pbdkit.load(FOLDER / file, settings=given), progress=False)
 
 
 def cells(ds):
@@ -92,11 +94,11 @@ def on_axis(found):
 
 def main():
     """Prints the table."""
-    across, along = (int(n) for n in sys.argv[1:3])
+    file, (across, along) = sys.argv[1], (int(n) for n in sys.argv[2:4])
     print("| d / D | A | B | C | theory A, B, C | cos θ on the axis | theory | links |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for pull in (0.05, 0.1, 0.2, 0.3):
-        found, expected = cells(pulled(across, along, pull, *sys.argv[3:])), theory(pull)
+        found, expected = cells(pulled(across, along, pull, *sys.argv[4:], file=file)), theory(pull)
         means = [
             f"{found.angle[found.zone == z].mean():.2f}° ± {found.angle[found.zone == z].std():.2f}"
             for z in "ABC"

@@ -1,40 +1,13 @@
-"""Pantographic sheets for pbdkit: two families of fibres, joined where they cross by pivots."""
+"""Pivots as two points that coincide, on fibres of springs that stay straight."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from pydantic import Field
 
 import pbdkit
-
-pbdkit_api = 1
-
-ALONG, NEXT, ACROSS = "along", "next", "across"
-Role = tuple[str, int]
-"""What a neighbour is to a pivot: along a fibre, next but one along it, or across a cell; and in
-which of the four directions: 0 and 1 are the two ends of the first family, 2 and 3 of the other."""
-Step = TypeVar("Step", pbdkit.Offset, pbdkit.Slot)
-
-
-class Fibres(pbdkit.NeighbourMetric):
-    """Shell 1: the next pivots along two families of fibres. Shell 2: the next but one. Shell 3:
-    those across the cells between.
-
-    The fibres run along the two shortest steps of the lattice that are not in line: along the axes
-    of a square lattice, along the half diagonals of a centred-rectangular one, at ±45° where its
-    a = b.
-    """
-
-    type: Literal["fibres"] = "fibres"
-
-    def shells_around(self, cell: pbdkit.Cell, sublattice: int) -> list[list[pbdkit.Offset]]:
-        """Four neighbours a shell. Raises ExperimentError where the lattice lacks one of them."""
-        radius = 4 * max(math.hypot(*vector) for vector in cell.vectors)
-        roles = _roles(cell.offsets(sublattice, radius))
-        return [[o for o, (what, _) in roles if what == shell] for shell in (ALONG, NEXT, ACROSS)]
+from pbdkit_pantograph.fibres import ACROSS, ALONG, NEXT, roles_of
 
 
 class Pantograph(pbdkit.FollowerRule):
@@ -72,7 +45,7 @@ class Pantograph(pbdkit.FollowerRule):
     def weights(self, slot: pbdkit.Slot, setting: pbdkit.Setting) -> dict[str, float]:
         """Stiffness and rest length of the spring, and 1 for the one of the eight points along the
         fibres that it is: `next0` to `next3`, and `after0` to `after3` behind them."""
-        roles = {s.rest: role for s, role in _roles(setting.slots[slot.source])}
+        roles = {s.rest: role for s, role in roles_of(setting.slots[slot.source])}
         what, direction = roles.get(slot.rest, ("", 0))
         stiffness = {ALONG: 1.0, ACROSS: self.shear}.get(what, 0.0)
         return {
@@ -123,47 +96,3 @@ def _bent(next_points: Any, after: Any) -> tuple[Any, Any]:
     middle, one, other = has_u * has_v, has_u * has_uu, has_v * has_vv
     force = 2.0 * middle * (u + v) + (one * (2.0 * u - uu) + other * (2.0 * v - vv))
     return force, 4.0 * middle + 2.0 * (one + other)
-
-
-def _roles(steps: Iterable[Step]) -> list[tuple[Step, Role]]:
-    """Those among the steps to a site's neighbours that are along or across the fibres.
-
-    Raises ExperimentError where one of the twelve is missing.
-    """
-    known = list(steps)
-    one, other = _families([step.rest for step in known])
-    rests = {
-        (what, n): reach * e
-        for what, reach in ((ALONG, 1), (NEXT, 2))
-        for n, e in enumerate((one, -one, other, -other))
-    }
-    diagonals = one + other, -one - other, one - other, other - one
-    rests |= {(ACROSS, n): e for n, e in enumerate(diagonals)}
-    return [(_found(known, rest), role) for role, rest in rests.items()]
-
-
-def _families(rests: list[pbdkit.Components]) -> tuple[pbdkit.Components, pbdkit.Components]:
-    """The two shortest that are not in line, of equal ones those of the smallest angle to x."""
-    shortest = min(math.hypot(*rest) for rest in rests)
-    flat = 1e-6 * shortest
-    ahead = [r for r in rests if r.y > flat or (abs(r.y) <= flat and r.x > 0)]
-    ahead.sort(key=lambda r: (round(math.hypot(*r) / shortest, 6), math.atan2(max(r.y, 0.0), r.x)))
-    one = ahead[0]
-    other = next((r for r in ahead if abs(one.x * r.y - one.y * r.x) > flat * shortest), one)
-    return one, other
-
-
-def _found(steps: list[Step], rest: pbdkit.Components) -> Step:
-    for step in steps:
-        if pbdkit.length(step.rest - rest) < 1e-6 * pbdkit.length(rest):
-            return step
-    raise pbdkit.ExperimentError(
-        f"fibres need a neighbour at ({rest.x:.4g}, {rest.y:.4g}): take a lattice of one site, "
-        "and {type: fibres} for the neighbours"
-    )
-
-
-@pbdkit.hookimpl
-def pbdkit_components() -> list[type[pbdkit.Component]]:
-    """What this distribution offers."""
-    return [Fibres, Pantograph]
