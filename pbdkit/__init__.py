@@ -50,6 +50,8 @@ if TYPE_CHECKING:
         Here as Here,
         Lattice as Lattice,
         LeaderRows as LeaderRows,
+        LoadRows as LoadRows,
+        Loadable as Loadable,
         Moment as Moment,
         Nearness as Nearness,
         NeighbourMetric as NeighbourMetric,
@@ -85,9 +87,9 @@ _HOME = {
     "pbdkit.interfaces": (
         "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
         "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here Lattice "
-        "LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles Remembered Remembers "
-        "RenewsBonds RenewsParticles Setting Slot Softens SpaceVector StartsCracked Stiffness "
-        "StoresEnergy Variable Vector dot length squared_length where"
+        "LeaderRows LoadRows Loadable Moment Nearness NeighbourMetric Offset Pair Particles "
+        "Remembered Remembers RenewsBonds RenewsParticles Setting Slot Softens SpaceVector "
+        "StartsCracked Stiffness StoresEnergy Variable Vector dot length squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

@@ -12,9 +12,9 @@ from pbdkit.components.cell_stiffness import on_both_sides
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
-    Calibrated,
     FollowerRule,
     Here,
+    Loadable,
     Setting,
     Slot,
     Stiffness,
@@ -23,7 +23,7 @@ from pbdkit.interfaces import (
 )
 
 
-class CellElastic(Calibrated, FollowerRule):
+class CellElastic(Loadable, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -74,10 +74,7 @@ class CellElastic(Calibrated, FollowerRule):
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """W d, and entries of W, of which the sum is symmetric."""
-        whole = w.left + w.right
-        xx, yy = w.xx * whole, w.yy * whole
-        xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
-        return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
+        return pulled(d, w)
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Vector:
@@ -88,6 +85,20 @@ class CellElastic(Calibrated, FollowerRule):
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · Σ W d."""
         return p.modulus * total[0]
+
+    @staticmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """The load over the modulus, besides Σ W d."""
+        pull, xx, xy, yy = total
+        return pull + load / p.modulus, xx, xy, yy
+
+
+def pulled(d: Any, w: Any) -> tuple[Any, ...]:
+    """W d with the weight of a bond, and the entries xx, xy, yy of W."""
+    whole = w.left + w.right
+    xx, yy = w.xx * whole, w.yy * whole
+    xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
+    return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
 
 
 def mean_move(total: Any) -> Vector:
@@ -207,13 +218,25 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
         return parameters | {"c": self.length**2 / diffusion}
 
     @staticmethod
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+        """c W d, and entries of W."""
+        pull, xx, xy, yy = pulled(d, w)
+        return p.c * pull, xx, xy, yy
+
+    @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Any:
-        """z - c (Σ W)⁻¹ Σ W (z_k - z_j)."""
-        return here.u - p.c * mean_move(total)
+        """z - (Σ W)⁻¹ c Σ W (z_k - z_j)."""
+        return here.u - mean_move(total)
 
     @staticmethod
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · (Σ W z_j - c Σ W (z_k - z_j))."""
         pull, xx, xy, yy = total
         x, y = here.u
-        return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - p.c * pull)
+        return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - pull)
+
+    @staticmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """Less the load over the modulus, besides c Σ W d: that counts against z."""
+        pull, xx, xy, yy = total
+        return pull - load / p.modulus, xx, xy, yy

@@ -21,6 +21,7 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.loads import Load
 from pbdkit.experiment.parts import brief, fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.solvers import AnySolver, Stepping
@@ -33,11 +34,13 @@ from pbdkit.interfaces import (
     FractureModel,
     FramePolicy,
     Lattice,
+    Loadable,
     NeighbourMetric,
     RenewsParticles,
     Softens,
 )
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.registry import Registry
 
 
@@ -90,6 +93,7 @@ class Experiment(Strict):
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
+    loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
@@ -101,6 +105,7 @@ class Experiment(Strict):
         anew, jumps = self.neighbours.nearness() is not None, not self.solver.makes_steps
         remembers = isinstance(self.rule, RenewsParticles)
         softens = isinstance(self.fracture, Softens)
+        knows_forces = isinstance(self.rule, Loadable) and material_of(self.rule) is not None
         clashes = [
             ("record", last > self.steps, f"step {last} is beyond the run's {self.steps}"),
             ("fracture", anew and self.fracture.can_break,
@@ -118,6 +123,13 @@ class Experiment(Strict):
             ("solver", jumps and remembers,
              f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
              "all of them; take solver: {type: stepping}"),
+            ("loads", bool(self.loads) and not knows_forces,
+             f"the rule '{self.rule.type}' with these parameters knows no forces: it says where a "
+             "particle goes, and of no material how far a force would move it; take a calibrated "
+             "rule ('elastic' or 'strain-gradient' with poisson_ratio above -1, 'orthotropic', "
+             "'springs')"),
+            ("loads", bool(self.loads) and anew,
+             "need neighbours that stay; set neighbours.reevaluate: false"),
         ]  # fmt: skip
         for key, clash, text in clashes:
             if clash:

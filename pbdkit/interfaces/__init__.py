@@ -1,7 +1,7 @@
 """What the author of a component reads: the six interfaces and the data they exchange."""
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
+from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, LoadRows, Moment, Variable
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
@@ -17,6 +17,7 @@ from pbdkit.interfaces.rule import (
     Calibrated,
     FollowerRule,
     Here,
+    Loadable,
     RenewsParticles,
     Setting,
     Stiffness,
@@ -46,8 +47,9 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "INTERFACES", "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated",
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "Moment", "Nearness",
-    "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "LoadRows",
+    "Loadable", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles",
+    "Remembered", "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens",
+    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot",
+    "length", "squared_length", "where",
 ]  # fmt: skip

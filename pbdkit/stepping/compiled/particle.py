@@ -37,6 +37,8 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
         rows["z@"] = f"{level.source}_@"
+    if plan.is_loaded(level):
+        rows["g@"] = "load_@"
     for row, of in rows.items():
         out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
     out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
@@ -93,7 +95,10 @@ def target_lines(
         centred = _shifted(plan, "-", plan.scene.middle)
     own = values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
     lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({own}))")
-    lines.append(f"move = apply{n}(({sums},), here, p)")
+    total = f"({sums},)"
+    if plan.is_loaded(level):
+        total = f"loaded{n}({total}, {plan.vector('g@[j]')}, p)"
+    lines.append(f"move = apply{n}({total}, here, p)")
     changing: list[int] = []
     if isinstance(level.scene.experiment.rule, RenewsParticles):
         changing = [m for m, number in enumerate(level.seen.own) if number.changes]
