@@ -41,8 +41,8 @@ class UnconvergedError(Exception):
 
 @dataclass(frozen=True)
 class Finder:
-    """Looks for the equilibria of a scene, to a tolerance that is a length, by one of the solver's
-    methods. `scale` is the length that shares are of."""
+    """Looks for equilibria of a scene, to within a length, by one of the solver's methods. `scale`
+    is the length that shares are of."""
 
     scene: Scene
     tolerance: float
@@ -137,8 +137,8 @@ class _Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        step, moves = math.ceil(self._moment), finder.moves
-        return linearised(finder.scene, at, step, finder.method, finder.watch, moves)
+        how = math.ceil(self._moment), finder.method, finder.watch, finder.moves
+        return linearised(finder.scene, at, *how)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
@@ -207,8 +207,7 @@ class _Newton(_Search):
         """How far leaders went on, or others under loads that did."""
 
     def run(self) -> Certificate:
-        """Raises UnconvergedError where corrections do not become smaller fast, or where what they
-        lead to is not stable."""
+        """Raises UnconvergedError where corrections do not shrink, or lead to nothing stable."""
         self._go_ahead()
         self._correct()
         certificate = self._certified()

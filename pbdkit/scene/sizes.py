@@ -25,6 +25,9 @@ WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
 the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
 of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
 
+LOADS = 0
+"""The same where loads act on everybody."""
+
 GRADIENT, FORCES, TABLES = 250, 160, 40
 """The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
 
@@ -68,7 +71,7 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
     """Bytes a particle besides state and table, with `each` neighbours."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
     made = WORKSPACE + experiment.shows_bonds * planes * BONDS
-    made += INNER * isinstance(rule, AppliesTwice)
+    made += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
     made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
     tables = [d for d in diagnostics if any("particle" in v.dims for v in d.variables())]
     if any("cells" in d.needs for d in tables):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass
-from functools import singledispatch
+from functools import partial, singledispatch
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from pbdkit.interfaces import (
     FramePolicy,
     Here,
     Lattice,
+    Loadable,
     NeighbourMetric,
     RenewsBonds,
     RenewsParticles,
@@ -38,12 +39,15 @@ from pbdkit.testing.states import (
     SEED,
     SHAPE,
     Shown,
+    applied,
     differences,
     frame_showing,
+    gathered,
     here,
     moment_of,
     owners,
     remembers,
+    standing,
 )
 
 Arrays = dict[str, Any]
@@ -103,27 +107,10 @@ def questions_of(component: Component, scene: Scene, seed: int) -> list[Question
     raise TypeError(f"{type(component).__name__} is of no interface")
 
 
-def gathered(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
-    """The contributions of every slot."""
-    evaluator = Evaluator(scene)
-    neighbours = zip(d, evaluator.everywhere(scene.neighbourhood.slots[0]), strict=True)
-    return [evaluator.contribution(one, one, to) for one, to in neighbours]
-
-
-def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
-    """The move that the sums of contributions make."""
-    return Evaluator(scene).move(summed((c, None) for c in contributions), _standing(scene, **at))
-
-
-def _standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
-    place = X if scene.experiment.rule.uses_reference else None
-    return Here(u, place, place, scene.constants.of_particle(*own))
-
-
 @questions_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
-    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force` and `draw`
-    where it has them."""
+    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force`, `loaded`
+    and `draw` where it has them."""
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
     gather = Question("gather", {"d": d}, lambda d: gathered(scene, d), elementwise=True)
@@ -139,15 +126,19 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
 
     def question(what: str) -> Question:
         def ask(total: Any, **to: Any) -> Any:
-            return asks[what](total, _standing(scene, **to))
+            return asks[what](total, standing(scene, **to))
 
         return Question(what, {"total": total} | at, ask, elementwise=True)
 
+    loads: list[Question] = []
+    if isinstance(rule, Loadable) and material_of(rule) is not None:
+        given = {"total": total, "load": here(scene, seed + 1)["u"]}
+        loads.append(Question("loaded", given, partial(rule.loaded, p=scene.constants.rule), True))
     slots = zip(d, scene.neighbourhood.slots[0], strict=True)
     meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
     what = "apply, where all neighbours meet in the particle,"
     met = Question(what, meeting | at, lambda d, **to: applied(scene, gathered(scene, d), **to))
-    return [gather, *map(question, asks), met, *_to_draw(rule, scene)]
+    return [gather, *map(question, asks), *loads, met, *_to_draw(rule, scene)]
 
 
 @questions_of.register

@@ -17,6 +17,7 @@ from pbdkit.interfaces import (
     Bonds,
     Component,
     FollowerRule,
+    Here,
     LeaderRows,
     Particles,
     Remembered,
@@ -26,6 +27,7 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, summed
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
 
@@ -100,6 +102,24 @@ def here(scene: Scene, seed: int) -> dict[str, Any]:
     return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": own}
 
 
+def gathered(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
+    """The contributions of every slot."""
+    evaluator = Evaluator(scene)
+    neighbours = zip(d, evaluator.everywhere(scene.neighbourhood.slots[0]), strict=True)
+    return [evaluator.contribution(one, one, to) for one, to in neighbours]
+
+
+def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
+    """The move that the sums of contributions make."""
+    return Evaluator(scene).move(summed((c, None) for c in contributions), standing(scene, **at))
+
+
+def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
+    """What stands at a particle."""
+    place = X if scene.experiment.rule.uses_reference else None
+    return Here(u, place, place, scene.constants.of_particle(*own))
+
+
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
     """Numbers that it remembers of some particles, or of some bonds that have not broken, as they
     are at the start or two steps later; those of one owner stand together."""
@@ -159,6 +179,8 @@ class Shown:
             return place[found]
         if name == "leader_groups":
             return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+        if name == "loads":
+            return tuple(load._replace(rows=place[load.rows]) for load in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
 

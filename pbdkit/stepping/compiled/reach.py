@@ -4,8 +4,8 @@ At rest a rule moves nothing, exactly; so a step can only move particles that be
 one that has moved. Where that is plain from the scene nothing has moved before the leaders do;
 elsewhere the first step looks at every particle and finds those that are not at rest. From then on
 the box around what has moved, and around leaders that are not at home, grows by one bond a step,
-and by as many as rules work on each other's moves. Where something is remembered that changes, everything is
-looked at in every step.
+and by as many as rules work on each other's moves. Where something is remembered that changes,
+everything is looked at in every step.
 """
 
 from __future__ import annotations

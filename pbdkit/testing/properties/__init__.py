@@ -7,6 +7,7 @@ from pbdkit.testing.properties import (
     elementwise,
     every,
     lattice_parts,
+    loads,
     particulars,
     repetition,
     start,
@@ -16,7 +17,7 @@ from pbdkit.testing.subject import Property
 
 PROPERTIES: tuple[Property, ...] = tuple(
     found
-    for page in (every, lattice_parts, start, repetition, elementwise, particulars, steps)
+    for page in (every, lattice_parts, start, repetition, elementwise, particulars, loads, steps)
     for found in vars(page).values()
     if isinstance(found, Property)
 )
