@@ -31,6 +31,8 @@ SPRINGS = {"type": "springs"}
 ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
 GRADIENT = {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 0.4}
 HELD = [{"select": {"edge": "left"}, "motion": {"type": "hold"}}]
+FREE = {"leaders": [], "diagnostics": []}
+QUICK = {"type": "stepping", "memory": "auto"}
 TIP = {"select": {"edge": "right"}, "force": [0.03, -0.01]}
 ALL = {"box": [-1, -1, 9, 9]}
 WEIGHT = {"select": ALL, "body_force": [0.0, -0.002]}
@@ -143,32 +145,32 @@ def test_a_body_force_counts_the_area_of_cells():
 
 def test_loads_act_from_and_until():
     """Before, nobody has moved, exactly; after, the body comes back to rest."""
-    given = loaded(TIP | {"from": 4, "until": 9}, steps=4000, solver={"type": "stepping"})
+    given = loaded(TIP | {"from": 4, "until": 9}, steps=900, solver=QUICK)
     ds = ran(given | {"record": {"at": [3, 4, 9, 10]}})
     u = abs(ds.position - ds.reference).max(["particle", "axis"])
     assert u.sel(time=3) == 0.0 < u.sel(time=4) < u.sel(time=9)
-    assert float(u.sel(time=4000)) < 1e-9
+    assert float(u.sel(time=900)) < 1e-9
     acting = ds.load_resultant.sel(time=[3, 4, 9, 10])[:, 0, 0]
     assert acting.values == pytest.approx([0.0, 0.03, 0.03, 0.0])
 
 
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS], ids=["elastic", "springs"])
 def test_steps_settle_at_the_equilibrium(rule):
-    there = ran(loaded(TIP, WEIGHT, rule=rule, steps=20000)).position.values[-1]
-    solver = {"type": "stepping", "settle": {"tolerance": 1e-6}}
-    ds = ran(loaded(TIP, WEIGHT, rule=rule, steps=20000, solver=solver))
+    parts = {"rule": rule, "steps": 5000, "record": {"at": [1]}, "diagnostics": []}
+    there = ran(loaded(TIP, WEIGHT, **parts)).position.values[-1]
+    ds = ran(loaded(TIP, WEIGHT, solver=QUICK | {"settle": {"tolerance": 1e-4}}, **parts))
     assert ds.attrs["status"] == "settled"
     way = abs(there - ds.reference.values).max()
-    assert abs(ds.position.values[-1] - there).max() < 2e-6 * way
+    assert abs(ds.position.values[-1] - there).max() < 1e-4 * way
 
 
 def test_shares_are_of_the_way_that_loads_make():
     """A thousandth of the load settles as the load does."""
-    solver = {"type": "stepping", "settle": {"tolerance": 1e-3}}
+    solver = QUICK | {"settle": {"tolerance": 1e-3}}
     found = []
     for size in (1.0, 1e-6):
         tip = TIP | {"force": [0.03 * size, -0.01 * size]}
-        ds = ran(loaded(tip, steps=20000, solver=solver))
+        ds = ran(loaded(tip, steps=5000, solver=solver, record={"at": [1]}, diagnostics=[]))
         found.append(((ds.position - ds.reference).values[-1] / size, ds.time.values[-1]))
     assert found[0][1] == pytest.approx(found[1][1], rel=0.01)
     np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-3 * abs(found[0][0]).max())
@@ -177,7 +179,7 @@ def test_shares_are_of_the_way_that_loads_make():
 def test_a_released_body_is_where_its_steps_are():
     """Where nothing holds it, how far it went under the load counts."""
     push = TIP | {"until": 20}
-    free = loaded(push, leaders=[], steps=3000)
+    free = loaded(push, steps=600, **FREE)
     stepped = ran(free | {"solver": {"type": "stepping"}})
     np.testing.assert_allclose(ran(free).position[-1], stepped.position[-1], atol=1e-8)
 
@@ -185,13 +187,13 @@ def test_a_released_body_is_where_its_steps_are():
 @pytest.mark.parametrize("rule", [ELASTIC, SPRINGS], ids=["elastic", "springs"])
 def test_what_nothing_holds_has_no_equilibrium(rule):
     with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of 24 particles"):
-        ran(loaded(TIP, rule=rule, leaders=[]))
+        ran(loaded(TIP, rule=rule, **FREE))
 
 
 def test_forces_in_balance_need_no_leader():
     back = {"select": {"edge": "left"}, "force": [-0.03, 0.0]}
     forth = {"select": {"edge": "right"}, "force": [0.03, 0.0]}
-    ds = ran(loaded(back, forth, rule={"type": "elastic", "poisson_ratio": 0.3}, leaders=[]))
+    ds = ran(loaded(back, forth, **FREE))
     u = (ds.position - ds.reference).values[-1]
     strain = np.polyfit(ds.reference.values[:, 0], u[:, 0], 1)[0]
     assert strain == pytest.approx(0.01, rel=1e-8)
@@ -242,12 +244,12 @@ def test_loads_come_in_increments_where_bonds_can_break():
     given = loaded(TIP | {"from": 2, "until": 3}, rule=SPRINGS, fracture=breaking, steps=6)
     found = moments(scene_of(given), 10)
     assert found == pytest.approx([1.0, *np.linspace(1.2, 2.0, 5), 3.0, *np.linspace(3.2, 4.0, 5)])
-    pulled = TIP | {"force": [0.2, 0.0]}
-    torn = ran(loaded(pulled, rule=SPRINGS, fracture=breaking | {"failure": 0.5}))
-    assert torn.attrs["status"] == "complete"
+    parts = {"solver": {"type": "equilibrium", "increments": 4}, "diagnostics": []}
+    whole = loaded(TIP, rule=SPRINGS, fracture=breaking | {"failure": 0.5}, **parts)
+    torn = ran(whole)
     assert (torn.broken_step.values < 0).all()
-    with pytest.raises(pbdkit.ExperimentError, match=r"nothing holds|do not hold"):
-        ran(loaded(pulled, rule=SPRINGS, fracture=breaking))
+    plain = ran(loaded(TIP, rule=SPRINGS, **parts))
+    np.testing.assert_allclose(torn.position[-1], plain.position[-1], atol=1e-8)
 
 
 def test_a_load_is_linear_between_steps():
@@ -262,7 +264,7 @@ def test_a_dataset_runs_again_and_tells_of_its_loads():
     np.testing.assert_array_equal(ds.position, again.position)
     assert '"force":[0.03,-0.01]' in ds.attrs["experiment"].replace(" ", "")
     assert ds.load_resultant.attrs["units"]
-    assert ds.load.values.tolist() == [0]
+    assert ds["load"].values.tolist() == [0]
 
 
 KNOWS_NONE = r"loads: the rule '.*' with these parameters knows no forces: .* take a calibrated"
