@@ -25,7 +25,7 @@ WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
 the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
 of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
 
-LOADS = 0
+LOADS = 60
 """The same where loads act on everybody."""
 
 GRADIENT, FORCES, TABLES = 250, 160, 40
