@@ -31,7 +31,7 @@ def bears_loads_as_forces(subject: Subject) -> None:
         at, under = standing(scene, **here(scene, seed)), rule.loaded(total, load, p)
         _compare(evaluator.force(under, at), evaluator.force(total, at) + load, "the force is not")
         still = flat(rule.loaded(total, 0.0 * load, p))
-        if any((still[name] != value).any() for name, value in flat(total).items()):
+        if any(np.any(still[name] != value) for name, value in flat(total).items()):
             raise PropertyError("`loaded` changes the sums where the load is 0")
         added.append(evaluator.move(total, at, load) - evaluator.move(total, at))
     _compare(added[0], added[1], "what it adds to the move is not, wherever neighbours stand,")
