@@ -55,6 +55,8 @@ if TYPE_CHECKING:
         Here as Here,
         Lattice as Lattice,
         LeaderRows as LeaderRows,
+        LoadRows as LoadRows,
+        Loadable as Loadable,
         Moment as Moment,
         Nearness as Nearness,
         NeighbourMetric as NeighbourMetric,
@@ -93,11 +95,10 @@ _HOME = {
     "pbdkit.interfaces": (
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
         "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel FrameMap "
-        "FramePolicy FrameSites Here Lattice LeaderRows Moment Nearness NeighbourMetric Offset "
-        "Pair Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
-        "SharesParticles Slot Softens SpaceVector StartsCracked Stiffness StoresEnergy "
-        "TurnsParticles Variable Vector dot length "
-        "squared_length where"
+        "FramePolicy FrameSites Here Lattice LeaderRows LoadRows Loadable Moment Nearness "
+        "NeighbourMetric Offset Pair Particles Quantity Remembered Remembers RenewsBonds "
+        "RenewsParticles Setting SharesParticles Slot Softens SpaceVector StartsCracked Stiffness "
+        "StoresEnergy TurnsParticles Variable Vector dot length squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

@@ -247,9 +247,16 @@ ORTHOTROPIC = {
 
 
 @st.composite
+def loads(draw):
+    kind, force = draw(one_of(["force", "body_force"])), draw(vectors)
+    acting = {"from": draw(st.integers(1, 4))} | draw(one_of([{}, {"until": 5}]))
+    return {"select": draw(selections), kind: [0.1 * f for f in force]} | acting
+
+
+@st.composite
 def calibrated_experiments(draw):
-    """Rules of elasticity, where they go: cut cells, frames with and without free edges, fracture;
-    the strain gradient with the natural frame and nothing that breaks."""
+    """Rules of elasticity, where they go: cut cells, frames with and without free edges, fracture,
+    loads; the strain gradient with the natural frame and nothing that breaks."""
     kind = draw(one_of(["square", "rectangular", "hexagonal"]))
     lattice = {"type": kind, "a": 1.0} | ({"b": 1.3} if kind == "rectangular" else {})
     rules = {"square": [*ELASTIC, SPRINGS, ORTHOTROPIC, GRADIENT], "hexagonal": [*ELASTIC, SPRINGS]}
@@ -260,6 +267,8 @@ def calibrated_experiments(draw):
         changed |= AROUND_SQUARES
     near = changed["neighbours"]
     experiment = draw(experiments(leaders=st.one_of(any_leaders, pulled_apart())))
+    if rule.get("poisson_ratio", 0.0) > -1.0:
+        experiment["loads"] = draw(st.lists(loads(), max_size=2))
     whole = experiment["body"]["type"] == "grid" and kind != "hexagonal"
     free = ["natural", "traction-free"] if whole else ["natural"]
     experiment |= changed | {"fracture": {"type": "none"}}

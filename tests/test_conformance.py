@@ -76,6 +76,7 @@ FAULTS = [
     (rules.Varies, "returns-a-value-a-particle", "`gather` returns now 2, now 3 values"),
     (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
     (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
+    (rules.BearsTwice, "bears-loads-as-forces", "the force is not the same as without, and the"),
     (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
     (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
     (rules.Raises, "changes-no-input", "has no attribute 'strength'"),

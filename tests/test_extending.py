@@ -33,6 +33,7 @@ PAGE_OF = {
 CAPABILITIES = {
     "FollowerRule": (
         pbdkit.Calibrated,
+        pbdkit.Loadable,
         pbdkit.StoresEnergy,
         pbdkit.Remembers,
         pbdkit.Draws,

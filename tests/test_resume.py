@@ -28,6 +28,13 @@ Call = Callable[..., Any]
 OUT = Path("tensile.nc")
 EVERYTHING = [{"type": "pe1"}, {"type": "displacement"}, {"type": "track", "numbers": [13]}]
 FRACTURE = {"type": "threshold", "thresholds": [1.6]}
+LOADED: dict[str, Any] = {
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "rule": {"type": "springs"},
+    "frame": {"type": "natural"},
+    "loads": [{"select": {"edge": "top"}, "force": [0.0, 0.02], "from": 3, "until": 6}],
+    "diagnostics": [{"type": "load-displacement", "youngs_modulus": 1.0}],
+}
 RUNS: dict[str, dict[str, Any]] = {
     "plain": {},
     "everything": {"diagnostics": EVERYTHING},
@@ -40,6 +47,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
     "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
     "equilibrium": {"solver": {"type": "equilibrium"}},
+    "loads": LOADED,
+    "equilibrium, loads": LOADED | {"solver": {"type": "equilibrium"}},
     "equilibrium, fracture": {
         "solver": {"type": "equilibrium", "increments": 20},
         "fracture": FRACTURE,

@@ -22,11 +22,14 @@ from pbdkit.stepping.state import initial_state
 
 TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
 STEPPED = "solver={type: stepping, relaxation: 0.2}"
+SWINGING = "solver={type: stepping, memory: 0.9}"
 SMALLER = {
     "material/bar": ["lattice.a=0.2"],
     "modelling/strip": ["units.length=3.125 mm"],
     "material/cantilever": ["lattice.a=0.25"],
     "material/hole": ["lattice.a=0.2"],
+    "modelling/cantilever-weight": ["lattice.a=0.5", SWINGING],
+    "modelling/hanging-bar": ["lattice.a=0.5", SWINGING],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],
     "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
     + [

@@ -1,7 +1,8 @@
 """The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
 u(t+1) = now · u(t) + before · u(t-1) + led · u_L + source for the displacements of the followers,
-an unknown a particle and axis. `before` is empty but for frames with lag and for memory.
+an unknown a particle and axis. `before` is empty but for frames with lag and for memory; loads are
+in `source`.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import Couplings, Entries, frame_matrices, scaled, some_of
 from pbdkit.analysis.linear_response import by_sublattice, has_neighbours, respond
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
@@ -153,7 +156,7 @@ class _Assembly:
     """Collects the couplings, looking particles up by their flat place on the raster."""
 
     def __init__(self, scene: Scene, state: State, step: int) -> None:
-        self._scene, self._state = scene, state
+        self._scene, self._state, self._step = scene, state, step
         raster, kinds = scene.raster, kinds_at(scene.raster, scene.leading, step)
         self._kind = np.full(raster.kind.size, EMPTY, np.int8)
         self._unknown = np.full(raster.kind.size, -1, np.int32)
@@ -180,8 +183,19 @@ class _Assembly:
             self._before.add_scaled_identity(moving, -solver.memory)
         if u.any():
             moves = moves - couplings.times(u.reshape(scene.axes, -1).T.astype(float, copy=False))
+        if scene.loads:
+            moves = moves + self._pushed(place)
         source, who = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
         return StepOperator(*who, self._now, self._before, self._led, self._shown, source)
+
+    def _pushed(self, place: Indices) -> Floats:
+        """(follower, axis): what the loads of the step add to the moves."""
+        moved = []
+        for scene in (replace(self._scene, loads=None), self._scene):
+            state = replace(self._state.copy(), step=self._step - 1)
+            SlotFollowers(scene, Stepping()).move(self._state.u, state.previous, state)
+            moved.append(state.previous.reshape(scene.axes, -1)[:, place].T)
+        return moved[1] - moved[0]
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""

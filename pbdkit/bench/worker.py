@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.api import load
-from pbdkit.equilibrium.certificate import Certificate, scale_of
+from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, scale_of
 from pbdkit.equilibrium.grids.inverse_iteration import SlowMode
 from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.newton import UnconvergedError
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.results.progress import Watch

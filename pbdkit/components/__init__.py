@@ -17,7 +17,7 @@ COMPONENTS = {
     "strain_fracture": "StrainFracture Damage",
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
     "fields": "Strain Rotation Stress",
-    "forces": "StrainEnergy Reaction StressStrain",
+    "forces": "StrainEnergy Reaction LoadDisplacement StressStrain",
 }
 """By module of this folder the classes that it offers."""
 

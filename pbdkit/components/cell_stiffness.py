@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Slot, Stiffness
+from pbdkit.interfaces import Slot, Stiffness, Vector
 from pbdkit.interfaces.polygons import Tiling
 
 Floats = NDArray[np.float64]
@@ -41,7 +42,23 @@ def _of_mean_strain(c: Stiffness, gradient: Floats, area: float) -> Floats:
     return K
 
 
-def on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:
+def bond_weights(slot: Slot, c: Stiffness, cells: Tiling) -> dict[str, float]:
+    """xx, xy, yx, yy: of the cell to the left of a slot [[xx, xy], [yx, yy]], of that to the right
+    the transpose; a cell on both sides counts half on each."""
+    left, right = _on_both_sides(slot, c, cells)
+    mean = (left + right.T) / 2
+    return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
+
+
+def pulled(d: Any, w: Any) -> tuple[Any, ...]:
+    """W d with the weight of a bond, and the entries xx, xy, yy of W."""
+    whole = w.left + w.right
+    xx, yy = w.xx * whole, w.yy * whole
+    xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
+    return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
+
+
+def _on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:
     """-K_jk in the cell to the left and in that to the right of a slot, half of it in each where
     both are one cell."""
     if not cells.rectangle:

@@ -8,12 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import on_both_sides
+from pbdkit.components.cell_stiffness import bond_weights, pulled
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
     FollowerRule,
     Here,
+    Loadable,
     MixesCells,
     Setting,
     Slot,
@@ -29,7 +30,7 @@ Factor = Annotated[
 ]
 
 
-class CellElastic(MixesCells, FollowerRule):
+class CellElastic(MixesCells, Loadable, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -76,20 +77,17 @@ class CellElastic(MixesCells, FollowerRule):
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
         to the right the transpose; a cell on both sides counts half on each."""
-        return _weights(slot, setting, self.material()[1])
+        return bond_weights(slot, self.material()[1], setting.cells)
 
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
         """The same of cells of that stiffness."""
         modulus = self.stiffness * self.material()[0]
-        return _weights(slot, setting, Stiffness(*(value / modulus for value in c)))
+        return bond_weights(slot, Stiffness(*(value / modulus for value in c)), setting.cells)
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """W d, and entries of W, of which the sum is symmetric."""
-        whole = w.left + w.right
-        xx, yy = w.xx * whole, w.yy * whole
-        xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
-        return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
+        return pulled(d, w)
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Vector:
@@ -101,11 +99,11 @@ class CellElastic(MixesCells, FollowerRule):
         """Modulus · Σ W d."""
         return p.modulus * total[0]
 
-
-def _weights(slot: Slot, setting: Setting, ratios: Stiffness) -> dict[str, float]:
-    left, right = on_both_sides(slot, ratios, setting.cells)
-    mean = (left + right.T) / 2
-    return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
+    @staticmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """The load over the modulus, besides Σ W d."""
+        pull, xx, xy, yy = total
+        return pull + load / p.modulus, xx, xy, yy
 
 
 def mean_move(total: Any) -> Vector:
@@ -225,13 +223,25 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
         return parameters | {"c": self.length**2 / diffusion}
 
     @staticmethod
+    def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
+        """c W d, and entries of W."""
+        pull, xx, xy, yy = pulled(d, w)
+        return p.c * pull, xx, xy, yy
+
+    @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Any:
-        """z - c (Σ W)⁻¹ Σ W (z_k - z_j)."""
-        return here.u - p.c * mean_move(total)
+        """z - (Σ W)⁻¹ c Σ W (z_k - z_j)."""
+        return here.u - mean_move(total)
 
     @staticmethod
     def force(total: Any, here: Here, p: Any) -> Any:
         """Modulus · (Σ W z_j - c Σ W (z_k - z_j))."""
         pull, xx, xy, yy = total
         x, y = here.u
-        return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - p.c * pull)
+        return p.modulus * (Vector(xx * x + xy * y, xy * x + yy * y) - pull)
+
+    @staticmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """Less the load over the modulus, besides c Σ W d: that counts against z."""
+        pull, xx, xy, yy = total
+        return pull - load / p.modulus, xx, xy, yy

@@ -57,8 +57,9 @@ class StrainEnergy(Diagnostic):
 class Reaction(Diagnostic):
     """The resultant force that each leader group must exert; 0 while it does not lead.
 
-    Minus the forces of the neighbours on its particles; a particle of two groups counts half with
-    each. All groups together exert nothing under the natural frame. Frame points pull too: at the
+    Minus the forces of the neighbours on its particles, and the loads on them; a particle of two
+    groups counts half with each. Under the natural frame all groups together exert nothing, or
+    minus the loads. Frame points pull too: at the
     corners of held edges that is no force of the body, and a warning says so.
     """
 
@@ -81,6 +82,34 @@ class Reaction(Diagnostic):
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """E t times the sums."""
         return (self.youngs_modulus * self.thickness * reactions(now),)
+
+
+class LoadDisplacement(Diagnostic):
+    """The load-displacement curve of each load: its resultant, 0 while it does not act, and the
+    mean displacement of its particles, each counted by what it bears of the load, so that the area
+    under the curve is the work of the load.
+    """
+
+    type: Literal["load-displacement"] = "load-displacement"
+    youngs_modulus: Modulus
+    thickness: Thickness = 1.0
+
+    needs: ClassVar[frozenset[Need]] = frozenset({"loads"})
+
+    def variables(self) -> tuple[Variable, ...]:
+        """`load_resultant`, `load_displacement`."""
+        dims, mean = ("load", "axis"), "mean displacement of the load's particles"
+        return (
+            Variable("load_resultant", dims, "resultant of the load", FORCE.lattice),
+            Variable("load_displacement", dims, mean, "lattice unit"),
+        )
+
+    def measure(self, now: Moment) -> tuple[Any, ...]:
+        """E t times the sums, and the means."""
+        loads = now.loads()
+        resultant = np.stack([load.share.sum() * load.force for load in loads])
+        means = [load.share @ now.displacement(load.rows) / load.share.sum() for load in loads]
+        return self.youngs_modulus * self.thickness * resultant, np.stack(means)
 
 
 class StressStrain(Diagnostic):
@@ -161,7 +190,9 @@ class StressStrain(Diagnostic):
 
 def reactions(now: Moment) -> Floats:
     """What each leader group exerts over Young's modulus and thickness, (leader group, axis)."""
-    forces, groups = now.forces.on_particles(), now.leader_groups()
+    forces, groups = np.array(now.forces.on_particles()), now.leader_groups()
+    for load in now.loads():
+        forces[load.rows] += np.outer(load.share, load.force)
     leaders = [group.rows if group.leads else group.rows[:0] for group in groups]
     times = np.bincount(np.concatenate(leaders), minlength=len(forces))
     return np.stack([0.0 - (forces[rows] / times[rows, None]).sum(axis=0) for rows in leaders])

@@ -12,6 +12,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     FollowerRule,
     Here,
+    Loadable,
     Setting,
     Slot,
     Stiffness,
@@ -127,7 +128,7 @@ EDGE_OF_SQUARE, DIAGONAL_OF_SQUARE, OF_TRIANGLE = 0.75, 0.375, math.sqrt(0.75)
 """Stiffnesses of the springs over Young's modulus and thickness: isotropic with ν = 1/3."""
 
 
-class Springs(StoresEnergy, FollowerRule):
+class Springs(Loadable, StoresEnergy, FollowerRule):
     """Each neighbour proposes the place at its rest distance, on the line to where the particle
     stands: x_k + l₀ (x_j - x_k)/|x_j - x_k|; the particle goes to the weighted mean.
 
@@ -177,6 +178,11 @@ class Springs(StoresEnergy, FollowerRule):
     def force(total: Any, here: Here, p: Any) -> Any:
         """Σ k e n."""
         return total[0]
+
+    @staticmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """The load besides Σ k e n."""
+        return total[0] + load, total[1]
 
     @staticmethod
     def energy(d: Any, r: Any, w: Any, p: Any) -> Any:

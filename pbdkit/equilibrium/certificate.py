@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
-from pbdkit.equilibrium.system import System, one_thread
+from pbdkit.equilibrium.system import StuckError, System, one_thread, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -69,15 +70,39 @@ UNKNOWN = Certificate(
     bound="nothing to solve",
     linearised=True,
 )
+
+
+class UnconvergedError(Exception):
+    """The best state found is no equilibrium; its certificate comes along."""
+
+    def __init__(self, reason: str, certificate: Certificate = UNKNOWN) -> None:
+        super().__init__(reason)
+        self.certificate = certificate
+
+
 """Where a search met a body that is not stable."""
 
 
 def scale_of(scene: Scene, start: State) -> float:
-    """The largest prescribed displacement: of the leaders, or of the start; the lattice's spacing
-    where nothing is prescribed but rest."""
+    """The largest prescribed displacement: of the leaders, or of the start; where nothing is
+    prescribed but rest the largest that loads make, and without any the lattice's spacing."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
     prescribed = max([float(abs(start.u).max()), *ways])
-    return prescribed or spacing_of(scene)
+    return prescribed or _way_under_loads(scene, start) or spacing_of(scene)
+
+
+def _way_under_loads(scene: Scene, rest: State) -> float:
+    """The largest displacement that loads make when they change, linearised at rest; 0 where
+    nothing holds the body against them."""
+    steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
+    rest = replace(rest, u=np.zeros(rest.u.shape))
+    pushes = [moves.at(rest, c) for c in (scene.loads.changes(steps) if scene.loads else ())]
+    if any(push.any() for push in pushes):
+        with suppress(ExperimentError, StuckError), one_thread():
+            system = linearised(scene, rest, steps, "auto", Watch())
+            for push in pushes:
+                ways.append(float(np.abs(solved(system, push, spacing_of(scene))).max()))
+    return max(ways)
 
 
 def spacing_of(scene: Scene) -> float:

@@ -9,9 +9,9 @@ from contextlib import suppress
 import numpy as np
 
 from pbdkit.equilibrium.breaking.choice import settler_of
-from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
+from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, broken_bonds, scale_of
 from pbdkit.equilibrium.load_path import moments
-from pbdkit.equilibrium.newton import Finder, UnconvergedError
+from pbdkit.equilibrium.newton import Finder
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
@@ -40,10 +40,10 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
     the state decide all that follows.
 
-    Until the roles change for the last time steps are made, so that leaders start, and parts that
-    nothing holds remain, where stepping has them. Where bonds can break, and for rules that are not
-    linear, the leaders' way is made in increments instead, within steps too: settle, break what is
-    too long, settle again until nothing breaks.
+    Until roles or loads change for the last time steps are made, so that leaders start, and parts
+    that nothing holds remain, where stepping has them. Where bonds can break, and for rules that
+    are not linear, leaders and loads come in increments instead, within steps too: settle, break
+    what is too long, settle again until nothing breaks.
     Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
     the watch says so: then the state is the last that had been reached.
     """
@@ -60,7 +60,7 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.has_fracture else 1
         return (yield from _load(scene, state, finder, moments(scene, count), since))
-    if (last := _last_change_of_roles(scene)) > state.step:
+    if (last := _last_change(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
 
@@ -85,7 +85,7 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
 
 def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[float]:
     """Steps, in calls short enough for interruptions to be heard."""
-    watch.begin("stepping until the roles change")
+    watch.begin("stepping until roles and loads change no more")
     first = state.step
     a_call = max(1, VALUES_A_CALL // state.u.size)
     while state.step < last:
@@ -97,11 +97,11 @@ def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[
 
 
 def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
-    before, step = (state.u.copy(), state.starts), math.ceil(moment)
+    before = state.u.copy(), state.starts
     led, state.starts = prescribe(scene, state, moment)
     place(state.u, led)
     try:
-        certificate = finder.find(state, step)
+        certificate = finder.find(state, moment)
     except StoppedError:
         state.u[...], state.starts = before
         raise
@@ -111,7 +111,8 @@ def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Cer
 
 
 def _load(scene: Scene, state: State, finder: Finder, every: list[float], since: float) -> Way:
-    """In increments up to the last motion or change of roles, breaking bonds on the way."""
+    """In increments up to the last motion or change of roles or loads, breaking bonds on the
+    way."""
     certificate: Certificate | None = None
     planned = [moment for moment in every if moment > since] or every[-1:]
     quick = settler_of(scene, finder.tolerance, finder.watch) if finder.linear else None
@@ -164,7 +165,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         led, state.starts = prescribe(scene, state, target)
         place(state.u, led)
         try:
-            certificate = finder.follow(state, math.ceil(target), before)
+            certificate = finder.follow(state, target, before)
         except UnconvergedError as error:
             vars(state).update(vars(before))
             part /= 2.0
@@ -188,12 +189,12 @@ def _stepped(
     place(state.u, led)
     for _ in range(MOST_ROUNDS):
         for _ in range(STEPS_A_ROUND):
-            state.u += finder.moves.at(state, math.ceil(moment))
+            state.u += finder.moves.at(state, moment)
         if not np.isfinite(state.u).all():
             break
         found = state.copy()
         with suppress(UnconvergedError):
-            certificate = finder.follow(found, math.ceil(moment), found.copy())
+            certificate = finder.follow(found, moment, found.copy())
             vars(state).update(vars(found))
             return certificate
     raise UnconvergedError(
@@ -220,9 +221,10 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     return False
 
 
-def _last_change_of_roles(scene: Scene) -> int:
-    """The last step before roles change within the run; 0 where they never do."""
+def _last_change(scene: Scene) -> int:
+    """The last step before roles or loads change within the run; 0 where they never do."""
     steps, changes = scene.experiment.steps, [0]
+    changes += [step - 1 for step in scene.loads.changes(steps)] if scene.loads else []
     for leading in scene.leading:
         first, last = leading.group.from_, leading.group.last(steps)
         changes += [step for step in (first - 1, last) if 0 <= step < steps]

@@ -15,10 +15,12 @@ SAMPLES = 16
 
 
 def events(scene: Scene) -> list[int]:
-    """The moments, from 0 on, between which each leader moves by one formula and all keep their
-    roles: the ends of steps, up to the last of the load."""
+    """The moments, from 0 on, between which each leader moves by one formula, all keep their roles
+    and loads come and go evenly: the ends of steps, up to the last of the load."""
     steps, last = scene.experiment.steps, last_event(scene)
     found = {0, last}
+    for change in scene.loads.changes(steps) if scene.loads else ():
+        found |= {change - 1, change}
     for leading in scene.leading:
         group = leading.group
         end = group.last(steps)
@@ -28,15 +30,15 @@ def events(scene: Scene) -> list[int]:
 
 
 def moments(scene: Scene, count: int) -> list[float]:
-    """The ends of about `count` increments, equal parts of the way that the leaders go, and every
-    event. An increment is some whole steps, or a step some whole increments; where nobody moves
-    there is one."""
+    """The ends of about `count` increments, equal parts of the way that the leaders go, as many of
+    what the loads do, and every event. An increment is some whole steps, or a step some whole
+    increments; where nobody moves there is one."""
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
-    ways = [_way(scene, *interval) for interval in intervals]
-    whole, found = sum(ways), list[float]()
-    for (begin, end), way in zip(intervals, ways, strict=True):
-        parts = count * way / whole if whole > 0.0 else 1.0
+    shares, found = _in_parts(count, [_way(scene, *i) for i in intervals]), list[float]()
+    if scene.loads:
+        shares = list(map(max, shares, _in_parts(count, [scene.loads.way(*i) for i in intervals])))
+    for (begin, end), parts in zip(intervals, shares, strict=True):
         a_step = round(parts / (end - begin))
         if a_step > 0:
             found += [begin + (n + 1) / a_step for n in range(a_step * (end - begin))]
@@ -44,6 +46,12 @@ def moments(scene: Scene, count: int) -> list[float]:
             marks = np.linspace(begin, end, max(1, round(parts)) + 1).round().astype(int)
             found += np.unique(marks)[1:].tolist()
     return found
+
+
+def _in_parts(count: int, ways: list[float]) -> list[float]:
+    """So many increments over intervals of these ways; one each where there is no way at all."""
+    whole = sum(ways)
+    return [count * way / whole if whole > 0.0 else 1.0 for way in ways]
 
 
 def _way(scene: Scene, begin: int, end: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,21 +32,26 @@ class Moves:
         self._scene = scene
         self._engine: Engine | None = None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
+        self._loads = replace(scene.loads) if scene.loads else None
+        stepped = replace(scene, loads=self._loads)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            stepped = replace(scene, experiment=experiment, leading=_resting(scene))
+            stepped = replace(stepped, experiment=experiment, leading=_resting(scene))
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
-        self._followers = None if self._engine else SlotFollowers(scene, stepping)
+        self._followers = None if self._engine else SlotFollowers(stepped, stepping)
 
     @property
     def is_compiled(self) -> bool:
         """Whether evaluating them is cheap."""
         return self._engine is not None and self._engine.name == "compiled"
 
-    def at(self, state: State, step: int) -> Floats:
-        """Planes, zero where nobody follows in that step; brings the state's frame into line."""
-        u, frame = state.u, self._scene.frame
+    def at(self, state: State, moment: float) -> Floats:
+        """Planes, zero where nobody follows in the step of a moment, under the loads of that
+        moment; brings the state's frame into line."""
+        u, frame, step = state.u, self._scene.frame, math.ceil(moment)
+        if self._loads:
+            self._loads.held_at = moment
         flat = u.reshape(len(u), -1)
         if frame:
             frame.follow(flat, flat)

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, UNKNOWN, Certificate
+from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, UnconvergedError
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
@@ -33,18 +33,10 @@ SHARE = 0.25
 UNSTABLE = "what is found is not stable"
 
 
-class UnconvergedError(Exception):
-    """The best state found is no equilibrium; its certificate comes along."""
-
-    def __init__(self, reason: str, certificate: Certificate) -> None:
-        super().__init__(reason)
-        self.certificate = certificate
-
-
 @dataclass(frozen=True)
 class Finder:
-    """Looks for the equilibria of a scene, to a tolerance that is a length, by one of the solver's
-    methods. `scale` is the length that shares are of."""
+    """Looks for equilibria of a scene, to within a length, by one of the solver's methods. `scale`
+    is the length that shares are of."""
 
     scene: Scene
     tolerance: float
@@ -71,32 +63,33 @@ class Finder:
             moves = [self.moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
             return system.mismatch(put, *moves) <= LINEAR
 
-    def find(self, state: State, step: int) -> Certificate:
-        """Moves the followers of `state`, in place, to where they rest, with the roles of `step`,
-        by the linearisation of the scene at rest, exact for linear rules.
+    def find(self, state: State, moment: float) -> Certificate:
+        """Moves the followers of `state`, in place, to where they rest, with the roles of the step
+        of a moment and the loads of that moment, by the linearisation of the scene at rest, exact
+        for linear rules.
 
         Raises ExperimentError where a part of the body has no equilibrium, UnconvergedError and
         StoppedError.
         """
         with one_thread():
-            return _Linear(self, state, step).run()
+            return _Linear(self, state, moment).run()
 
-    def follow(self, state: State, step: int, before: State) -> Certificate:
-        """The same for rules that are not linear, from the equilibrium `before` the leaders went on
-        a little: by Newton's iteration, as long as each correction is much smaller than the last,
-        so that no other equilibrium is nearer. What is found is stable."""
+    def follow(self, state: State, moment: float, before: State) -> Certificate:
+        """The same for rules that are not linear, from the equilibrium `before` leaders and loads
+        went on a little: by Newton's iteration, as long as each correction is much smaller than
+        the last, so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
             try:
-                return _Newton(self, state, step, before).run()
+                return _Newton(self, state, moment, before).run()
             except IndefiniteError:
-                raise UnconvergedError(UNSTABLE, UNKNOWN) from None
+                raise UnconvergedError(UNSTABLE) from None
 
 
 class _Search(ABC):
     _linear = False
 
-    def __init__(self, finder: Finder, state: State, step: int, at: State, what: str) -> None:
-        self._finder, self._state, self._step = finder, state, step
+    def __init__(self, finder: Finder, state: State, moment: float, at: State, what: str) -> None:
+        self._finder, self._state, self._moment = finder, state, moment
         self._linearisations = self._inner = 0
         self._system = self._linearised(at, what)
         self._left = self._moves()
@@ -138,14 +131,15 @@ class _Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return linearised(finder.scene, at, self._step, finder.method, finder.watch, finder.moves)
+        how = math.ceil(self._moment), finder.method, finder.watch, finder.moves
+        return linearised(finder.scene, at, *how)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
         self._left = self._moves()
 
     def _moves(self) -> Floats:
-        return self._finder.moves.at(self._state, self._step)
+        return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
         known, of, by = self._known
@@ -169,9 +163,9 @@ class _Search(ABC):
 class _Linear(_Search):
     """By one linearisation."""
 
-    def __init__(self, finder: Finder, state: State, step: int) -> None:
+    def __init__(self, finder: Finder, state: State, moment: float) -> None:
         at_rest = replace(state, u=np.zeros_like(state.u))
-        super().__init__(finder, state, step, at_rest, "assembling")
+        super().__init__(finder, state, moment, at_rest, "assembling")
         self._owed: State | None = state.copy()
 
     def run(self) -> Certificate:
@@ -200,15 +194,14 @@ class _Linear(_Search):
 class _Newton(_Search):
     """By linearisations at each state it comes to, from an equilibrium nearby."""
 
-    def __init__(self, finder: Finder, state: State, step: int, before: State) -> None:
-        super().__init__(finder, state, step, before, "following the load")
+    def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
+        super().__init__(finder, state, moment, before, "following the load")
         self._before, self._led = before, state.u - before.u
         self._way = float(np.abs(self._led).max())
-        """How far leaders went on."""
+        """How far leaders went on, or others under loads that did."""
 
     def run(self) -> Certificate:
-        """Raises UnconvergedError where corrections do not become smaller fast, or where what they
-        lead to is not stable."""
+        """Raises UnconvergedError where corrections do not shrink, or lead to nothing stable."""
         self._go_ahead()
         self._correct()
         certificate = self._certified()
@@ -220,10 +213,13 @@ class _Newton(_Search):
         """As far as the equilibrium before says, leaders their whole way: by what moves a small
         part of it makes."""
         moves, part = self._finder.moves, min(1.0, NUDGE / self._way) if self._way else 1.0
-        here = moves.at(self._before, self._step)
+        here = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._led)
-        pull = here + (moves.at(nudged, self._step) - here) / part
-        self._shift(self._system.solve(pull, max(self._wanted, NEAR * self._way)))
+        pull = here + (moves.at(nudged, self._moment) - here) / part
+        correction = self._system.solve(pull, max(self._wanted, NEAR * self._way))
+        if self._finder.scene.loads:
+            self._way = max(self._way, float(np.abs(correction).max(initial=0.0)))
+        self._shift(correction)
 
     def _correct(self) -> None:
         far, size, farther = math.inf, math.inf, self._way

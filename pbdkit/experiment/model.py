@@ -20,8 +20,10 @@ from pydantic import (
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
+from pbdkit.experiment.clashes import clashes_of
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.loads import Load
 from pbdkit.experiment.names import Name, RegionName, Version
 from pbdkit.experiment.parts import fault, open_part, report
 from pbdkit.experiment.record import Record
@@ -37,11 +39,9 @@ from pbdkit.interfaces import (
     FramePolicy,
     Lattice,
     NeighbourMetric,
-    RenewsParticles,
-    Softens,
 )
 from pbdkit.interfaces.component import Strict
-from pbdkit.interfaces.fields import TakesFields, unknown_regions
+from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.units import Scales, Units, given_by_units, of_one_material
 from pbdkit.registry.registry import Registry
 
@@ -77,6 +77,7 @@ class Experiment(Strict):
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
+    loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
@@ -84,44 +85,14 @@ class Experiment(Strict):
 
     @model_validator(mode="after")
     def _together(self) -> Self:
-        last, settles = max(self.record.at or (0,)), self.stepping.settle is not None
-        anew, jumps = self.neighbours.nearness() is not None, not self.solver.makes_steps
-        remembers = isinstance(self.rule, RenewsParticles)
-        softens = isinstance(self.fracture, Softens)
-        clashes = [
-            ("record", last > self.steps, f"step {last} is beyond the run's {self.steps}"),
-            ("fracture", anew and self.fracture.can_break,
-             "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
-             "set neighbours.reevaluate: false or fracture: {type: none}"),
-            ("solver", anew and jumps,
-             "where neighbours are re-evaluated nothing tells where the steps lead; "
-             "set neighbours.reevaluate: false or solver: {type: stepping}"),
-            ("solver", anew and settles,
-             "where neighbours are re-evaluated no distance from equilibrium is known; "
-             "set neighbours.reevaluate: false, or leave solver.settle out"),
-            ("solver", settles and (remembers or softens),
-             f"'{(self.rule if remembers else self.fracture).type}' remembers, so that no distance "
-             "from equilibrium is known; leave solver.settle out"),
-            ("solver", jumps and remembers,
-             f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
-             "all of them; take solver: {type: stepping}"),
-        ]  # fmt: skip
-        for key, clash, text in clashes:
-            if clash:
-                raise fault(text, key=key)
+        for key, text in clashes_of(self):
+            raise fault(text, key=key)
         for field in ("rule", "fracture"):
-            for name, text in unknown_regions(getattr(self, field), self.regions):
-                raise fault(text, key=(field, name))
             try:
                 self.__dict__[field] = sampled(getattr(self, field), self.lattice, self.body)
             except ValidationError as error:
                 first = error.errors()[0]
                 raise fault(first["msg"], key=(field, first["ctx"]["key"])) from None
-        for name, region in self.regions.items():
-            if any(box.in_sites for box in region.boxes()):
-                raise fault(
-                    "counts sites, and a region is a place: take a rectangle", key=("regions", name)
-                )
         return self
 
     @property

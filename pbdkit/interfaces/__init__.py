@@ -1,7 +1,7 @@
 """What the author of a component reads: the six interfaces and the data they exchange."""
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
+from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, LoadRows, Moment, Variable
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
@@ -17,6 +17,7 @@ from pbdkit.interfaces.rule import (
     Calibrated,
     FollowerRule,
     Here,
+    Loadable,
     MixesCells,
     RenewsParticles,
     Setting,
@@ -51,9 +52,10 @@ __all__ = [
     "AREA", "ENERGY", "FORCE", "INTERFACES", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
     "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "Component", "Components",
     "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
-    "Here", "Lattice", "LeaderRows", "MixesCells", "Moment", "Nearness", "NeighbourMetric",
-    "Offset", "Pair", "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens", "SpaceVector",
-    "StartsCracked", "Stiffness", "StoresEnergy", "TurnsParticles", "Variable", "Vector", "dot",
+    "Here", "Lattice", "LeaderRows", "LoadRows", "Loadable", "MixesCells", "Moment", "Nearness",
+    "NeighbourMetric", "Offset", "Pair", "Particles", "Quantity", "Remembered", "Remembers",
+    "RenewsBonds", "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens",
+    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TurnsParticles", "Variable",
+    "Vector", "dot",
     "length", "squared_length", "where",
 ]  # fmt: skip

@@ -15,7 +15,7 @@ from pbdkit.interfaces.rule import Stiffness
 from pbdkit.interfaces.values import Bonds
 
 Floats = NDArray[np.floating[Any]]
-Need = Literal["bonds", "cells", "material", "forces"]
+Need = Literal["bonds", "cells", "material", "forces", "loads"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,16 @@ class LeaderRows(NamedTuple):
 
     rows: NDArray[np.intp]
     leads: bool
+
+
+class LoadRows(NamedTuple):
+    """The rows of a load's particles, what each bears of it (its share of a force, its area of a
+    body force), and the force now, in all or of a unit of area, over Young's modulus and
+    thickness, (axis,)."""
+
+    rows: NDArray[np.intp]
+    share: Floats
+    force: Floats
 
 
 @dataclass(frozen=True)
@@ -165,6 +175,10 @@ class Moment(ABC):
         """The leader groups in the order of the experiment."""
 
     @abstractmethod
+    def loads(self) -> tuple[LoadRows, ...]:
+        """The loads in the order of the experiment; none acts yet at time 0."""
+
+    @abstractmethod
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
@@ -190,7 +204,8 @@ class Diagnostic(Component):
     """What it makes no sense without. "bonds": the table of bonds in the dataset; "cells"
     (`Moment.cells`): a body that has none, a single row for instance, is refused; "material"
     (`Moment.forces.stiffness`), "forces" (all of `Moment.forces`): rules that are not calibrated
-    are refused."""
+    are refused; "loads" (`Moment.loads`): experiments without loads are. Variables can then have
+    a dimension `load`, an entry a load."""
     every_step: ClassVar[bool] = False
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
     at_end: ClassVar[bool] = False

@@ -71,8 +71,9 @@ class FollowerRule(TakesFields):
     Relaxation and memory are applied afterwards and are no concern of the rule. A particle that
     has no neighbour stays. A fictitious neighbour counts as present.
 
-    What only some rules can do is a class that they take on besides: `Calibrated`, `StoresEnergy`,
-    `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`, `TurnsParticles`, `AppliesTwice`.
+    What only some rules can do is a class that they take on besides: `Calibrated`, `Loadable`,
+    `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
+    `TurnsParticles`, `AppliesTwice`.
     """
 
     linear: ClassVar[bool] = False
@@ -124,6 +125,21 @@ class Calibrated(ABC):
     def force(total: Any, here: Here, p: Any) -> Any:
         """The force of the neighbours on the particle over Young's modulus and thickness, a vector
         in the lattice's units, from the sums. It vanishes in equilibrium."""
+
+
+class Loadable(Calibrated):
+    """A calibrated rule that takes loads: forces from outside that act on followers."""
+
+    @staticmethod
+    @abstractmethod
+    def loaded(total: Any, load: Any, p: Any) -> tuple[Any, ...]:
+        """The sums as they would be if a neighbour exerted the force `load` besides, a vector over
+        Young's modulus and thickness in the lattice's units, elementwise:
+
+            force(loaded(total, f, p), here, p) = force(total, here, p) + f.
+
+        What it adds to the move is the same wherever neighbours stand.
+        """
 
 
 class StoresEnergy(Calibrated):

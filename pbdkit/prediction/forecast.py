@@ -131,7 +131,10 @@ def _doubts(scene: Scene) -> list[str]:
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
             warnings.append(f"leaders.{n}: begins to lead after the run's last step")
-    if not scene.leading:
+    for n, load in enumerate(scene.experiment.loads):
+        if load.from_ > scene.experiment.steps:
+            warnings.append(f"loads.{n}: begins to act after the run's last step")
+    if not (scene.leading or scene.loads):
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():
         warnings.append(

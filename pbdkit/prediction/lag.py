@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.edge import edge_of
 from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.spectrum import excess
-from pbdkit.equilibrium.system import StuckError, System
+from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.leaders import Oscillation
 from pbdkit.scene.leader_groups import Leading
@@ -38,14 +38,10 @@ from pbdkit.stepping.state import State
 Floats = NDArray[np.floating[Any]]
 DEAREST = 2e8
 """Products of numbers that are made at most to know the lag at the end of an interval."""
-ACCURACY = 1e-2
-"""Of solutions by iteration, as a share of what they were taken to come to."""
 EARLY = 0.01
 """Up to this share of 1 / (1 - λ) hardly anything fades that was pushed."""
 FINEST = 1e-12
 """The finest accuracy asked for."""
-FAR, TURNS = 8.0, 4
-"""Where they come to so many times less they are solved for once more, at most so often."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ class Trail:
             push = first + scene.lag * shown - scene.experiment.stepping.memory * delta
             if scene.lag:
                 push += edge.moves(edge.shown(delta))
-            steady = _solved(system, push, slowness * float(np.abs(push).max()))
+            steady = solved(system, push, slowness * float(np.abs(push).max()))
             wrong = slowness * accuracy * size
             if wrong <= ACCURACY * float(np.abs(steady).max()) or accuracy <= FINEST:
                 return cls(first, push, steady)
@@ -171,25 +167,13 @@ def _reached_about(
     if steps <= EARLY * slowness:
         return most
     try:
-        further = _solved(system, e, slowness * float(np.abs(e).max()))
+        further = solved(system, e, slowness * float(np.abs(e).max()))
     except StuckError:
         return None
     basis, images = (np.stack([a.ravel(), b.ravel()]) for a, b in ((e, further), (trail.push, e)))
     A = np.linalg.solve(basis @ basis.T, basis @ images.T)
     left = np.linalg.matrix_power(np.eye(2) - A, steps)[:, 0]
     return min(most, _largest((1.0 - left[0]) * e - left[1] * further))
-
-
-def _solved(system: System, moves: Floats, size: float) -> Floats:
-    """A⁻¹ moves, of at most that size, to a share of what it comes to."""
-    found = system.solve(moves, ACCURACY * size)
-    for _ in range(TURNS):
-        most = float(np.abs(found).max())
-        if most * FAR >= size:
-            break
-        size = most
-        found = system.solve(moves, ACCURACY * size)
-    return found
 
 
 def _largest(planes: Floats) -> float:

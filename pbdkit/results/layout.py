@@ -93,7 +93,8 @@ def base_columns() -> list[Column]:
 
 def optional_columns() -> list[list[Column]]:
     """What only some datasets have, whatever their diagnostics: the table of bonds, when each
-    broke, the coordinate of what is measured at every step, and that of leader groups."""
+    broke, the coordinate of what is measured at every step, and those of leader
+    groups and of loads."""
     bond, ends = ("bond",), "the two particles of the bond, as positions along `particle` from 0"
     step = "step at which the bond broke, -1 if it has not"
     strain = "strain with which the bond broke, NaN if it has not or was broken from the start"
@@ -109,6 +110,7 @@ def optional_columns() -> list[list[Column]]:
         ],
         [coordinate("step", "step", when=When.STEP, units="step")],
         [coordinate("leader_group", group)],
+        [coordinate("load", "load, by its place among the experiment's loads, from 0")],
     ]
 
 

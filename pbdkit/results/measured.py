@@ -41,7 +41,15 @@ class Measured:
     @cached_property
     def shows_leaders(self) -> bool:
         """Whether anything is measured of each leader group."""
-        return any("leader_group" in v.dims for d in self._diagnostics for v in d.variables())
+        return self._measures_each("leader_group")
+
+    @cached_property
+    def shows_loads(self) -> bool:
+        """Whether anything is measured of each load."""
+        return self._measures_each("load")
+
+    def _measures_each(self, dim: str) -> bool:
+        return any(dim in v.dims for d in self._diagnostics for v in d.variables())
 
     @cached_property
     def sizes(self) -> dict[str, int]:
@@ -52,6 +60,8 @@ class Measured:
             sizes |= {"bond": len(scene.bonds.ends), "end": 2}
         if self.shows_leaders:
             sizes["leader_group"] = len(scene.leading)
+        if self.shows_loads:
+            sizes["load"] = len(scene.experiment.loads)
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import LeaderRows, Moment, Pair, Stiffness, length
+from pbdkit.interfaces import LeaderRows, LoadRows, Moment, Pair, Stiffness, length
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
@@ -110,6 +110,14 @@ class StateMoment(Moment):
         step = max(self.step, 1)
         return tuple(
             LeaderRows(read_only(each.rows), each.group.leads(step)) for each in self._scene.leading
+        )
+
+    def loads(self) -> tuple[LoadRows, ...]:
+        """As they act in this step."""
+        loads = self._scene.loads
+        return tuple(
+            LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self.step))
+            for each in (loads.each if loads else ())
         )
 
     def broken_bonds(self) -> int:

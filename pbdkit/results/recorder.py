@@ -73,6 +73,8 @@ class Recorder:
             yield {"bond": scene.bonds.ends, "shell": scene.bonds.shell}
         if self._measured.shows_leaders:
             yield {"leader_group": np.arange(len(scene.leading))}
+        if self._measured.shows_loads:
+            yield {"load": np.arange(len(scene.experiment.loads))}
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
@@ -141,6 +143,7 @@ def columns_of(scene: Scene) -> list[Column]:
         scene.has_fracture,
         measured.every_step,
         measured.shows_leaders,
+        measured.shows_loads,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
     all_of_them = [*layout.base_columns(), *some, *measured.columns()]

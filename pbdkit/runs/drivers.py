@@ -191,7 +191,7 @@ class Straight(Driver):
     def states(self) -> States:
         """Interrupted, it gives out how far it had come."""
         # Loaded by those who look for an equilibrium, and by nobody else.
-        from pbdkit.equilibrium.newton import UnconvergedError
+        from pbdkit.equilibrium.certificate import UnconvergedError
 
         state, steps = self.state, self.scene.experiment.steps
         yield state

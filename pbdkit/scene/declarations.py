@@ -64,6 +64,8 @@ def check_diagnostics(
                     f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
                     "belong to the body; make it wider, or leave the diagnostic out"
                 )
+            if "loads" in diagnostic.needs and not experiment.loads:
+                raise ExperimentError(f"'{diagnostic.type}' is of loads, and there is none")
             if diagnostic.needs & {"material", "forces"}:
                 _refuse_without_material(diagnostic, experiment)
             for variable in diagnostic.variables():

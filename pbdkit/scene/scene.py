@@ -24,6 +24,7 @@ from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
+from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
 from pbdkit.scene.places import Mask, distinct, hull
 from pbdkit.scene.raster import Raster, positions
@@ -38,9 +39,9 @@ FLAT = 0.05
 class Scene:
     """An experiment on its lattice.
 
-    `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner`
-    (the scene with the rule's inner rule) are None where the scene has none. `leading` are the
-    leader groups, `warnings` are for the user.
+    `constants` are what the elementwise functions are called with. `frame`, `cells`, `inner` (the
+    scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
+    the leader groups, `warnings` are for the user.
     """
 
     experiment: Experiment
@@ -51,6 +52,7 @@ class Scene:
     cells: WeighedCells | None
     inner: Scene | None
     leading: tuple[Leading, ...]
+    loads: Loads | None
     warnings: tuple[str, ...]
 
     @property
@@ -132,7 +134,8 @@ def _build(experiment: Experiment) -> Scene:
     check_directions(experiment, has_frame=following is not None)
     cells = filling.on(raster, neighbourhood.tiling)
     cells = weighed(experiment, raster, setting, cells)
-    parts = (neighbourhood, raster, constants, following, cells, None, leading)
+    loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
+    parts = (neighbourhood, raster, constants, following, cells, None, leading, loads)
     return with_inner(Scene(experiment, *parts, tuple(warnings)))
 
 
@@ -230,5 +233,5 @@ def with_inner(scene: Scene) -> Scene:
             )
     experiment = experiment.model_copy(update={"rule": inner})
     constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    below = replace(scene, experiment=experiment, constants=constants)
+    below = replace(scene, experiment=experiment, constants=constants, loads=None)
     return replace(scene, inner=with_inner(below))

@@ -26,8 +26,8 @@ WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
 the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
 of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
 
-MATERIALS = 250
-"""The same where cells are of several materials."""
+LOADS, MATERIALS = 60, 250
+"""The same where loads act on everybody, and where cells are of several materials."""
 
 GRADIENT, FORCES, TABLES = 250, 160, 40
 """The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
@@ -72,7 +72,7 @@ def _workspace(experiment: Experiment, each: int, planes: float) -> float:
     """Bytes a particle besides state and table, with `each` neighbours."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
     made = WORKSPACE + experiment.shows_bonds * planes * BONDS
-    made += INNER * isinstance(rule, AppliesTwice)
+    made += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
     made += MATERIALS * bool(rule.varying and rule.uses_cells) + 8 * len(rule.varying)
     made += 8 * planes * len(experiment.fracture.varying)
     made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES

@@ -20,6 +20,7 @@ from pbdkit.interfaces import (
     Components,
     FollowerRule,
     Here,
+    Loadable,
     RenewsBonds,
     RenewsParticles,
     Slot,
@@ -98,8 +99,11 @@ class Evaluator:
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
 
-    def move(self, total: Contributions, here: Here) -> Any:
-        """From where the particle stands to its target."""
+    def move(self, total: Contributions, here: Here, load: Components | None = None) -> Any:
+        """From where the particle stands to its target, under a load if there is any."""
+        if load is not None:
+            assert isinstance(self.rule, Loadable)
+            total = as_values(self.rule.loaded(total, load, self._p), "loaded")
         return as_vector(self.rule.apply(total, here, self._p), "apply", here.u)
 
     def force(self, total: Contributions, here: Here) -> Any:

@@ -20,7 +20,7 @@ from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import positions
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Contributions, Evaluator, Mask, Neighbour
-from pbdkit.stepping.state import Floats, State
+from pbdkit.stepping.state import Floats, State, shown
 from pbdkit.stepping.surroundings import Surroundings, blocks
 
 REAL = "fiub"
@@ -34,8 +34,9 @@ class Followers(ABC):
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Writes the displacements of all body particles into `new`, from the intermediate
         configuration m; `new` comes holding those of the step before. Particles without any
-        neighbour stay. What it writes for leaders is overwritten. Of the state it takes what bonds
-        and particles remember, and renews, in place, what particles do."""
+        neighbour stay. What it writes for leaders is overwritten. Of the state, at the end of the
+        step before, it takes what bonds and particles remember, and renews, in place, what
+        particles do."""
 
 
 def target(here: Any, move: Any, before: Any, solver: Stepping) -> Any:
@@ -73,8 +74,12 @@ class SlotFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Every block from m alone: their order does not matter."""
+        loads = self._scene.loads
+        acting = loads.at(state.step + 1, m.dtype) if loads else None
         for around, evaluator, total, here in self._summed(m, state):
-            planes = around.where.of(m), evaluator.move(total, here), around.where.of(new)
+            load = None if acting is None else vector(shown(around.where.of(acting)))
+            moved = evaluator.move(total, here, load)
+            planes = around.where.of(m), moved, around.where.of(new)
             for u, move, plane in zip(*planes, strict=True):
                 _write(plane, target(u, move, plane, self._solver), around.movable, u)
             evaluator.renew_particles(total, here, around.own(state), around.movable)

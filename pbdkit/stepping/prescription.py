@@ -55,8 +55,8 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
 
 
 def steady_steps(scene: Scene, step: int, most: int) -> int:
-    """How many steps from `step` on have the same leaders at the same places, at most `most`, at
-    least 1."""
+    """How many steps from `step` on have the same leaders at the same places and the same loads, at
+    most `most`, at least 1."""
     for leading in scene.leading:
         group = leading.group
         begins, ends = group.from_, group.last(step + most)
@@ -67,12 +67,15 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
                 return 1
         elif step < begins:
             most = min(most, begins - step)
-    return most
+    changes = scene.loads.changes(step + most) if scene.loads else []
+    return min([most, *(change - step for change in changes if change > step)])
 
 
 def last_event(scene: Scene) -> int:
-    """The last step within the run at which leaders move or roles change, at least 1."""
+    """The last step within the run at which leaders move, or roles or loads change, at least
+    1."""
     steps, events = scene.experiment.steps, [1]
+    events += scene.loads.changes(steps) if scene.loads else []
     for leading in scene.leading:
         first, last = leading.group.from_, leading.group.last(steps)
         rests = leading.group.motion.rests_after() or 0

@@ -7,7 +7,7 @@ in dataclasses.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass
 from functools import partial, singledispatch
 from typing import Any
 
@@ -23,6 +23,7 @@ from pbdkit.interfaces import (
     FramePolicy,
     Here,
     Lattice,
+    Loadable,
     NeighbourMetric,
     RenewsBonds,
     RenewsParticles,
@@ -38,14 +39,17 @@ from pbdkit.testing.states import (
     SEED,
     SHAPE,
     Shown,
+    applied,
     differences,
     frame_showing,
+    gathered,
     here,
     measured_by,
     moment_of,
     owners,
     remembers,
     shared,
+    standing,
 )
 
 Arrays = dict[str, Any]
@@ -105,31 +109,10 @@ def questions_of(component: Component, scene: Scene, seed: int) -> list[Question
     raise TypeError(f"{type(component).__name__} is of no interface")
 
 
-def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ...]]:
-    """The contributions of every slot; `shared` is what is remembered of the particle and of the
-    neighbour there, by slot, unless it is as at the start."""
-    evaluator, named = Evaluator(scene), scene.constants.of_particle
-    neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
-    if shared:
-        ends = [tuple(named(*values) for values in pair) for pair in shared]
-        neighbours = [replace(to, shared=e) for to, e in zip(neighbours, ends, strict=True)]
-    return [evaluator.contribution(v, v, to) for v, to in zip(d, neighbours, strict=True)]
-
-
-def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
-    """The move that the sums of contributions make."""
-    return Evaluator(scene).move(summed((c, None) for c in contributions), _standing(scene, **at))
-
-
-def _standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
-    place = X if scene.experiment.rule.uses_reference else None
-    return Here(u, place, place, scene.constants.of_particle(*own))
-
-
 @questions_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
-    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force` and `draw`
-    where it has them."""
+    """`gather` and `apply`, also where r + d = 0 along every slot; `remember`, `force`, `loaded`
+    and `draw` where it has them."""
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
     contributions = gathered(scene, each(np.array, d))
     given = {"d": d, "shared": shared(scene, at["own"])}
@@ -146,15 +129,19 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[Question]:
 
     def question(what: str) -> Question:
         def ask(total: Any, **to: Any) -> Any:
-            return asks[what](total, _standing(scene, **to))
+            return asks[what](total, standing(scene, **to))
 
         return Question(what, {"total": total} | at, ask, elementwise=True)
 
+    loads: list[Question] = []
+    if isinstance(rule, Loadable) and material_of(rule) is not None:
+        given = {"total": total, "load": here(scene, seed + 1)["u"]}
+        loads.append(Question("loaded", given, partial(rule.loaded, p=scene.constants.rule), True))
     slots = zip(d, scene.neighbourhood.slots[0], strict=True)
     meeting = {"d": [v.each(lambda x, r: np.full_like(x, -r), slot.rest) for v, slot in slots]}
     what = "apply, where all neighbours meet in the particle,"
     met = Question(what, meeting | at, lambda d, **to: applied(scene, gathered(scene, d), **to))
-    return [gather, *map(question, asks), met, *_to_draw(rule, scene)]
+    return [gather, *map(question, asks), *loads, met, *_to_draw(rule, scene)]
 
 
 @questions_of.register

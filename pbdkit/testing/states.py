@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 from itertools import accumulate
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from pbdkit.interfaces import (
     Component,
     Diagnostic,
     FollowerRule,
+    Here,
     LeaderRows,
     Particles,
     Remembered,
@@ -28,6 +30,7 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.evaluator import Evaluator, summed
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
 
@@ -100,6 +103,28 @@ def here(scene: Scene, seed: int) -> dict[str, Any]:
     rng, size = np.random.default_rng(seed + 1), spacing(scene)
     own = remembers(scene.experiment.rule, scene, seed)
     return {"u": _vector(0.3 * size, rng), "X": _vector(5 * size, rng), "own": own}
+
+
+def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ...]]:
+    """The contributions of every slot; `shared` is what is remembered of the particle and of the
+    neighbour there, by slot, unless it is as at the start."""
+    evaluator, named = Evaluator(scene), scene.constants.of_particle
+    neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
+    if shared:
+        ends = [tuple(named(*values) for values in pair) for pair in shared]
+        neighbours = [replace(to, shared=e) for to, e in zip(neighbours, ends, strict=True)]
+    return [evaluator.contribution(v, v, to) for v, to in zip(d, neighbours, strict=True)]
+
+
+def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
+    """The move that the sums of contributions make."""
+    return Evaluator(scene).move(summed((c, None) for c in contributions), standing(scene, **at))
+
+
+def standing(scene: Scene, u: Any, X: Any, own: Any) -> Here:
+    """What stands at a particle."""
+    place = X if scene.experiment.rule.uses_reference else None
+    return Here(u, place, place, scene.constants.of_particle(*own))
 
 
 def remembers(part: Component, scene: Scene, seed: int) -> tuple[Any, ...]:
@@ -176,6 +201,8 @@ class Shown:
             return place[found]
         if name == "leader_groups":
             return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+        if name == "loads":
+            return tuple(load._replace(rows=place[load.rows]) for load in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
 

@@ -49,6 +49,11 @@ PULLED = [
     {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [0.3, 0.1]}},
 ]
 """The leaders of the scenes that diagnostics measure."""
+LOADED = [
+    {"select": {"edge": "top"}, "force": [0.02, 0.05]},
+    {"select": {"edge": "right"}, "body_force": [0.01, -0.03], "from": 2},
+]
+"""The loads of those that measure loads."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
@@ -66,6 +71,7 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     if field == "diagnostics":
         given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
+        given |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
     choices = {
         "lattice": list(LATTICES.values()),
         "neighbours": neighbours,
@@ -87,7 +93,7 @@ def _frames(component: Component) -> list[dict[str, Any]]:
 
 
 def _rules(component: Component) -> list[dict[str, Any]]:
-    if isinstance(component, Diagnostic) and component.needs & {"material", "forces"}:
+    if isinstance(component, Diagnostic) and component.needs & {"material", "forces", "loads"}:
         return [ELASTIC]
     if isinstance(component, FramePolicy) and component.edges_are_free:
         return [ELASTIC]

@@ -214,6 +214,23 @@ class HoldsOn(Sound):
         return -0.5 * here.u
 
 
+class BearsTwice(pbdkit.Loadable, Sound):
+    """Counts a load twice."""
+
+    type: Literal["bears-twice"] = "bears-twice"
+
+    def stiffness(self):
+        return pbdkit.Stiffness(1.0, 1.0, 0.0, 0.5)
+
+    @staticmethod
+    def force(total, here, p):
+        return total[0]
+
+    @staticmethod
+    def loaded(total, load, p):
+        return total[0] + 2.0 * load, total[1]
+
+
 class Unlike(Sound):
     """Multiplies whole numbers beyond 63 bits, which wrap around in compiled code."""
 

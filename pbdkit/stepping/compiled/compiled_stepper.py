@@ -27,7 +27,7 @@ from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import Led, prescribe, steady_steps
-from pbdkit.stepping.state import State, unmoved_state
+from pbdkit.stepping.state import Floats, State, unmoved_state
 
 BAND = 16384
 """Places that bonds are judged on before they are swept, on one thread: what they take stays in the
@@ -93,7 +93,8 @@ class CompiledStepper(Engine):
         step = state.step + 1
         led, starts = prescribe(self._scene, state, step)
         self._clamped = self._clamps.turn(state, step)
-        count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
+        load = self._load(state)
+        count = self._reach.before(led, load, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
         u, new = state.u, state.previous
@@ -110,7 +111,14 @@ class CompiledStepper(Engine):
         leaders["led_kept"] = np.empty_like(led_values)
         reached = {"box": self._reach.box, "growth": self._reach.growth, "clamped": self._clamped}
         moved = state_arrays(self._plan, state.u, state.previous, state)
-        return self._arrays | moved | leaders | reached
+        load = self._load(state)
+        loads = {} if load is None else dict(zip(self._plan.each("load_@"), load, strict=True))
+        return self._arrays | moved | leaders | reached | loads
+
+    def _load(self, state: State) -> Floats | None:
+        """What acts in the step after a state."""
+        loads = self._scene.loads
+        return loads.at(state.step + 1, state.u.dtype) if loads else None
 
     def _given(self, state: State, led: Led, count: int) -> tuple[Any, ...]:
         """The arguments of the kernel that makes `count` steps."""

@@ -12,6 +12,7 @@ from pbdkit.interfaces import (
     FollowerRule,
     FractureModel,
     Here,
+    Loadable,
     RenewsBonds,
     RenewsParticles,
     Softens,
@@ -54,6 +55,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
         for kind, names in FUNCTIONS.items():
             if isinstance(part, kind):
                 found |= {f"{name}{number}": getattr(part, name) for name in names}
+        if isinstance(part, Loadable) and levels[-1].scene.loads:
+            found[f"loaded{number}"] = part.loaded
     return found
 
 
@@ -100,7 +103,7 @@ def _parts(scene: Scene) -> tuple[int, ...]:
         with blaming(experiment.rule, "to compile"):
             total = evaluator.contribution(one, one, evaluator.everywhere([slot])[0])
             here = Here(one, one, one, scene.constants.of_particle(*own))
-            for component in evaluator.move(total, here):
+            for component in evaluator.move(total, here, one if scene.loads else None):
                 target(ones, component, ones, experiment.stepping)
             evaluator.renew_particles(total, here, own, None)
     return tuple(len(part) if isinstance(part, Components) else 1 for part in total)

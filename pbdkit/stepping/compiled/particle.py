@@ -43,6 +43,8 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
         rows["z@"] = f"{level.source}_@"
+    if plan.is_loaded(level):
+        rows["g@"] = "load_@"
     for row, of in rows.items():
         out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
     out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
@@ -125,7 +127,10 @@ def target_lines(
         X = _shifted(plan, "+", plan.scene.raster.lattice.origin)
         centred = _shifted(plan, "-", plan.scene.middle)
     lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({_own(level)}))")
-    lines.append(f"move = apply{n}(({sums},), here, p)")
+    total = f"({sums},)"
+    if plan.is_loaded(level):
+        total = f"loaded{n}({total}, {plan.vector('g@[j]')}, p)"
+    lines.append(f"move = apply{n}({total}, here, p)")
     changing: list[int] = []
     if isinstance(level.scene.experiment.rule, RenewsParticles):
         changing = [m for m, number in enumerate(level.seen.own) if number.changes]

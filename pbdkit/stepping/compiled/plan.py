@@ -79,6 +79,10 @@ class Plan:
         """Whether there are too many neighbours to write them out."""
         return max(map(len, self.scene.neighbourhood.slots)) > MOST_BITS
 
+    def is_loaded(self, level: Level) -> bool:
+        """Whether loads act on what moves by the rule of that level: the last alone."""
+        return self.scene.loads is not None and level is self.levels[-1]
+
     @property
     def model(self) -> Any:
         """The fracture model, None where nothing breaks."""

@@ -1,11 +1,11 @@
 """How far the leaders' motion can have reached: nothing beyond is touched.
 
-At rest a rule moves nothing, exactly; so a step can only move particles that adjoin one that has
-moved. Where that is plain from the scene nothing has moved before the leaders do; elsewhere the
-first step looks at every particle and finds those that are not at rest. From then on the box around
-what has moved, and around leaders that are not at home, grows by one bond a step, and by as many
-as rules work on each other's moves. Where something is remembered that changes, everything is
-looked at in every step.
+At rest a rule moves nothing, exactly; so a step can only move particles that bear a load or adjoin
+one that has moved. Where that is plain from the scene nothing has moved before the leaders do;
+elsewhere the first step looks at every particle and finds those that are not at rest. From then on
+the box around what has moved, and around leaders that are not at home, grows by one bond a step,
+and by as many as rules work on each other's moves. Where something is remembered that changes,
+everything is looked at in every step.
 """
 
 from __future__ import annotations
@@ -54,13 +54,15 @@ class Reach:
         self._known = self._rests and state.step == 0 and not state.u.any()
         self._keep_to(np.zeros_like(self._bond) if self._known else self._everything)
 
-    def before(self, led: Led, count: int) -> int:
-        """Takes the leaders of the coming steps in; returns how many of `count` can be made in
-        one go."""
+    def before(self, led: Led, load: Floats | None, count: int) -> int:
+        """Takes the leaders and the load of the coming steps in; returns how many of `count` can be
+        made in one go."""
         if not self._known:
             return count if self._renews else 1
         for place, values in led:
             self._join(np.unravel_index(place[(values != 0.0).any(axis=0)], self._shape)[1:])
+        if load is not None:
+            self._join(np.nonzero((load != 0.0).any(axis=(0, 1))))
         return count
 
     def after(self, now: Floats, before: Floats) -> None:

@@ -8,6 +8,7 @@ from pbdkit.testing.properties import (
     elementwise,
     every,
     lattice_parts,
+    loads,
     particulars,
     repetition,
     start,
@@ -24,6 +25,7 @@ PROPERTIES: tuple[Property, ...] = tuple(
         repetition,
         elementwise,
         particulars,
+        loads,
         steps,
         directions,
     )

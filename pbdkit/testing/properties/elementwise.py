@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pbdkit.interfaces import Draws, FollowerRule, FractureModel
 from pbdkit.scene.scene import Scene
 from pbdkit.testing.properties.start import remembered
-from pbdkit.testing.question import Question, applied, flat, gathered
-from pbdkit.testing.states import SEED, SHAPE, differences, here, owners
+from pbdkit.testing.question import Question, flat
+from pbdkit.testing.states import SEED, SHAPE, applied, differences, gathered, here, owners
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of
 
 ROUNDING = 1e-12

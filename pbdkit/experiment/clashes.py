@@ -1,0 +1,59 @@
+"""What does not go together in an experiment, though each part is right by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from pbdkit.interfaces import Loadable, RenewsParticles, Softens
+from pbdkit.interfaces.fields import unknown_regions
+from pbdkit.interfaces.rule import material_of
+
+if TYPE_CHECKING:
+    from pbdkit.experiment.model import Experiment
+
+Key = str | tuple[str, str]
+
+
+def clashes_of(asked: Experiment) -> Iterator[tuple[Key, str]]:
+    """The fields at which parts clash, each with a message."""
+    yield from ((key, text) for key, clashes, text in _looked_at(asked) if clashes)
+    for field in ("rule", "fracture"):
+        for name, text in unknown_regions(getattr(asked, field), asked.regions):
+            yield (field, name), text
+    for name, region in asked.regions.items():
+        if any(box.in_sites for box in region.boxes()):
+            yield ("regions", name), "counts sites, and a region is a place: take a rectangle"
+
+
+def _looked_at(asked: Experiment) -> list[tuple[Key, bool, str]]:
+    last, settles = max(asked.record.at or (0,)), asked.stepping.settle is not None
+    anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
+    remembers = isinstance(asked.rule, RenewsParticles)
+    softens = isinstance(asked.fracture, Softens)
+    knows_forces = isinstance(asked.rule, Loadable) and material_of(asked.rule) is not None
+    return [
+        ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
+        ("fracture", anew and asked.fracture.can_break,
+         "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
+         "set neighbours.reevaluate: false or fracture: {type: none}"),
+        ("solver", anew and jumps,
+         "where neighbours are re-evaluated nothing tells where the steps lead; "
+         "set neighbours.reevaluate: false or solver: {type: stepping}"),
+        ("solver", anew and settles,
+         "where neighbours are re-evaluated no distance from equilibrium is known; "
+         "set neighbours.reevaluate: false, or leave solver.settle out"),
+        ("solver", settles and (remembers or softens),
+         f"'{(asked.rule if remembers else asked.fracture).type}' remembers, so that no distance "
+         "from equilibrium is known; leave solver.settle out"),
+        ("solver", jumps and remembers,
+         f"the rule '{asked.rule.type}' remembers, so that where the steps lead depends on "
+         "all of them; take solver: {type: stepping}"),
+        ("loads", bool(asked.loads) and not knows_forces,
+         f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
+         "particle goes, and of no material how far a force would move it; take a calibrated "
+         "rule ('elastic' or 'strain-gradient' with poisson_ratio above -1, 'orthotropic', "
+         "'springs')"),
+        ("loads", bool(asked.loads) and anew,
+         "need neighbours that stay; set neighbours.reevaluate: false"),
+    ]  # fmt: skip

@@ -1,0 +1,120 @@
+"""Loads on a raster: who bears which share, and what acts at a moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.loads import Load
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.polygons import Tiling, signed_area
+from pbdkit.scene.cells import WeighedCells, patches
+from pbdkit.scene.leader_groups import Selecting
+from pbdkit.scene.places import Floats
+from pbdkit.scene.raster import Raster
+
+STRAIGHT = 1e-9
+"""Particles that lie off a line by less than this share of its length are on it."""
+Planes = NDArray[np.floating[Any]]
+"""The force on each particle, (axis, sublattice, cell, cell)."""
+
+
+@dataclass(frozen=True)
+class Loading:
+    """A load with the rows and places of its particles, and what each bears of it: a `share` of
+    the whole force, or the area of a body force."""
+
+    load: Load
+    rows: Indices
+    place: Indices
+    share: Floats
+
+
+@dataclass
+class Loads:
+    """The loads of a scene. They go on with the steps, or stand as at the moment `held_at`."""
+
+    each: tuple[Loading, ...]
+    shape: tuple[int, ...]
+    held_at: float | None = None
+    _last: tuple[Any, Planes] | None = field(default=None, repr=False)
+
+    def at(self, moment: float, dtype: Any) -> Planes:
+        """What acts at the end of a step, or at a moment within it; nobody writes to it."""
+        moment = moment if self.held_at is None else self.held_at
+        key = (*(loading.load.amplitude(moment) for loading in self.each), np.dtype(dtype))
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._sum(moment).astype(dtype, copy=False)
+        return self._last[1]
+
+    def _sum(self, moment: float) -> Planes:
+        forces = [np.outer(each.load.force_at(moment), each.share) for each in self.each]
+        planes = np.zeros((len(forces[0]), *self.shape))
+        for loading, force in zip(self.each, forces, strict=True):
+            planes.reshape(len(planes), -1)[:, loading.place] += force
+        return planes
+
+    def changes(self, steps: int) -> list[int]:
+        """The steps of a run in which others act than in the step before."""
+        every = {step for loading in self.each for step in loading.load.changes()}
+        return sorted(step for step in every if step <= steps)
+
+    def way(self, begin: float, end: float) -> float:
+        """By what share the load that changes most does between two moments."""
+        loads = (loading.load for loading in self.each)
+        return max(abs(load.amplitude(end) - load.amplitude(begin)) for load in loads)
+
+
+def build_loads(
+    raster: Raster, tiling: Tiling, cells: WeighedCells | None, experiment: Experiment
+) -> Loads | None:
+    """Every load with its particles; None where there is none. Raises ExperimentError for a load
+    that selects nobody or a frame point, and where forces leave the finite numbers."""
+    body, found = Selecting(raster, experiment.regions), list[Loading]()
+    for n, load in enumerate(experiment.loads):
+        rows = body.select(load.select, ("loads", n, "select"))
+        at = raster.reference(rows)
+        place = raster.place_of(rows)
+        share = _shares(at) if load.force else _areas(raster, tiling, cells).ravel()[place]
+        found.append(Loading(load, rows, place, share))
+        with np.errstate(all="ignore"):
+            finite = np.isfinite(load.force_at(load.from_) * share.sum()).all()
+        if not finite:
+            raise ExperimentError("leaves the finite numbers", ("loads", n))
+    return Loads(tuple(found), raster.shape) if found else None
+
+
+def _shares(at: Floats) -> Floats:
+    """(particle,): the part of a force that falls to each of some places, (particle, axis): half
+    the way to the next one on both sides where all lie on a line, else all alike."""
+    order = np.lexsort(at.T)
+    way = at - at[order[0]]
+    x, y = along = way[order[-1]]
+    squared = along @ along
+    if len(at) == 1 or (np.abs(way @ [-y, x]) > STRAIGHT * squared).any():
+        return np.full(len(at), 1.0 / len(at))
+    half = np.diff((way @ along)[order]) / (2 * squared)
+    share = np.empty(len(at))
+    share[order] = np.append(half, 0.0) + np.append(0.0, half)
+    return share
+
+
+def _areas(raster: Raster, tiling: Tiling, cells: WeighedCells | None) -> Floats:
+    """(sublattice, cell, cell): the area that belongs to each particle: an equal part of every cell
+    that meets there, as far as it is weighed; where no cells are weighed, a site's of the lattice.
+    """
+    cell = raster.lattice.cell()
+    if cells is None or cells.share is None:
+        return np.full(raster.shape, abs(np.linalg.det(cell.vectors)) / len(cell.sites))
+    area = np.zeros(raster.shape)
+    for patch in patches(raster, tiling):
+        corners = patch.polygon.rest
+        each = float(signed_area(corners)) / len(corners) * cells.of(patch) * patch.whole
+        for corner in patch.corners:
+            corner.of(area)[...] += each
+    return area
