@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbdkit.experiment.leaders import Hold
+from pbdkit.experiment.motions import Hold
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import RenewsParticles
 from pbdkit.scene.leader_groups import Leading, kinds_at
@@ -14,6 +14,7 @@ from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
 
@@ -30,6 +31,7 @@ class Moves:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
+        self._guidance = Guidance(scene)
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
@@ -44,7 +46,7 @@ class Moves:
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, step: int) -> Floats:
-        """Planes, zero where nobody follows in that step; brings the state's frame into line."""
+        """Planes, zero where nobody follows in that step, or along that axis; brings the state's frame into line."""
         u, frame = state.u, self._scene.frame
         flat = u.reshape(len(u), -1)
         if frame:
@@ -58,11 +60,15 @@ class Moves:
             moves = u.astype(float)
             with np.errstate(all="ignore"):
                 self._followers.move(u, moves, state)
+                self._guidance.correct(moves, u, step)
         with np.errstate(all="ignore"):
             moves -= u
-        still = [led.place for led in self._scene.leading if led.group.leads(step)]
-        for place in [*still, *([frame.place] if frame else [])]:
-            moves.reshape(len(u), -1)[:, place] = 0.0
+        still = moves.reshape(len(u), -1)
+        for led in self._scene.leading:
+            for axis in led.axes if led.group.leads(step) else ():
+                still[axis, led.place] = 0.0
+        if frame:
+            still[:, frame.place] = 0.0
         return moves
 
 

@@ -30,7 +30,7 @@ from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.spectrum import excess
 from pbdkit.equilibrium.system import StuckError, System
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import Oscillation
+from pbdkit.experiment.motions import Oscillation
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State

@@ -110,7 +110,8 @@ class StateMoment(Moment):
         """At time 0 those of step 1 lead."""
         step = max(self.step, 1)
         return tuple(
-            LeaderRows(read_only(each.rows), each.group.leads(step)) for each in self._scene.leading
+            LeaderRows(read_only(each.rows), each.group.leads(step), each.axes)
+            for each in self._scene.leading
         )
 
     def broken_bonds(self) -> int:

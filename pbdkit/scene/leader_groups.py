@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
+from pbdkit.experiment.leaders import LeaderGroup, Selection
 from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.motions import Rotation
 from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Floats, distinct
@@ -25,12 +26,18 @@ SHOWN = 5
 @dataclass(frozen=True)
 class Leading:
     """A leader group with the rows, places and reference positions (particle, axis) of its
-    particles."""
+    particles, and the numbers of the axes along which it leads."""
 
     group: LeaderGroup
     rows: Indices
     place: Indices
     reference: Floats
+    axes: tuple[int, ...]
+
+    def offset(self, n: float) -> Floats:
+        """Of the motion from rest, (particle or 1, axis along which the group leads)."""
+        offset = np.atleast_2d(self.group.motion.offset(n, self.reference))
+        return np.asarray(offset[:, list(self.axes)])
 
 
 def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]:
@@ -45,7 +52,8 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
         rows = body.select(group.select, ("leaders", n, "select"))
         at = raster.reference(rows)
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
-        found.append(Leading(group, rows, raster.place_of(rows), at))
+        axes = tuple("xy".index(axis) for axis in group.axes or ()) or range(at.shape[1])
+        found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes))))
     for k, n in _meeting(found, steps):
         if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
             _refuse_contradiction(raster, found, k, n, steps)
@@ -65,7 +73,8 @@ def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
         near = (begin[:n] <= end[n]) & (begin[n] <= end[:n]) & (kind[:n] != kind[n])
         near &= (low[:n] <= high[n]) & (low[n] <= high[:n])
         for k in np.flatnonzero(near).tolist():
-            if not sets[k].isdisjoint(sets[n]):
+            alike = not {*found[k].axes}.isdisjoint(found[n].axes)
+            if alike and not sets[k].isdisjoint(sets[n]):
                 yield k, n
 
 
@@ -174,9 +183,10 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
     start = _offset(a.group, begin - 1, at)
     knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
     near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1, 2)}
+    axes = sorted({*a.axes} & {*b.axes})
     for step in sorted(step for step in near if begin <= step <= end):
         one, other = _offset(a.group, step, at), start + _offset(b.group, step, at + start)
-        differs = np.abs(one - other).max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
+        differs = np.abs(one - other)[:, axes].max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
         if differs.any():
             number = shared[np.argmax(differs)] + 1
             raise ExperimentError(
@@ -200,7 +210,8 @@ def _refuse_infinite(
 def _known_beforehand(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
     """Whether it is known where both motions start, or does not matter: it does to rotations."""
     turns = any(isinstance(group.motion, Rotation) for group in (a, b))
-    return not turns or (at_rest and min(a.from_, b.from_) == 1)
+    latest = max if a.axes or b.axes else min  # where a particle follows along an axis is not known
+    return not turns or (at_rest and latest(a.from_, b.from_) == 1)
 
 
 def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:

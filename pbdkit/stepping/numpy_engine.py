@@ -11,7 +11,8 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
-from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.stepping.guidance import Guidance
+from pbdkit.stepping.prescription import place, placed, prescribe
 from pbdkit.stepping.state import State
 
 
@@ -39,6 +40,7 @@ class Stepper(Engine):
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
+        self._guidance = Guidance(scene)
 
     def advance(self, state: State, steps: int = 1) -> State:
         """One step after the other."""
@@ -49,13 +51,16 @@ class Stepper(Engine):
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
         led, starts = prescribe(self._scene, state, step)
-        before = [(places, u.reshape(len(u), -1)[:, places].copy()) for places, _ in led]
+        before = placed(u, led)
         place(u, led)
+        if self._guidance.some:  # who leads along an axis makes no way along it that could go on
+            place(new, led)
         if self._fracturing:
             self._fracturing.break_bonds(u, state, step)
         # What leaves the finite numbers is found at recording.
         with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
             self._followers.move(u, new, state)
+            self._guidance.correct(new, u, step)
         place(new, led)
         place(u, before)
         if self._scene.frame:

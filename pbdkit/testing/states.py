@@ -17,7 +17,6 @@ from pbdkit.interfaces import (
     Bonds,
     Component,
     FollowerRule,
-    LeaderRows,
     Particles,
     Remembered,
     Vector,
@@ -158,7 +157,7 @@ class Shown:
         if name in ("rows", "nearest"):
             return place[found]
         if name == "leader_groups":
-            return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+            return tuple(group._replace(rows=place[group.rows]) for group in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
 
