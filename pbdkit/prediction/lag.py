@@ -98,7 +98,8 @@ class Trail:
         edge, v = edge_of(scene, state, step), np.zeros((scene.axes, *scene.raster.shape))
         for leading in scene.leading:
             if leading.group.leads(step):
-                v.reshape(scene.axes, -1)[:, leading.place] = _velocity(leading, step).T
+                for axis in leading.axes:
+                    v.reshape(scene.axes, -1)[axis, leading.place] = _velocity(leading, step)[:, axis]
         direct, shown = edge.moves(v), edge.moves(edge.shown(v))
         if not (direct + shown).any():
             return None
@@ -231,7 +232,8 @@ def _moments(leading: Leading, scene: Scene) -> list[int]:
 def _velocity(leading: Leading, step: int) -> Floats:
     """Of a group's particles in a step, (particle, axis); a rotation turns it on the way."""
     n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
-    if isinstance(motion, Oscillation):
-        return np.zeros_like(at)
-    before = motion.offset(n - 1, at) if n > 1 else 0.0
-    return np.zeros_like(at) + (motion.offset(n, at) - before)
+    v = np.zeros_like(at)
+    if not isinstance(motion, Oscillation):
+        before = motion.offset(n - 1, at) if n > 1 else 0.0
+        v[:, list(leading.axes)] += (motion.offset(n, at) - before)[..., list(leading.axes)]
+    return v
