@@ -201,7 +201,9 @@ class Experiment(Strict):
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:
             self.__pydantic_validator__.validate_python(
-                parts, self_instance=self, context={"registry": registry}
+                parts,
+                self_instance=self,
+                context={"registry": registry, "folder": source.folder},
             )
         except ValidationError as error:
             raise report(error, source) from None

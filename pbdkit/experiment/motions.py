@@ -3,45 +3,17 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from bisect import bisect_left
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, ValidationInfo, model_validator
 
-from pbdkit.experiment.parts import brief, closed_part
-from pbdkit.interfaces import Component, Pair
-
-Floats = NDArray[np.floating[Any]]
-Steps = Annotated[int, Field(ge=1, le=2**62)]
-
-
-class Motion(Component):
-    """A prescribed motion, counted from the position at which it starts."""
-
-    rests: ClassVar[bool] = True
-    """Whether the motion ends, at the last of its knots."""
-
-    @abstractmethod
-    def offset(self, n: float, start: Floats) -> Floats:
-        """How far from their start the leaders stand at the end of the motion's n-th step, n ≥ 1;
-        on the way to an equilibrium also between two steps, n > 0.
-
-        `start` are the positions at which the motion found them, (particle, axis); so is what is
-        returned, or (axis,) where it is the same for all.
-        """
-
-    def knots(self) -> tuple[int, ...]:
-        """The steps n between which, and after which, the offset changes as one formula in n; by
-        default it always does."""
-        return ()
-
-    def rests_after(self) -> int | None:
-        """The step n from which on the offset stays as it is; None where it never does."""
-        return max((1, *self.knots())) if self.rests else None
-
+from pbdkit.experiment.columns import MOST_ROWS, read_columns
+from pbdkit.experiment.measured_motion import Measured
+from pbdkit.experiment.motion import Floats, Motion, Steps
+from pbdkit.experiment.parts import brief, closed_part, fault
+from pbdkit.interfaces import Pair
 
 class Hold(Motion):
     """Stays where it is."""
@@ -84,16 +56,17 @@ class Displace(Motion):
         return (1,)
 
 
-class Path(Motion):
+class Tabulated(Motion):
     """Stands `displacements[k]` from its start at its step `steps[k]`; linear between, from no
     displacement at its step 0, and the last is kept."""
 
-    type: Literal["path"] = "path"
-    steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1)]
-    displacements: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)]
+    steps: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=MOST_ROWS)]
+    displacements: Annotated[
+        tuple[Pair, ...], Field(strict=False, min_length=1, max_length=MOST_ROWS)
+    ]
 
     @model_validator(mode="after")
-    def _in_order(self) -> Path:
+    def _in_order(self) -> Self:
         if len(self.steps) != len(self.displacements):
             raise ValueError(
                 f"as many displacements as steps are needed: {len(self.displacements)} given "
@@ -113,6 +86,36 @@ class Path(Motion):
     def knots(self) -> tuple[int, ...]:
         """Its steps."""
         return self.steps
+
+
+class Path(Tabulated):
+    """Along `displacements`, at its steps `steps`."""
+
+    type: Literal["path"] = "path"
+
+
+class Table(Tabulated):
+    """The same from a `file`, a CSV with columns step, ux, uy; its content takes its place."""
+
+    type: Literal["table"] = "table"
+    file: str | None = Field(None, exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, given: Any, info: ValidationInfo) -> Any:
+        if not isinstance(given, dict) or given.get("file") is None:
+            return given
+        if "steps" in given or "displacements" in given:
+            raise fault("give either a file, or steps and displacements", key="file")
+        rows = read_columns(given["file"], info, ("step", "ux", "uy"))
+        if rows[0] == [0.0, 0.0, 0.0]:  # where every motion starts
+            del rows[0]
+        if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
+            text = f"{given['file']}: steps are whole numbers from 1 on, got {wrong[0]:g}"
+            raise fault(f"{text}; at step 0 nothing is displaced yet", key="file")
+        steps, displacements = [int(row[0]) for row in rows], [tuple(row[1:]) for row in rows]
+        rest = {key: value for key, value in given.items() if key != "file"}
+        return rest | {"steps": steps, "displacements": displacements}
 
 
 class Rotation(Motion):
@@ -151,5 +154,7 @@ class Oscillation(Motion):
 
 AnyMotion = Annotated[
     SerializeAsAny[Motion],
-    closed_part(Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation),
+    closed_part(
+        Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation, Table, Measured
+    ),
 ]

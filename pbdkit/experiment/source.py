@@ -43,6 +43,8 @@ class Source:
     name: str = ""
     data: Any = None
     places: dict[Where, str] = field(default_factory=dict)
+    folder: Path = field(default_factory=Path)
+    """Where the files lie that it names."""
 
     def message(self, where: Sequence[str | int], text: str) -> str:
         """``file:line:column: field: text``; of an absent field the place of what encloses it."""
@@ -73,7 +75,9 @@ def read_file(path: Path) -> Source:
         raise ExperimentError(
             f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8"
         ) from None
-    return read_text(text, str(path))
+    source = read_text(text, str(path))
+    source.folder = path.parent
+    return source
 
 
 def read_text(text: str, name: str) -> Source:

@@ -12,6 +12,7 @@ from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.scene.bonds import count_bonds
+from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
@@ -115,7 +116,7 @@ def prediction(scene: Scene) -> dict[str, Any]:
 def _doubts(scene: Scene) -> list[str]:
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
     warnings = list(scene.warnings)
-    if not (kinds_at(scene.raster, scene.leading, 1) == FOLLOWER).any():
+    if not (kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER).any():
         warnings.append("leaders: everybody leads in step 1, nobody follows")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:

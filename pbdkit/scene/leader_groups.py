@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.leaders import LeaderGroup, Selection
+from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
 from pbdkit.interfaces import Pair
@@ -51,6 +52,7 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
     for n, group in enumerate(experiment.leaders):
         rows = body.select(group.select, ("leaders", n, "select"))
         at = raster.reference(rows)
+        _refuse_unmeasured(group, at, rows, ("leaders", n, "motion"))
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
         axes = tuple("xy".index(axis) for axis in group.axes or ()) or range(at.shape[1])
         found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes))))
@@ -185,7 +187,8 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
     near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1, 2)}
     axes = sorted({*a.axes} & {*b.axes})
     for step in sorted(step for step in near if begin <= step <= end):
-        one, other = _offset(a.group, step, at), start + _offset(b.group, step, at + start)
+        moved = at if b.group.motion.of_reference else at + start
+        one, other = _offset(a.group, step, at), start + _offset(b.group, step, moved)
         differs = np.abs(one - other)[:, axes].max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
         if differs.any():
             number = shared[np.argmax(differs)] + 1
@@ -194,6 +197,26 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
                 "select it in one of them only, or let one end before the other begins",
                 ("leaders", n),
             )
+
+
+def _refuse_unmeasured(
+    group: LeaderGroup, at: Floats, rows: Indices, where: tuple[str | int, ...]
+) -> None:
+    if not isinstance(group.motion, Measured):
+        return
+    try:
+        outside = np.flatnonzero(np.isnan(group.motion.at(at)).any(axis=1))
+    except RuntimeError as error:  # of Qhull
+        text = f"no triangles can be put between the points: {str(error).strip().splitlines()[0]}"
+        raise ExperimentError(text, where) from None
+    if len(outside):
+        x, y = at[outside[0]]
+        raise ExperimentError(
+            f"{len(outside)} of {len(rows)} particles lie outside the measured points, the first "
+            f"is number {rows[outside[0]] + 1} at ({x:.6g}, {y:.6g}); measure farther out, or "
+            "select fewer",
+            where,
+        )
 
 
 def _refuse_infinite(

@@ -38,7 +38,8 @@ def prescribe(scene: Scene, state: State, moment: float) -> tuple[Led, Starts]:
             if begun is None:
                 begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
             n_th = moment - leading.group.from_ + 1
-            offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
+            motion, at = leading.group.motion, leading.reference
+            offset = motion.offset(n_th, at if motion.of_reference else at + begun.T)
             u = (begun + np.atleast_2d(offset).T)[list(leading.axes)]
             led.append(Placed(leading.place, u, leading.axes))
         starts.append(begun)
