@@ -21,12 +21,14 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.newton import Newton
 from pbdkit.experiment.parts import brief, fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
     INTERFACES,
+    Calibrated,
     Component,
     Diagnostic,
     FollowerRule,
@@ -101,6 +103,7 @@ class Experiment(Strict):
         anew, jumps = self.neighbours.nearness() is not None, not self.solver.makes_steps
         remembers = isinstance(self.rule, RenewsParticles)
         softens = isinstance(self.fracture, Softens)
+        masses = any(isinstance(group.motion, Newton) for group in self.leaders)
         clashes = [
             ("record", last > self.steps, f"step {last} is beyond the run's {self.steps}"),
             ("fracture", anew and self.fracture.can_break,
@@ -118,6 +121,12 @@ class Experiment(Strict):
             ("solver", jumps and remembers,
              f"the rule '{self.rule.type}' remembers, so that where the steps lead depends on "
              "all of them; take solver: {type: stepping}"),
+            ("solver", masses and (jumps or settles),
+             "leaders that move by Newton's law have no place at which they rest beforehand; take "
+             "solver: {type: stepping} without settle, or a load on followers"),
+            ("rule", masses and not isinstance(self.rule, Calibrated),
+             f"leaders that move by Newton's law need forces, and '{self.rule.type}' knows none; "
+             "take a calibrated rule: elastic, springs"),
         ]  # fmt: skip
         for key, clash, text in clashes:
             if clash:

@@ -12,6 +12,7 @@ from pydantic import Field, SerializeAsAny, ValidationInfo, model_validator
 from pbdkit.experiment.columns import MOST_ROWS, read_columns
 from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.motion import Floats, Motion, Steps
+from pbdkit.experiment.newton import Newton
 from pbdkit.experiment.parts import brief, closed_part, fault
 from pbdkit.interfaces import Pair
 
@@ -155,6 +156,6 @@ class Oscillation(Motion):
 AnyMotion = Annotated[
     SerializeAsAny[Motion],
     closed_part(
-        Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation, Table, Measured
+        Motion, Hold, Velocity, Displace, Path, Rotation, Oscillation, Table, Measured, Newton
     ),
 ]

@@ -11,6 +11,7 @@ from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
+from pbdkit.prediction.masses import too_light
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.leader_groups import kinds_at
@@ -121,6 +122,7 @@ def _doubts(scene: Scene) -> list[str]:
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
             warnings.append(f"leaders.{n}: begins to lead after the run's last step")
+    warnings += too_light(scene)
     if not scene.leading:
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():

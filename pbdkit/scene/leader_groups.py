@@ -15,6 +15,7 @@ from pbdkit.experiment.leaders import LeaderGroup, Selection
 from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
+from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces import Pair
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Floats, distinct
@@ -231,7 +232,10 @@ def _refuse_infinite(
 
 
 def _known_beforehand(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
-    """Whether it is known where both motions start, or does not matter: it does to rotations."""
+    """Whether it is known where both motions start, or does not matter: it does to rotations; and
+    of masses nothing is known."""
+    if any(isinstance(group.motion, Newton) for group in (a, b)):
+        return False
     turns = any(isinstance(group.motion, Rotation) for group in (a, b))
     latest = max if a.axes or b.axes else min  # where a particle follows along an axis is not known
     return not turns or (at_rest and latest(a.from_, b.from_) == 1)

@@ -12,6 +12,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.guidance import Guidance
+from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.prescription import place, placed, prescribe
 from pbdkit.stepping.state import State
 
@@ -40,7 +41,7 @@ class Stepper(Engine):
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
-        self._guidance = Guidance(scene)
+        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
 
     def advance(self, state: State, steps: int = 1) -> State:
         """One step after the other."""
@@ -50,7 +51,7 @@ class Stepper(Engine):
 
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
-        led, starts = prescribe(self._scene, state, step)
+        led, starts = prescribe(self._scene, state, step, self._newton)
         before = placed(u, led)
         place(u, led)
         if self._guidance.some:  # who leads along an axis makes no way along it that could go on

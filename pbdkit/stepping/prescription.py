@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.state import Floats, State
 
 
@@ -27,14 +29,20 @@ Led = list[Placed]
 Starts = tuple[Floats | None, ...]
 
 
-def prescribe(scene: Scene, state: State, moment: float) -> tuple[Led, Starts]:
+def prescribe(
+    scene: Scene, state: State, moment: float, forces: NewtonForces | None = None
+) -> tuple[Led, Starts]:
     """The leaders of a step with their displacements at its end, or at a moment within it, and
-    where each motion has started."""
+    where each motion has started; by Newton's law, with the forces at the end of the step before,
+    the velocities reached."""
     led: Led = []
     starts: list[Floats | None] = []
     step = math.ceil(moment)
-    for leading, begun in zip(scene.leading, state.starts, strict=True):
-        if leading.group.leads(step):
+    for n, (leading, begun) in enumerate(zip(scene.leading, state.starts, strict=True)):
+        if leading.group.leads(step) and forces and n in forces.numbers:
+            begun, u = _pushed(scene, state, forces, n)
+            led.append(Placed(leading.place, u, leading.axes))
+        elif leading.group.leads(step):
             if begun is None:
                 begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
             n_th = moment - leading.group.from_ + 1
@@ -46,6 +54,20 @@ def prescribe(scene: Scene, state: State, moment: float) -> tuple[Led, Starts]:
     if scene.leaders_overlap and len(led) > 1:
         _refuse_contradiction(scene, led, step)
     return led, tuple(starts)
+
+
+def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[Floats, Floats]:
+    """The velocities of a group (axis, particle), and where they lead along its axes."""
+    leading, velocity = scene.leading[n], state.starts[n]
+    motion, axes = leading.group.motion, list(leading.axes)
+    assert isinstance(motion, Newton)
+    if velocity is None:
+        velocity = np.outer(motion.velocity, np.ones(len(leading.place)))
+    faster = motion.faster(velocity.T, forces.on(n, state), forces.share(n)).T
+    reached = np.zeros_like(faster)
+    reached[axes] = faster[axes]
+    here = state.u.reshape(scene.axes, -1)[:, leading.place]
+    return reached, (here + reached)[axes]
 
 
 def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:

@@ -26,6 +26,7 @@ from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
 from pbdkit.stepping.guidance import Guidance
+from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import Led, prescribe, steady_steps
 from pbdkit.stepping.state import State, unmoved_state
@@ -53,7 +54,7 @@ class CompiledStepper(Engine):
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
         self._last: State | None = None
-        self._guidance = Guidance(scene)
+        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
         levels = levels_of(scene)
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
@@ -90,7 +91,7 @@ class CompiledStepper(Engine):
 
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
-        led, starts = prescribe(self._scene, state, step)
+        led, starts = prescribe(self._scene, state, step, self._newton)
         count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
