@@ -119,7 +119,7 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
 @pytest.mark.parametrize(
     ("motion", "content", "text"),
     [
-        (TABLE, "step,ux\n1,0\n", r"experiment\.yaml:9:27: leaders\.0\.motion\.file: .*data\.csv:1: "
+        (TABLE, "step,ux\n1,0\n", r"yaml:9:27: leaders\.0\.motion\.file: .*data\.csv:1: "
                                   "needs columns step, ux, uy, .* no 'uy'"),
         (TABLE, "step,ux,uy\n", "holds no row"),
         (TABLE, "step,ux,uy\n1,a,0\n", r"data\.csv:2: column 'ux' needs a finite number, got 'a'"),

@@ -1,4 +1,4 @@
-"""Guided particles among the couplings: their moves, and what belongs to leaders of what they do."""
+"""Guided particles among the couplings: their moves, and what they do as leaders."""
 
 from __future__ import annotations
 

@@ -52,8 +52,9 @@ class Reaction(Diagnostic):
     """The resultant force that each leader group must exert; 0 while it does not lead.
 
     Minus the forces of the neighbours on its particles; a particle of two groups counts half with
-    each. A group that leads along some axes exerts nothing along the others. All groups together exert nothing under the natural frame. Frame points pull too: at the
-    corners of held edges that is no force of the body, and a warning says so.
+    each. A group that leads along some axes exerts nothing along the others. All groups together
+    exert nothing under the natural frame. Frame points pull too: at the corners of held edges that
+    is no force of the body, and a warning says so.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -160,7 +161,7 @@ def reactions(now: Moment) -> Floats:
     times, found = np.zeros(forces.shape), np.zeros((len(groups), forces.shape[1]))
     leading = [(n, each.rows, list(each.axes)) for n, each in enumerate(groups) if each.leads]
     for _, rows, axes in leading:
-        times[np.ix_(rows, axes)] += 1
+        times[rows[:, None], axes] += 1
     for n, rows, axes in leading:
         share = forces[rows] / np.maximum(times[rows], 1)
         found[n, axes] = 0.0 - share.sum(axis=0)[axes]

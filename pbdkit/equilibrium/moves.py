@@ -46,7 +46,8 @@ class Moves:
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, step: int) -> Floats:
-        """Planes, zero where nobody follows in that step, or along that axis; brings the state's frame into line."""
+        """Planes, zero where nobody follows in that step, or along that axis; brings the state's
+        frame into line."""
         u, frame = state.u, self._scene.frame
         flat = u.reshape(len(u), -1)
         if frame:

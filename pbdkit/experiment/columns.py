@@ -24,7 +24,9 @@ def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list
     try:
         return list(_rows(_path(given, (info.context or {}).get("folder", Path())), names))
     except UnicodeDecodeError as error:
-        raise fault(f"{given}: is not UTF-8: {error.reason}; save it as UTF-8", key="file") from None
+        raise fault(
+            f"{given}: is not UTF-8: {error.reason}; save it as UTF-8", key="file"
+        ) from None
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise fault(f"{given}: cannot be read: {reason}", key="file") from None

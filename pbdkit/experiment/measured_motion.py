@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,7 +16,7 @@ from pbdkit.interfaces import Pair
 
 Pairs = Annotated[tuple[Pair, ...], Field(strict=False, min_length=2, max_length=MOST_ROWS)]
 ON_EDGE = 1e-7
-"""How far outside, as a share of a triangle or of a line's length, a place counts as on the edge."""
+"""By what share of a triangle, or of a line's length, a place outside counts as on the edge."""
 
 
 class Measured(Motion):
@@ -52,8 +53,7 @@ class Measured(Motion):
                 f"{len(self.points)}"
             )
         if len(set(self.points)) < len(self.points):
-            seen: set[Any] = set()
-            twice = next(p for p in self.points if p in seen or seen.add(p))
+            twice = next(p for p, times in Counter(self.points).items() if times > 1)
             raise ValueError(f"({twice[0]:g}, {twice[1]:g}) is measured twice; keep one of them")
         return self
 

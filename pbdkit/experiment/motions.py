@@ -16,6 +16,7 @@ from pbdkit.experiment.newton import Newton
 from pbdkit.experiment.parts import brief, closed_part, fault
 from pbdkit.interfaces import Pair
 
+
 class Hold(Motion):
     """Stays where it is."""
 

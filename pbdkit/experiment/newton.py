@@ -35,7 +35,7 @@ class Newton(Motion):
         """The velocities (particle, axis) a step on, with what neighbours exert and each one's
         share of the force."""
         force = share[:, None] * np.array(self.force) + pull - self.damping * velocity
-        return velocity + force / self.mass
+        return np.asarray(velocity + force / self.mass)
 
     def lightest(self, stiffness: float) -> float:
         """The mass below which a particle held by such a spring swings ever farther: steps are

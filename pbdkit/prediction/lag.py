@@ -99,7 +99,9 @@ class Trail:
         for leading in scene.leading:
             if leading.group.leads(step):
                 for axis in leading.axes:
-                    v.reshape(scene.axes, -1)[axis, leading.place] = _velocity(leading, step)[:, axis]
+                    v.reshape(scene.axes, -1)[axis, leading.place] = _velocity(leading, step)[
+                        :, axis
+                    ]
         direct, shown = edge.moves(v), edge.moves(edge.shown(v))
         if not (direct + shown).any():
             return None

@@ -1,4 +1,4 @@
-"""Leaders that are too light for steps: those of the symplectic Euler method are stable for ω ≤ 2."""
+"""Leaders that are too light for steps: the symplectic Euler method is stable for ω ≤ 2."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ def too_light(scene: Scene) -> list[str]:
     state = initial_state(scene) if forces.numbers else None
     for n in forces.numbers:
         motion = scene.leading[n].group.motion
-        assert state and isinstance(motion, Newton)
+        assert state
+        assert isinstance(motion, Newton)
         least = motion.lightest(forces.stiffness(n, state, NUDGE))
         if motion.mass < least:
             found.append(
-                f"leaders.{n}.motion.mass: {motion.mass:g} is too light, its swing may grow without "
-                f"bound; steps are stable from {least:.4g} on"
+                f"leaders.{n}.motion.mass: {motion.mass:g} is too light, its swing may grow for "
+                f"ever; steps are stable from {least:.4g} on"
             )
     return found

@@ -1,4 +1,4 @@
-"""Guided particles: leaders that lead along some axes and follow along the others, as on rollers."""
+"""Guided particles lead along some axes and follow along the others, as on rollers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
@@ -47,7 +48,7 @@ def guided_at(raster: Raster, leading: Iterable[Leading], step: int) -> Guided:
     return Guided(rows[free], raster.place_of(rows[free]), led[:, free])
 
 
-def kinds_of_places(raster: Raster, leading: Iterable[Leading], step: int) -> Indices:
+def kinds_of_places(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
     """The kinds of flat places with the roles of a step; who is guided counts as a follower."""
     kind = raster.kind.ravel().copy()
     every = tuple(leading)

@@ -190,7 +190,9 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
     for step in sorted(step for step in near if begin <= step <= end):
         moved = at if b.group.motion.of_reference else at + start
         one, other = _offset(a.group, step, at), start + _offset(b.group, step, moved)
-        differs = np.abs(one - other)[:, axes].max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
+        differs = np.abs(one - other)[:, axes].max(axis=1) > 1e-12 * max(
+            _spacing(raster), np.abs(one).max()
+        )
         if differs.any():
             number = shared[np.argmax(differs)] + 1
             raise ExperimentError(

@@ -85,7 +85,7 @@ class Guidance:
             return shares
         pulls = self._pulls(guided.place)
         for pattern in np.unique(guided.led, axis=1).T:
-            some = np.flatnonzero((guided.led.T == pattern).all(axis=1))
+            some = np.flatnonzero((pattern == guided.led.T).all(axis=1))
             f, of = np.flatnonzero(~pattern), np.flatnonzero(pattern)
             own, across = (pulls[np.ix_(some, f, axis)] for axis in (f, of))
             shares[np.ix_(some, f, of)] = np.linalg.pinv(own) @ across
