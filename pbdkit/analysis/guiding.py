@@ -49,7 +49,7 @@ class Guiding:
 
     def put(
         self, free: Couplings, led: Couplings, rows: Indices, there: Indices,
-        unknown: tuple[Indices, Indices], blocks: Floats,
+        unknown: tuple[NDArray[np.int32], NDArray[np.int32]], blocks: Floats,
     ) -> None:  # fmt: skip
         """Adds what particles at flat places do as followers, and what guided ones do as leaders,
         by the numbers `unknown` that each flat place has among both."""

@@ -234,9 +234,8 @@ def lattice_system(
     held = held_components(scene, step)
     if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
         return None
-    matrix = constrained(matrix, held)
     try:
-        system = LatticeSystem(*balanced(matrix, alike), state.u.shape, watch)
+        system = LatticeSystem(*balanced(constrained(matrix, held), alike), state.u.shape, watch)
     except FloatingError:
         return None
     if not system.may_be_stable:

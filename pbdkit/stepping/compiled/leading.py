@@ -54,11 +54,10 @@ def leading_arrays(plan: Plan, led: Led, slants: Slants, real: Any) -> dict[str,
     found: dict[str, Any] = {}
     for a, axis in enumerate(plan.axes):
         some = [each for each in led if a in each.axes]
-        places = [np.empty(0, np.intp), *(each.place for each in some)]
-        values = [np.empty(0), *(each.u[each.axes.index(a)] for each in some)]
-        u = np.concatenate(values).astype(real)
-        found |= {f"led_{axis}": np.concatenate(places), f"led_values_{axis}": u}
-        found[f"led_kept_{axis}"] = np.empty_like(u)
+        at = np.concatenate([np.empty(0, np.intp), *(each.place for each in some)])
+        u = np.concatenate([np.empty(0), *(each.u[each.axes.index(a)] for each in some)])
+        u = u.astype(real)
+        found |= {f"led_{axis}": at, f"led_values_{axis}": u, f"led_kept_{axis}": np.empty_like(u)}
     for to, of in permutations(range(len(plan.axes)), 2):
         name = plan.axes[to] + plan.axes[of]
         none = np.empty(0, np.intp), np.empty(0, real)
