@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,16 @@ from pbdkit.experiment.parts import fault
 from pbdkit.interfaces.component import did_you_mean
 
 MOST_BYTES, MOST_ROWS = 2**26, 200_000
+
+
+def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
+    """For a model's JSON Schema: these fields are needed, or `file` in their place."""
+
+    def either(schema: dict[str, Any]) -> None:
+        schema["required"] = [name for name in schema.get("required", ()) if name not in names]
+        schema["anyOf"] = [{"required": ["file"]}, {"required": [*names]}]
+
+    return either
 
 
 def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:

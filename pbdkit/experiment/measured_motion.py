@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, model_validator
 
-from pbdkit.experiment.columns import MOST_ROWS, read_columns
+from pbdkit.experiment.columns import MOST_ROWS, or_a_file, read_columns
 from pbdkit.experiment.motion import Floats, Motion, Steps
 from pbdkit.experiment.parts import fault
 from pbdkit.interfaces import Pair
@@ -25,6 +25,8 @@ class Measured(Motion):
 
     `file`: a CSV with columns x, y, ux, uy; its content takes its place.
     """
+
+    model_config = ConfigDict(json_schema_extra=or_a_file("points", "displacements"))
 
     type: Literal["measured"] = "measured"
     of_reference: ClassVar[bool] = True

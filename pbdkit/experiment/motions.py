@@ -7,9 +7,9 @@ from bisect import bisect_left
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, ValidationInfo, model_validator
+from pydantic import ConfigDict, Field, SerializeAsAny, ValidationInfo, model_validator
 
-from pbdkit.experiment.columns import MOST_ROWS, read_columns
+from pbdkit.experiment.columns import MOST_ROWS, or_a_file, read_columns
 from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.motion import Floats, Motion, Steps
 from pbdkit.experiment.newton import Newton
@@ -98,6 +98,8 @@ class Path(Tabulated):
 
 class Table(Tabulated):
     """The same from a `file`, a CSV with columns step, ux, uy; its content takes its place."""
+
+    model_config = ConfigDict(json_schema_extra=or_a_file("steps", "displacements"))
 
     type: Literal["table"] = "table"
     file: str | None = Field(None, exclude=True)
