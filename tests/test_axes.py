@@ -9,7 +9,7 @@ import pytest
 
 import pbdkit
 from pbdkit.experiment.body import Body, Box
-from pbdkit.experiment.leaders import Velocity
+from pbdkit.experiment.motions import Velocity
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.choice import choose, make_engine
 from pbdkit.stepping.state import initial_state

@@ -33,6 +33,16 @@ class Entries:
         values = np.concatenate([self.values, factor * other.values])
         return Entries(rows, columns, values, other.shape)
 
+    def without(self, unknowns: Indices) -> Entries:
+        """The matrix less some rows and columns."""
+        kept = np.ones(self.shape[0], bool)
+        kept[unknowns] = False
+        number = np.cumsum(kept) - 1
+        some = kept[self.rows] & kept[self.columns]
+        size = int(np.count_nonzero(kept))
+        at = number[self.rows[some]], number[self.columns[some]]
+        return Entries(*at, self.values[some], (size, size))
+
     def matrix(self) -> Any:
         """Dense up to DENSE rows, else sparse."""
         if self.shape[0] > DENSE:

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import Couplings
+from pbdkit.analysis.guiding import Guiding
 from pbdkit.analysis.operator import moves_and_couplings
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
@@ -47,16 +49,18 @@ class Edge:
 def edge_of(scene: Scene, state: State, step: int) -> Edge:
     """At a state, with the roles of a step; of all followers where a rule works on the moves of
     another."""
-    raster = scene.raster
-    kind = raster.kind.ravel().copy()
-    for leading in scene.leading:
-        if leading.group.leads(step):
-            kind[leading.place] = LEADER
+    raster, guiding = scene.raster, Guiding(scene, step)
+    kind = kinds_of_places(raster, scene.leading, step)
     place = np.flatnonzero(kind == FOLLOWER)
     if not scene.inner:
         seen = np.flatnonzero((kind == LEADER) | (kind == FRAME))
+        seen = np.concatenate([seen, guiding.guided.place])
         beside = [seen - slot_step(raster.shape, slot) for slot in scene.neighbourhood.every]
-        some = np.unique(np.concatenate(beside)).clip(0, kind.size - 1)
+        some = np.unique(np.concatenate([*beside, seen])).clip(0, kind.size - 1)
         place = some[kind[some] == FOLLOWER]
     _, couplings = moves_and_couplings(scene, state, place)
+    couplings.parts = [
+        (rows, there, guiding.turned(place[rows], blocks))
+        for rows, there, blocks in couplings.parts
+    ]
     return Edge(scene, place, couplings)

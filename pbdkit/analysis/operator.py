@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import Couplings, Entries, frame_matrices, scaled, some_of
+from pbdkit.analysis.guiding import Guiding
 from pbdkit.analysis.linear_response import by_sublattice, has_neighbours, respond
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Stepping
@@ -39,7 +40,8 @@ class StepOperator:
 
     `followers` and `leaders` are rows of the particle table; in the plane unknown 2n is x of the
     n-th follower, 2n + 1 its y, and the same for leaders. The couplings hold the same by
-    particle; of those with leaders, `couplings_shown` is the share that frame points show.
+    particle; of those with leaders, `couplings_shown` is the share that frame points show. Guided
+    particles are of both: `held` are their unknowns that lead, with empty rows and columns.
     """
 
     followers: Indices
@@ -49,6 +51,7 @@ class StepOperator:
     couplings_led: Couplings
     couplings_shown: Couplings
     source: Floats
+    held: Indices
 
     @property
     def couplings_both(self) -> Couplings:
@@ -72,8 +75,10 @@ class StepOperator:
         return self.couplings_led.entries().sparse()
 
     def augmented(self) -> Entries:
-        """The operator on (u(t), u(t-1)); that on u(t) where the step does not look back."""
-        now, before = self.couplings_now.entries(), self.couplings_before.entries()
+        """The operator on (u(t), u(t-1)); that on u(t) where the step does not look back. Without
+        what is held."""
+        parts = self.couplings_now, self.couplings_before
+        now, before = (couplings.entries().without(self.held) for couplings in parts)
         if not len(before.values):
             return now
         size = now.shape[0]
@@ -91,9 +96,8 @@ def step_operator(
     Raises ExperimentError where neighbours are found anew at every step.
     """
     if scene.experiment.neighbours.nearness():
-        raise ExperimentError(
-            "neighbours that are found anew have no step operator", ("neighbours",)
-        )
+        text = "neighbours that are found anew have no step operator"
+        raise ExperimentError(text, ("neighbours",))
     state, step = state or initial_state(scene), step or scene.experiment.steps
     return _Assembly(scene, state, step).operator()
 
@@ -160,11 +164,16 @@ class _Assembly:
         raster, kinds = scene.raster, kinds_at(scene.raster, scene.leading, step)
         self._kind = np.full(raster.kind.size, EMPTY, np.int8)
         self._unknown = np.full(raster.kind.size, -1, np.int32)
-        rows = {kind: np.flatnonzero(kinds == kind) for kind in (FOLLOWER, LEADER, FRAME)}
+        self._guiding = guiding = Guiding(scene, step)
+        rows = {kind: np.flatnonzero(kinds == kind) for kind in (FRAME, LEADER, FOLLOWER)}
+        rows[FOLLOWER] = np.sort(np.concatenate([rows[FOLLOWER], guiding.guided.rows]))
+        self._as_leader = self._unknown
         for kind, some in rows.items():
             place = raster.place_of(some)
             self._kind[place] = kind
             self._unknown[place] = np.arange(len(some))
+            if kind == LEADER and guiding:
+                self._as_leader = self._unknown.copy()
         self._followers, self._leaders = rows[FOLLOWER], rows[LEADER]
         free, led = len(self._followers), len(self._leaders)
         self._now, self._before = (Couplings((free, free), scene.axes) for _ in range(2))
@@ -174,19 +183,34 @@ class _Assembly:
         scene, solver, u = self._scene, self._scene.experiment.stepping, self._state.u
         place = scene.raster.place_of(self._followers)
         moves, couplings = moves_and_couplings(scene, self._state, place)
-        self._now.add_scaled_identity(np.arange(len(place), dtype=np.int32), 1.0)
+        self._stay(self._now, place, np.arange(len(place), dtype=np.int32), 1.0)
+        moves = self._guiding.turned(place, moves)
+        couplings.parts = [
+            (rows, there, self._guiding.turned(place[rows], blocks))
+            for rows, there, blocks in couplings.parts
+        ]
         for rows, there, blocks in couplings.parts:
             self._see(rows, there, scaled(solver.relaxation, blocks))
         if solver.memory:
             moving = np.flatnonzero(has_neighbours(scene, place))
-            self._now.add_scaled_identity(moving, solver.memory)
-            self._before.add_scaled_identity(moving, -solver.memory)
+            self._stay(self._now, place, moving, solver.memory)
+            self._stay(self._before, place, moving, -solver.memory)
         if u.any():
             moves = moves - couplings.times(u.reshape(scene.axes, -1).T.astype(float, copy=False))
         if scene.loads:
             moves = moves + self._pushed(place)
         source, who = (solver.relaxation * moves).ravel(), (self._followers, self._leaders)
-        return StepOperator(*who, self._now, self._before, self._led, self._shown, source)
+        axis, some = np.nonzero(self._guiding.guided.led)
+        guided = self._unknown[self._guiding.guided.place[some]]
+        couplings_of = self._now, self._before, self._led, self._shown
+        return StepOperator(*who, *couplings_of, source, np.sort(scene.axes * guided + axis))
+
+    def _stay(self, couplings: Couplings, place: Indices, rows: Indices, factor: float) -> None:
+        """Adds factor · 1 where followers are free."""
+        own = self._guiding.numbers(place[rows])
+        couplings.add_scaled_identity(rows[own < 0], factor)
+        some = np.flatnonzero(own >= 0)
+        couplings.add(rows[some], rows[some], factor * self._guiding.free[own[some]])
 
     def _pushed(self, place: Indices) -> Floats:
         """(follower, axis): what the loads of the step add to the moves."""
@@ -200,9 +224,11 @@ class _Assembly:
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
         """Followers and leaders directly, frame points through those that they follow."""
         kinds = self._kind[there]
-        for kind, couplings in ((FOLLOWER, self._now), (LEADER, self._led)):
-            some = kinds == kind
-            couplings.add(rows[some], self._unknown[there[some]], some_of(weight, some))
+        some, numbers = kinds == LEADER, (self._unknown, self._as_leader)
+        self._led.add(rows[some], self._as_leader[there[some]], some_of(weight, some))
+        some = kinds == FOLLOWER
+        given = rows[some], there[some], numbers, some_of(weight, some)
+        self._guiding.put(self._now, self._led, *given)
         frame, some = self._scene.frame, kinds == FRAME
         if frame is None or not some.any():
             return
@@ -217,6 +243,8 @@ class _Assembly:
             body = frame.body_place[entry]
             of_leader = self._kind[body] == LEADER
             free = self._before if frame.map.lag else self._now
-            sums = ((self._led, of_leader), (self._shown, of_leader), (free, ~of_leader))
-            for couplings, those in sums:
-                couplings.add(rows[has][those], self._unknown[body[those]], product[those])
+            for couplings, others in ((self._led, free), (self._shown, Couplings((0, 0), 0))):
+                columns = self._as_leader[body[of_leader]]
+                couplings.add(rows[has][of_leader], columns, product[of_leader])
+                given = rows[has][~of_leader], body[~of_leader], numbers, product[~of_leader]
+                self._guiding.put(others, couplings, *given)

@@ -58,9 +58,10 @@ class Reaction(Diagnostic):
     """The resultant force that each leader group must exert; 0 while it does not lead.
 
     Minus the forces of the neighbours on its particles, and the loads on them; a particle of two
-    groups counts half with each. Under the natural frame all groups together exert nothing, or
-    minus the loads. Frame points pull too: at the
-    corners of held edges that is no force of the body, and a warning says so.
+    groups counts half with each. A group that leads along some axes exerts nothing along the
+    others. Under the natural frame all groups together exert nothing, or minus the loads. Frame
+    points pull too: at the corners of held edges that is no force of the body, and a warning says
+    so.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -189,10 +190,16 @@ class StressStrain(Diagnostic):
 
 
 def reactions(now: Moment) -> Floats:
-    """What each leader group exerts over Young's modulus and thickness, (leader group, axis)."""
+    """What each leader group exerts over Young's modulus and thickness, (leader group, axis): along
+    axes along which it leads."""
     forces, groups = np.array(now.forces.on_particles()), now.leader_groups()
     for load in now.loads():
         forces[load.rows] += np.outer(load.share, load.force)
-    leaders = [group.rows if group.leads else group.rows[:0] for group in groups]
-    times = np.bincount(np.concatenate(leaders), minlength=len(forces))
-    return np.stack([0.0 - (forces[rows] / times[rows, None]).sum(axis=0) for rows in leaders])
+    times, found = np.zeros(forces.shape), np.zeros((len(groups), forces.shape[1]))
+    leading = [(n, each.rows, list(each.axes)) for n, each in enumerate(groups) if each.leads]
+    for _, rows, axes in leading:
+        times[rows[:, None], axes] += 1
+    for n, rows, axes in leading:
+        share = forces[rows] / np.maximum(times[rows], 1)
+        found[n, axes] = 0.0 - share.sum(axis=0)[axes]
+    return found

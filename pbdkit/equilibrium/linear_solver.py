@@ -35,15 +35,17 @@ SAME = 1e-12
 @dataclass(frozen=True)
 class Ground:
     """Where the unknowns lie, `axes` of each particle next to each other: the places of particles
-    and of leaders, (particle, axis of space)."""
+    and of leaders, (particle, axis of space); which unknowns are `held`, each alone in its row and
+    column (None: none)."""
 
     axes: int
     places: Floats
     led: Floats
+    held: NDArray[np.bool_] | None = None
 
     def grids(self, matrix: Any) -> Preconditioner:
         """Multigrid for a matrix of these unknowns."""
-        return SparseGrids(matrix, self.axes, self.places, self.led)
+        return SparseGrids(matrix, self.axes, self.places, self.led, self.held)
 
 
 class LinearSolver(ABC):

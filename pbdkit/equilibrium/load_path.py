@@ -62,7 +62,7 @@ def _way(scene: Scene, begin: int, end: int) -> float:
         if not (group.from_ - 1 <= begin and group.leads(end)):
             continue
         times = np.linspace(begin, end, SAMPLES + 1) - group.from_ + 1
-        at = [np.atleast_2d(group.motion.offset(n, leading.reference)) for n in times.tolist()]
-        ways = sum(np.hypot(*(b - a).T) for a, b in pairwise(at))
+        at = [leading.offset(n) for n in times.tolist()]
+        ways = sum(np.hypot.reduce(abs(b - a), axis=1) for a, b in pairwise(at))
         most = max(most, float(np.max(ways)))
     return most if math.isfinite(most) else 0.0

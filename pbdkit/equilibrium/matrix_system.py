@@ -50,6 +50,8 @@ class MatrixSystem(System):
         self._X = scene.raster.reference(operator.followers)
         self._led = scene.raster.reference(operator.leaders)
         self._place = scene.raster.place_of(operator.followers)
+        self._guided = np.zeros((len(operator.followers), scene.axes), bool)
+        self._guided.ravel()[operator.held] = True
         self._both = both = operator.couplings_both
         first = 1 if both.couples(0, 1) else 0
         self._stages = [] if both.couples(first, 1 - first) else [self._stage([first])]
@@ -120,7 +122,7 @@ class MatrixSystem(System):
             if stage.into is not None:
                 r = r + stage.into @ found[:, 1 - stage.axes[0]]
             back = None if owed is None else owed[:, stage.axes].ravel()
-            x = np.empty_like(r)
+            x = np.zeros_like(r)
             for some, part in stage.parts:
                 try:
                     x[some] = part.solve(r[some], None if back is None else back[some])
@@ -190,12 +192,17 @@ class MatrixSystem(System):
         self._amplification = max(self._amplification, largest)
         led = self._operator.couplings_led.entries(axes)
         count, label = connected(matrix, strongly=False)
+        guided, alone = self._guided[:, axes].ravel(), np.zeros(count, bool)
+        # A component that leads stands alone: it goes with its particle, or is left out.
+        alone[label[guided]] = True
+        if len(axes) > 1:
+            label = np.where(guided, label.reshape(-1, 2)[:, ::-1].ravel(), label)
         held = np.zeros(count, bool)
         held[label[led.rows[led.values != 0.0]]] = True
         # What leaders move directly or not is solved together, each part that floats by itself.
-        groups = [np.flatnonzero(held[label])] if held.any() else []
+        groups = [np.flatnonzero((held & ~alone)[label])] if held.any() else []
         stage = _Stage(axes, [])
-        for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held)]:
+        for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held & ~alone)]:
             part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
             stage.parts.append((some, part))
         return stage
@@ -203,12 +210,19 @@ class MatrixSystem(System):
     def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
         """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
         if held:
-            ground = Ground(len(axes), self._X[some[:: len(axes)] // len(axes)], self._led)
+            ground = self._ground(axes, some)
             with suppress(np.linalg.LinAlgError):
                 return Held(matrix, self._method, ground, self._watch)
         before = self._operator.couplings_before
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
         return Floating(matrix, back, self._watch)
+
+    def _ground(self, axes: list[int], some: Indices) -> Ground:
+        """Where these unknowns lie; who leads along the one axis asked for is a leader."""
+        where, held = some[:: len(axes)] // len(axes), self._guided[:, axes]
+        led = self._X[held[:, 0]] if len(axes) == 1 else self._X[:0]
+        guided = held[where].ravel() if len(axes) > 1 and held.any() else None
+        return Ground(len(axes), self._X[where], np.concatenate([self._led, led]), guided)
 
 
 def _within(matrix: Any, unknowns: Indices) -> Any:

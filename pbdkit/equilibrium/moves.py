@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbdkit.experiment.leaders import Hold
+from pbdkit.experiment.motions import Hold
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.interfaces import RenewsParticles
 from pbdkit.scene.leader_groups import Leading, kinds_at
@@ -15,6 +15,7 @@ from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
 
@@ -31,6 +32,7 @@ class Moves:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
+        self._guidance = Guidance(scene)
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         self._loads = replace(scene.loads) if scene.loads else None
         stepped = replace(scene, loads=self._loads)
@@ -47,8 +49,8 @@ class Moves:
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
-        """Planes, zero where nobody follows in the step of a moment, under the loads of that
-        moment; brings the state's frame into line."""
+        """Planes, zero where nobody follows in the step of a moment, or along that axis, under
+        the loads of that moment; brings the state's frame into line."""
         u, frame, step = state.u, self._scene.frame, math.ceil(moment)
         if self._loads:
             self._loads.held_at = moment
@@ -64,11 +66,15 @@ class Moves:
             moves = u.astype(float)
             with np.errstate(all="ignore"):
                 self._followers.move(u, moves, state)
+                self._guidance.correct(moves, u, step)
         with np.errstate(all="ignore"):
             moves -= u
-        still = [led.place for led in self._scene.leading if led.group.leads(step)]
-        for place in [*still, *([frame.place] if frame else [])]:
-            moves.reshape(len(u), -1)[:, place] = 0.0
+        still = moves.reshape(len(u), -1)
+        for led in self._scene.leading:
+            for axis in led.axes if led.group.leads(step) else ():
+                still[axis, led.place] = 0.0
+        if frame:
+            still[:, frame.place] = 0.0
         return moves
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 COARSEST = 400
 """Unknowns up to which a grid is solved with its inverse."""
 MOST_GRIDS = 20
@@ -54,9 +55,11 @@ class _Level:
 class SparseGrids:
     """Approximates A⁻¹ r by a V-cycle in single precision. Of the matrix there are `axes` unknowns
     a particle, one after the other; `places` (particle, axis of space) says where particles lie,
-    `led` where the leaders do."""
+    `led` where the leaders do, `held` which unknowns stand alone, and are not interpolated to."""
 
-    def __init__(self, matrix: Any, axes: int, places: Floats, led: Floats) -> None:
+    def __init__(
+        self, matrix: Any, axes: int, places: Floats, led: Floats, held: Mask | None = None
+    ) -> None:
         self._levels: list[_Level] = []
         A, spacing = matrix.astype(np.float32).tocsr(), _spacing(np.concatenate([places, led]))
         origin = places.min(axis=0, initial=np.inf)
@@ -65,10 +68,14 @@ class SparseGrids:
             hats, points = _hats(A, axes, (places - origin) / spacing, (led - origin) / spacing)
             if hats.shape[1] > 0.8 * hats.shape[0]:
                 continue
+            if held is not None:
+                hats, held = _free(hats, held)
             own = _own_inverses(A, axes)
             restricts = hats.T.tocsr()
             self._levels.append(_Level(A, own, MARGIN * _largest(A, own), hats, restricts))
             A, places = (restricts @ (A @ hats)).tocsr(), points * spacing + origin
+            if held is not None:
+                A = A + _chosen(held)
         self._coarsest = np.linalg.pinv(A.toarray().astype(float), rcond=SINGULAR).astype(
             np.float32
         )
@@ -130,6 +137,21 @@ def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
     hats = csr_array((value.astype(np.float32), (row, piece)), (len(at), count))
     places = np.stack(np.unravel_index(around, shape), axis=1) + low
     return kron(hats, eye_array(axes, dtype=np.float32), format="csr"), places.astype(float)
+
+
+def _free(hats: Any, held: Mask) -> tuple[Any, Mask]:
+    """The hats of what is free, and which unknowns of the next grid are held: those to which one
+    that is held is nearer than any other."""
+    led, free = (_chosen(some) @ hats for some in (held, ~held))
+    below = (led.max(axis=0).toarray() > free.max(axis=0).toarray()).ravel()
+    return (free @ _chosen(~below)).tocsr(), below
+
+
+def _chosen(some: Mask) -> Any:
+    """1 on the diagonal of some."""
+    from scipy.sparse import diags_array
+
+    return diags_array(some.astype(np.float32), format="csr")
 
 
 def _nearest(at: Floats, low: Indices, shape: tuple[int, ...]) -> Floats:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Any
 
-from pbdkit.interfaces import Loadable, RenewsParticles, Softens
+from pbdkit.experiment.newton import Newton
+from pbdkit.interfaces import Calibrated, Loadable, RenewsParticles, Softens
 from pbdkit.interfaces.fields import unknown_regions
 from pbdkit.interfaces.rule import material_of
-
-if TYPE_CHECKING:
-    from pbdkit.experiment.model import Experiment
 
 Key = str | tuple[str, str]
 
 
-def clashes_of(asked: Experiment) -> Iterator[tuple[Key, str]]:
-    """The fields at which parts clash, each with a message."""
+def clashes_of(asked: Any) -> Iterator[tuple[Key, str]]:
+    """The fields of an experiment at which parts clash, each with a message."""
     yield from ((key, text) for key, clashes, text in _looked_at(asked) if clashes)
     for field in ("rule", "fracture"):
         for name, text in unknown_regions(getattr(asked, field), asked.regions):
@@ -26,12 +24,13 @@ def clashes_of(asked: Experiment) -> Iterator[tuple[Key, str]]:
             yield ("regions", name), "counts sites, and a region is a place: take a rectangle"
 
 
-def _looked_at(asked: Experiment) -> list[tuple[Key, bool, str]]:
+def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
     last, settles = max(asked.record.at or (0,)), asked.stepping.settle is not None
     anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
     remembers = isinstance(asked.rule, RenewsParticles)
     softens = isinstance(asked.fracture, Softens)
-    knows_forces = isinstance(asked.rule, Loadable) and material_of(asked.rule) is not None
+    masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
+    knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
     return [
         ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
         ("fracture", anew and asked.fracture.can_break,
@@ -49,6 +48,12 @@ def _looked_at(asked: Experiment) -> list[tuple[Key, bool, str]]:
         ("solver", jumps and remembers,
          f"the rule '{asked.rule.type}' remembers, so that where the steps lead depends on "
          "all of them; take solver: {type: stepping}"),
+        ("solver", masses and (jumps or settles),
+         "leaders that move by Newton's law have no place at which they rest beforehand; take "
+         "solver: {type: stepping} without settle, or a load on followers"),
+        ("rule", masses and not isinstance(asked.rule, Calibrated),
+         f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none; "
+         "take a calibrated rule: elastic, springs"),
         ("loads", bool(asked.loads) and not knows_forces,
          f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
          "particle goes, and of no material how far a force would move it; take a calibrated "

@@ -34,7 +34,7 @@ def with_value(
         int(p) if p.isascii() and p.isdecimal() and len(p) < 10 else p for p in path.split(".")
     )
     places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
-    changed = Source(source.name, copy.deepcopy(source.data), source.folder, places)
+    changed = Source(source.name, copy.deepcopy(source.data), places, source.folder)
     _place(changed.data, where, value, label, defaults)
     for depth in range(1, len(where) + 1):
         changed.places.setdefault(where[:depth], label)

@@ -34,7 +34,9 @@ def read_experiment(name: str) -> Source:
         return read_file(path)
     names = shipped_names()
     if name in names:
-        return read_text(shipped_text(name), name)
+        source = read_text(shipped_text(name), name)
+        source.folder = (FOLDER / name).parent
+        return source
     what = "is a folder" if is_folder else "is no file and no shipped experiment"
     near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
     hint = did_you_mean(name, [*near, *names])

@@ -42,9 +42,9 @@ class Source:
 
     name: str = ""
     data: Any = None
+    places: dict[Where, str] = field(default_factory=dict)
     folder: Path = field(default_factory=Path)
     """Where the files lie that it names."""
-    places: dict[Where, str] = field(default_factory=dict)
 
     def message(self, where: Sequence[str | int], text: str) -> str:
         """``file:line:column: field: text``; of an absent field the place of what encloses it."""

@@ -43,10 +43,12 @@ class Variable:
 
 
 class LeaderRows(NamedTuple):
-    """The rows of a leader group's particles, and whether it leads during this step."""
+    """The rows of a leader group's particles, whether it leads during this step, and the numbers of
+    the axes along which it does."""
 
     rows: NDArray[np.intp]
     leads: bool
+    axes: tuple[int, ...] = (0, 1)
 
 
 class LoadRows(NamedTuple):

@@ -202,7 +202,7 @@ class Analysis:
         graph = Entries(both.rows, both.columns, np.ones(len(both.rows)), both.shape)
         count, label = connected(graph.matrix(), strongly=False)
         led = np.zeros(count, bool)
-        led[label[operator.couplings_led.entries().rows]] = True
+        led[label[np.append(operator.couplings_led.entries().rows, operator.held)]] = True
         numbers = operator.followers[np.arange(len(label)) // self.scene.axes] + 1
         parts = {tuple(np.unique(numbers[label == n]).tolist()) for n in np.flatnonzero(~led)}
         return sorted(parts)

@@ -12,7 +12,9 @@ from pbdkit.analysis.stencil import bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.units import LENGTH
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
+from pbdkit.prediction.masses import too_light
 from pbdkit.scene.bonds import count_bonds
+from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
@@ -126,7 +128,7 @@ def prediction(scene: Scene) -> dict[str, Any]:
 def _doubts(scene: Scene) -> list[str]:
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
     warnings = list(scene.warnings)
-    if not (kinds_at(scene.raster, scene.leading, 1) == FOLLOWER).any():
+    if not (kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER).any():
         warnings.append("leaders: everybody leads in step 1, nobody follows")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
@@ -134,6 +136,7 @@ def _doubts(scene: Scene) -> list[str]:
     for n, load in enumerate(scene.experiment.loads):
         if load.from_ > scene.experiment.steps:
             warnings.append(f"loads.{n}: begins to act after the run's last step")
+    warnings += too_light(scene)
     if not (scene.leading or scene.loads):
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():

@@ -30,7 +30,7 @@ from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.spectrum import excess
 from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.leaders import Oscillation
+from pbdkit.experiment.motions import Oscillation
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -94,7 +94,10 @@ class Trail:
         edge, v = edge_of(scene, state, step), np.zeros((scene.axes, *scene.raster.shape))
         for leading in scene.leading:
             if leading.group.leads(step):
-                v.reshape(scene.axes, -1)[:, leading.place] = _velocity(leading, step).T
+                for axis in leading.axes:
+                    v.reshape(scene.axes, -1)[axis, leading.place] = _velocity(leading, step)[
+                        :, axis
+                    ]
         direct, shown = edge.moves(v), edge.moves(edge.shown(v))
         if not (direct + shown).any():
             return None
@@ -215,7 +218,8 @@ def _moments(leading: Leading, scene: Scene) -> list[int]:
 def _velocity(leading: Leading, step: int) -> Floats:
     """Of a group's particles in a step, (particle, axis); a rotation turns it on the way."""
     n, motion, at = step - leading.group.from_ + 1, leading.group.motion, leading.reference
-    if isinstance(motion, Oscillation):
-        return np.zeros_like(at)
-    before = motion.offset(n - 1, at) if n > 1 else 0.0
-    return np.zeros_like(at) + (motion.offset(n, at) - before)
+    v = np.zeros_like(at)
+    if not isinstance(motion, Oscillation):
+        before = motion.offset(n - 1, at) if n > 1 else 0.0
+        v[:, list(leading.axes)] += (motion.offset(n, at) - before)[..., list(leading.axes)]
+    return v

@@ -101,4 +101,4 @@ class Spectra:
         both = self.operator.couplings_both.entries()
         share, every = 1.0 / self.scene.experiment.stepping.relaxation, np.arange(both.shape[0])
         rest = Entries(every, every, np.full(len(every), 1.0 - share), both.shape)
-        return rest.plus(both, share).matrix()
+        return rest.plus(both, share).without(self.operator.held).matrix()

@@ -18,8 +18,9 @@ from pbdkit.registry.blame import blaming
 from pbdkit.results.cell_values import StateCells
 from pbdkit.results.tables import Tables, read_only
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
-from pbdkit.scene.leader_groups import Selecting, kinds_at
+from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.selecting import Selecting
 from pbdkit.stepping.evaluator import Neighbour
 from pbdkit.stepping.state import Floats, State, describe_bonds
 
@@ -109,7 +110,8 @@ class StateMoment(Moment):
         """At time 0 those of step 1 lead."""
         step = max(self.step, 1)
         return tuple(
-            LeaderRows(read_only(each.rows), each.group.leads(step)) for each in self._scene.leading
+            LeaderRows(read_only(each.rows), each.group.leads(step), each.axes)
+            for each in self._scene.leading
         )
 
     def loads(self) -> tuple[LoadRows, ...]:

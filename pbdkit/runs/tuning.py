@@ -101,7 +101,8 @@ def _eigenvalues(scene: Scene, rest: State) -> tuple[Complex, bool]:
     kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
     followers = np.flatnonzero(kinds == FOLLOWER)
     if len(followers) <= scene.axes * DENSE:
-        own = step_operator(scene, rest).couplings_now.entries()
+        operator = step_operator(scene, rest)
+        own = operator.couplings_now.entries().without(operator.held)
         if _largest_group(own) <= DENSE:
             return spectrum(own.matrix()).eigenvalues, True
     return _ends(scene, rest, scene.raster.place_of(followers))

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.body import Body
-from pbdkit.experiment.leaders import LeaderGroup, Rotation, Selection
+from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Pair
-from pbdkit.interfaces.component import did_you_mean
+from pbdkit.experiment.motions import Rotation
+from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.field_values import signed_distance
-from pbdkit.scene.places import Floats, distinct
-from pbdkit.scene.raster import FOLLOWER, LEADER, Raster
+from pbdkit.scene.places import Floats
+from pbdkit.scene.raster import LEADER, Raster
+from pbdkit.scene.selecting import Selecting, spacing
 
 SHOWN = 5
 """So many warnings of one kind are given."""
@@ -28,12 +27,18 @@ SHOWN = 5
 @dataclass(frozen=True)
 class Leading:
     """A leader group with the rows, places and reference positions (particle, axis) of its
-    particles."""
+    particles, and the numbers of the axes along which it leads."""
 
     group: LeaderGroup
     rows: Indices
     place: Indices
     reference: Floats
+    axes: tuple[int, ...]
+
+    def offset(self, n: float) -> Floats:
+        """Of the motion from rest, (particle or 1, axis along which the group leads)."""
+        offset = np.atleast_2d(self.group.motion.offset(n, self.reference))
+        return np.asarray(offset[:, list(self.axes)])
 
 
 def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]:
@@ -47,8 +52,10 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
     for n, group in enumerate(experiment.leaders):
         rows = body.select(group.select, ("leaders", n, "select"))
         at = raster.reference(rows)
+        _refuse_unmeasured(group, at, rows, ("leaders", n, "motion"))
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
-        found.append(Leading(group, rows, raster.place_of(rows), at))
+        axes = tuple("xy".index(axis) for axis in group.axes or ()) or range(at.shape[1])
+        found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes))))
     for k, n in _meeting(found, steps):
         if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
             _refuse_contradiction(raster, found, k, n, steps)
@@ -68,7 +75,8 @@ def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
         near = (begin[:n] <= end[n]) & (begin[n] <= end[:n]) & (kind[:n] != kind[n])
         near &= (low[:n] <= high[n]) & (low[n] <= high[:n])
         for k in np.flatnonzero(near).tolist():
-            if not sets[k].isdisjoint(sets[n]):
+            alike = not {*found[k].axes}.isdisjoint(found[n].axes)
+            if alike and not sets[k].isdisjoint(sets[n]):
                 yield k, n
 
 
@@ -96,88 +104,6 @@ def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[n
     return kinds
 
 
-@dataclass(frozen=True)
-class Selecting:
-    """Chooses body particles of a raster; what it looks at is made once."""
-
-    raster: Raster
-    regions: Mapping[str, Body] = field(default_factory=dict)
-
-    @cached_property
-    def _body(self) -> Indices:
-        return self.raster.body_rows
-
-    @cached_property
-    def _x(self) -> Floats:
-        return self.raster.reference(self._body)
-
-    def distance(self, point: Pair) -> Floats:
-        """(particle,): how far each body particle is from a point at rest."""
-        return np.asarray(np.hypot(*(self._x - point).T))
-
-    def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
-        """The rows of the selected body particles, sorted."""
-        if selection.edge is not None:
-            rows = self._edge(selection.edge)
-        elif selection.box is not None:
-            rows = self._box(selection.box)
-        elif selection.numbers is not None:
-            rows = _numbers(self.raster, selection.numbers, (*where, "numbers"))
-        elif selection.region is not None:
-            rows = self._region(selection.region, (*where, "region"))
-        else:
-            rows = self.nearest(selection.nearest or ())
-        if not len(rows):
-            low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
-            text = f"selects no particle; the body reaches from {low} to {high}"
-            raise ExperimentError(text, where)
-        return distinct(rows)
-
-    def _edge(self, edge: str) -> Indices:
-        """The body particle of smallest or largest i in every row j, or j in every column i."""
-        axis = 0 if edge in ("left", "right") else 1
-        return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
-
-    def _box(self, box: tuple[float, float, float, float]) -> Indices:
-        slack = 1e-9 * _spacing(self.raster)
-        low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
-        return self._body[((self._x >= low) & (self._x <= high)).all(axis=1)]
-
-    def _region(self, name: str, where: tuple[str | int, ...]) -> Indices:
-        if name not in self.regions:
-            known = ", ".join(self.regions) or "there is none: add `regions`"
-            hint = did_you_mean(name, self.regions)
-            raise ExperimentError(f"there is no region '{name}'{hint} (known: {known})", where)
-        distance = signed_distance(self.regions[name], self.raster.lattice.cell(), *self._x.T)
-        return self._body[distance <= 0.0]
-
-    def nearest(self, points: Iterable[Pair]) -> Indices:
-        """The row of the particle nearest to each point, the lowest number on ties."""
-        found = []
-        for point in points:
-            distance = self.distance(point)
-            ties = distance <= distance.min() * (1 + 1e-9) + 1e-12 * _spacing(self.raster)
-            found.append(self._body[np.argmax(ties)])
-        return np.array(found, np.intp)
-
-
-def _spacing(raster: Raster) -> float:
-    return math.hypot(*raster.lattice.cell().vectors[0])
-
-
-def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
-    for n, number in enumerate(numbers):
-        if number > raster.count:
-            raise ExperimentError(
-                f"there is no particle {number}; they are numbered 1 to {raster.count}", (*where, n)
-            )
-        if raster.table_kind[number - 1] != FOLLOWER:
-            raise ExperimentError(
-                f"particle {number} is a frame point: only body particles can lead", (*where, n)
-            )
-    return np.array(numbers, np.intp) - 1
-
-
 def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, steps: int) -> None:
     """Compares what groups k and n prescribe in every step in which both lead one particle."""
     a, b = sorted((found[k], found[n]), key=lambda leading: leading.group.from_)
@@ -188,9 +114,13 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
     start = _offset(a.group, begin - 1, at)
     knots = {g.from_ - 1 + n for g in (a.group, b.group) for n in g.motion.knots()}
     near = {step + d for step in (begin, end, *knots) for d in (-1, 0, 1, 2)}
+    axes = sorted({*a.axes} & {*b.axes})
     for step in sorted(step for step in near if begin <= step <= end):
-        one, other = _offset(a.group, step, at), start + _offset(b.group, step, at + start)
-        differs = np.abs(one - other).max(axis=1) > 1e-12 * max(_spacing(raster), np.abs(one).max())
+        moved = at if b.group.motion.of_reference else at + start
+        one, other = _offset(a.group, step, at), start + _offset(b.group, step, moved)
+        differs = np.abs(one - other)[:, axes].max(axis=1) > 1e-12 * max(
+            spacing(raster), np.abs(one).max()
+        )
         if differs.any():
             number = shared[np.argmax(differs)] + 1
             raise ExperimentError(
@@ -198,6 +128,26 @@ def _refuse_contradiction(raster: Raster, found: list[Leading], k: int, n: int, 
                 "select it in one of them only, or let one end before the other begins",
                 ("leaders", n),
             )
+
+
+def _refuse_unmeasured(
+    group: LeaderGroup, at: Floats, rows: Indices, where: tuple[str | int, ...]
+) -> None:
+    if not isinstance(group.motion, Measured):
+        return
+    try:
+        outside = np.flatnonzero(np.isnan(group.motion.at(at)).any(axis=1))
+    except RuntimeError as error:  # of Qhull
+        text = f"no triangles can be put between the points: {str(error).strip().splitlines()[0]}"
+        raise ExperimentError(text, where) from None
+    if len(outside):
+        x, y = at[outside[0]]
+        raise ExperimentError(
+            f"{len(outside)} of {len(rows)} particles lie outside the measured points, the first "
+            f"is number {rows[outside[0]] + 1} at ({x:.6g}, {y:.6g}); measure farther out, or "
+            "select fewer",
+            where,
+        )
 
 
 def _refuse_infinite(
@@ -212,9 +162,13 @@ def _refuse_infinite(
 
 
 def _known_beforehand(a: LeaderGroup, b: LeaderGroup, at_rest: bool) -> bool:
-    """Whether it is known where both motions start, or does not matter: it does to rotations."""
+    """Whether it is known where both motions start, or does not matter: it does to rotations; and
+    of masses nothing is known."""
+    if any(isinstance(group.motion, Newton) for group in (a, b)):
+        return False
     turns = any(isinstance(group.motion, Rotation) for group in (a, b))
-    return not turns or (at_rest and min(a.from_, b.from_) == 1)
+    latest = max if a.axes or b.axes else min  # where a particle follows along an axis is not known
+    return not turns or (at_rest and latest(a.from_, b.from_) == 1)
 
 
 def _offset(group: LeaderGroup, step: int, start: Floats) -> Floats:

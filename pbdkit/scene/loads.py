@@ -14,9 +14,10 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.polygons import Tiling, signed_area
 from pbdkit.scene.cells import WeighedCells, patches
-from pbdkit.scene.leader_groups import Selecting
+from pbdkit.scene.force_shares import shares
 from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import Raster
+from pbdkit.scene.selecting import Selecting
 
 STRAIGHT = 1e-9
 """Particles that lie off a line by less than this share of its length are on it."""
@@ -80,28 +81,13 @@ def build_loads(
         rows = body.select(load.select, ("loads", n, "select"))
         at = raster.reference(rows)
         place = raster.place_of(rows)
-        share = _shares(at) if load.force else _areas(raster, tiling, cells).ravel()[place]
+        share = shares(at) if load.force else _areas(raster, tiling, cells).ravel()[place]
         found.append(Loading(load, rows, place, share))
         with np.errstate(all="ignore"):
             finite = np.isfinite(load.force_at(load.from_) * share.sum()).all()
         if not finite:
             raise ExperimentError("leaves the finite numbers", ("loads", n))
     return Loads(tuple(found), raster.shape) if found else None
-
-
-def _shares(at: Floats) -> Floats:
-    """(particle,): the part of a force that falls to each of some places, (particle, axis): half
-    the way to the next one on both sides where all lie on a line, else all alike."""
-    order = np.lexsort(at.T)
-    way = at - at[order[0]]
-    x, y = along = way[order[-1]]
-    squared = along @ along
-    if len(at) == 1 or (np.abs(way @ [-y, x]) > STRAIGHT * squared).any():
-        return np.full(len(at), 1.0 / len(at))
-    half = np.diff((way @ along)[order]) / (2 * squared)
-    share = np.empty(len(at))
-    share[order] = np.append(half, 0.0) + np.append(0.0, half)
-    return share
 
 
 def _areas(raster: Raster, tiling: Tiling, cells: WeighedCells | None) -> Floats:

@@ -88,5 +88,5 @@ def way_of(leading: Leading, steps: int) -> float:
     if last < 1:
         return 0.0
     looks = {*np.linspace(1, last, SAMPLES).astype(int).tolist(), *group.motion.knots()}
-    offsets = (group.motion.offset(n, leading.reference) for n in looks if n <= last)
+    offsets = (leading.offset(n) for n in looks if n <= last)
     return max(float(np.abs(offset).max()) for offset in offsets)

@@ -12,7 +12,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.clamps import Clamps
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
-from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.stepping.guidance import Guidance
+from pbdkit.stepping.newton_forces import NewtonForces
+from pbdkit.stepping.prescription import place, placed, prescribe
 from pbdkit.stepping.state import State
 
 
@@ -41,6 +43,7 @@ class Stepper(Engine):
         self._clamps = Clamps(scene)
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
+        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
 
     def advance(self, state: State, steps: int = 1) -> State:
         """One step after the other."""
@@ -50,9 +53,11 @@ class Stepper(Engine):
 
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
-        led, starts = prescribe(self._scene, state, step)
-        before = [(places, u.reshape(len(u), -1)[:, places].copy()) for places, _ in led]
+        led, starts = prescribe(self._scene, state, step, self._newton)
+        before = placed(u, led)
         place(u, led)
+        if self._guidance.some:  # who leads along an axis makes no way along it that could go on
+            place(new, led)
         if self._fracturing:
             self._fracturing.break_bonds(u, state, step)
         clamped = self._clamps.turn(state, step)
@@ -62,6 +67,7 @@ class Stepper(Engine):
             self._followers.move(u, new, state)
         for values, prescribed in kept:
             values[clamped] = prescribed
+            self._guidance.correct(new, u, step)
         place(new, led)
         place(u, before)
         if self._scene.frame:

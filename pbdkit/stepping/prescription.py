@@ -3,49 +3,84 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.state import Floats, State
 
-Led = list[tuple[Indices, Floats]]
-"""(place, u) of the particles that lead, u as (axis, particle)."""
+
+class Placed(NamedTuple):
+    """Particles that lead: their places, and their displacements u (axis, particle) along those
+    axes."""
+
+    place: Indices
+    u: Floats
+    axes: tuple[int, ...]
+
+
+Led = list[Placed]
 Starts = tuple[Floats | None, ...]
 
 
-def prescribe(scene: Scene, state: State, moment: float) -> tuple[Led, Starts]:
+def prescribe(
+    scene: Scene, state: State, moment: float, forces: NewtonForces | None = None
+) -> tuple[Led, Starts]:
     """The leaders of a step with their displacements at its end, or at a moment within it, and
-    where each motion has started."""
+    where each motion has started; by Newton's law, with the forces at the end of the step before,
+    the velocities reached."""
     led: Led = []
     starts: list[Floats | None] = []
     step = math.ceil(moment)
-    for leading, begun in zip(scene.leading, state.starts, strict=True):
-        if leading.group.leads(step):
+    for n, (leading, begun) in enumerate(zip(scene.leading, state.starts, strict=True)):
+        if leading.group.leads(step) and forces and n in forces.numbers:
+            begun, u = _pushed(scene, state, forces, n)
+            led.append(Placed(leading.place, u, leading.axes))
+        elif leading.group.leads(step):
             if begun is None:
                 begun = state.u.reshape(scene.axes, -1)[:, leading.place].copy()
             n_th = moment - leading.group.from_ + 1
-            offset = leading.group.motion.offset(n_th, leading.reference + begun.T)
-            led.append((leading.place, begun + np.atleast_2d(offset).T))
+            motion, at = leading.group.motion, leading.reference
+            offset = motion.offset(n_th, at if motion.of_reference else at + begun.T)
+            u = (begun + np.atleast_2d(offset).T)[list(leading.axes)]
+            led.append(Placed(leading.place, u, leading.axes))
         starts.append(begun)
     if scene.leaders_overlap and len(led) > 1:
         _refuse_contradiction(scene, led, step)
     return led, tuple(starts)
 
 
+def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[Floats, Floats]:
+    """The velocities of a group (axis, particle), and where they lead along its axes."""
+    leading, velocity = scene.leading[n], state.starts[n]
+    motion, axes = leading.group.motion, list(leading.axes)
+    assert isinstance(motion, Newton)
+    if velocity is None:
+        velocity = np.outer(motion.velocity, np.ones(len(leading.place)))
+    faster = motion.faster(velocity.T, forces.on(n, state), forces.share(n)).T
+    reached = np.zeros_like(faster)
+    reached[axes] = faster[axes]
+    here = state.u.reshape(scene.axes, -1)[:, leading.place]
+    return reached, (here + reached)[axes]
+
+
 def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     """What could not be known before: groups that move one particle differently from where it
     stands."""
-    places = np.concatenate([p for p, _ in led])
-    u = np.concatenate([v for _, v in led], axis=1)
-    order = np.argsort(places, kind="stable")
-    apart = np.abs(np.diff(u[:, order], axis=1)).max(axis=0) > 1e-9 * max(1.0, np.abs(u).max())
-    clashes = np.flatnonzero((np.diff(places[order]) == 0) & apart)
+    size = scene.raster.kind.size
+    components = np.concatenate([a * size + at for at, _, axes in led for a in axes])
+    u = np.concatenate([each.u.ravel() for each in led])
+    order = np.argsort(components, kind="stable")
+    apart = np.abs(np.diff(u[order])) > 1e-9 * max(1.0, np.abs(u).max())
+    clashes = np.flatnonzero((np.diff(components[order]) == 0) & apart)
     if len(clashes):
-        place = places[order[clashes[:1]]]
+        place = components[order[clashes]].min(keepdims=True) % size
         number = int(scene.raster.rows_at(*np.unravel_index(place, scene.raster.shape))[0]) + 1
         raise ExperimentError(
             f"two groups move particle {number} differently in step {step}; select it in one of "
@@ -94,5 +129,12 @@ def is_cut_short(leading: Leading, steps: int) -> bool:
 def place(u: Floats, led: Led) -> None:
     """Puts leaders where they are prescribed."""
     flat = u.reshape(len(u), -1)
-    for places, values in led:
-        flat[:, places] = values
+    for places, values, axes in led:
+        for axis, value in zip(axes, values, strict=True):
+            flat[axis, places] = value
+
+
+def placed(u: Floats, led: Led) -> Led:
+    """Where the same particles stand, along the same axes."""
+    flat = u.reshape(len(u), -1)
+    return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in led]

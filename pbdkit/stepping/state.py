@@ -47,8 +47,9 @@ class State:
     step at which each broke and -1 where none did, and `broken_length` its length just then in the
     intermediate configuration, 0 where none broke; None where nothing can break. `starts` has for
     each leader group that has begun the displacements from which its motion counts, (axis,
-    particle). `bond_values` and `particle_values` are what the fracture model remembers of each
-    bond, as `broken_step` lies, and the rule of each particle, (sublattice, cell, cell).
+    particle); of one that moves by Newton's law, the velocities. `bond_values` and
+    `particle_values` are what the fracture model remembers of each bond, as `broken_step` lies, and
+    the rule of each particle, (sublattice, cell, cell).
     """
 
     step: int

@@ -163,7 +163,7 @@ def read_sweep(path: Path) -> tuple[Sweep, Source, Source]:
     sweep = checked(source.data, source)
     if isinstance(sweep.experiment, dict):
         inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}
-        return sweep, Source(str(path), sweep.experiment, path.parent, inner), source
+        return sweep, Source(str(path), sweep.experiment, inner, path.parent), source
     try:
         return sweep, _beside(path, sweep.experiment), source
     except _NoSuchExperimentError as error:

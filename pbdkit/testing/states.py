@@ -20,7 +20,6 @@ from pbdkit.interfaces import (
     Diagnostic,
     FollowerRule,
     Here,
-    LeaderRows,
     Particles,
     Remembered,
     Vector,
@@ -200,7 +199,7 @@ class Shown:
         if name in ("rows", "nearest"):
             return place[found]
         if name == "leader_groups":
-            return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+            return tuple(group._replace(rows=place[group.rows]) for group in found)
         if name == "loads":
             return tuple(load._replace(rows=place[load.rows]) for load in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)

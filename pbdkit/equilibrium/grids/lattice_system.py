@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.held_components import constrained, held_components
 from pbdkit.equilibrium.grids.inverse_iteration import SlowMode, softest
 from pbdkit.equilibrium.grids.lattice_krylov import (
     BiconjugateGradients,
@@ -230,10 +231,11 @@ def lattice_system(
         alike = DIFFERENCED
     else:
         matrix, alike, moves = stencil_matrix(scene, state, step), EXACT, None
-    if matrix is None or leads_one_way(matrix) or not is_held(matrix):
+    held = held_components(scene, step)
+    if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
         return None
     try:
-        system = LatticeSystem(*balanced(matrix, alike), state.u.shape, watch)
+        system = LatticeSystem(*balanced(constrained(matrix, held), alike), state.u.shape, watch)
     except FloatingError:
         return None
     if not system.may_be_stable:

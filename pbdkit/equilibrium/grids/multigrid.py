@@ -13,6 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.grids.grid_functions import kernels
+from pbdkit.equilibrium.grids.held_components import (
+    Held,
+    coarser_held,
+    with_held,
+    without_held,
+)
 from pbdkit.equilibrium.grids.stencil_matrix import OWN, StencilMatrix, inverses
 
 Floats = NDArray[np.floating[Any]]
@@ -37,10 +43,16 @@ class FloatingError(Exception):
 
 class Grid:
     """One grid: its `code` and `kind` as of StencilMatrix, its `stencils`, and what kernels are
-    given of them in a precision."""
+    given of them in a precision. Corrections do not reach `held` components."""
 
-    def __init__(self, code: NDArray[np.int32], kind: NDArray[np.int8], stencils: Floats) -> None:
-        self.code, self.kind, self.stencils = code, kind, stencils
+    def __init__(
+        self,
+        code: NDArray[np.int32],
+        kind: NDArray[np.int8],
+        stencils: Floats,
+        held: Held | None = None,
+    ) -> None:
+        self.code, self.kind, self.stencils, self.held = code, kind, stencils, held
         rows = len(code) + 1
         first, lone = np.empty(rows, np.int64), np.empty(rows, np.int64)
         none = np.empty(0, np.int32)
@@ -84,10 +96,22 @@ class Grid:
         kind, code = np.zeros(shape, np.int8), np.zeros(shape, np.int32)
         kernels().coarse_kinds(self.kind, halved, kind)
         count = kernels().coarse_codes(self.code, kind, halved, code)
-        stencils = np.zeros((count + 1, *self.stencils.shape[1:]))
-        kernels().galerkin(self.code, self.stencils, code, halved, stencils)
+        stencils, fine = np.zeros((count + 1, *self.stencils.shape[1:])), self.stencils
+        if self.held is not None:
+            fine = without_held(self.code, fine, self.held)
+        kernels().galerkin(self.code, fine, code, halved, stencils)
         stencils[0] = _coarse_stencil(self.stencils[:1], halved)
-        return Grid(code, kind, stencils)
+        if self.held is None:
+            return Grid(code, kind, stencils)
+        held = coarser_held(self.kind, self.held, halved, kind)
+        code, stencils, _ = with_held(code, stencils, held)
+        return Grid(code, kind, stencils, held)
+
+    def add_coarser(self, coarse: Floats, halved: tuple[int, int], x: Floats) -> None:
+        """x += P coarse."""
+        kernels().prolong(*self.lists[:5], coarse, halved, x)
+        if self.held is not None:
+            x[self.held] = 0.0
 
     def matrix(self) -> tuple[tuple[NDArray[np.intp], ...], Floats]:
         """Where the unknowns are, and the matrix, dense."""
@@ -128,7 +152,7 @@ class Multigrid:
     precision = np.float32
 
     def __init__(self, matrix: StencilMatrix) -> None:
-        grid = Grid(matrix.code, matrix.kind, matrix.stencils)
+        grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
         self._levels = [_Level(grid, self.precision)]
         while grid.unknowns > COARSEST:
             halved = grid.halved()
@@ -187,7 +211,7 @@ class Multigrid:
         above = self._levels[depth - 1]
         found = above.grid.field(self.precision)
         coarse = field.astype(self.precision, copy=False)
-        kernels().prolong(*above.grid.lists[:5], coarse, above.halved, found)
+        above.grid.add_coarser(coarse, above.halved, found)
         return found
 
     def finer_place(self, depth: int, place: tuple[int, int]) -> tuple[int, int]:
@@ -206,7 +230,7 @@ class Multigrid:
         kernel.relax(level.given, b, level.x, level.row, weight, True, False)
         kernel.restrict(level.given, b, level.x, level.halved, below.grid.code, below.b)
         coarse = self._cycled(depth + 1, below.b)
-        kernel.prolong(*level.grid.lists[:5], coarse, level.halved, level.x)
+        level.grid.add_coarser(coarse, level.halved, level.x)
         kernel.relax(level.given, b, level.x, level.row, weight, False, True)
         return level.x
 

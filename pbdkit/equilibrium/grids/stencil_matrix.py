@@ -19,6 +19,7 @@ from pbdkit.equilibrium.grids.primitive_raster import PrimitiveRaster, primitive
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.scene.scene import Scene
@@ -43,7 +44,8 @@ class StencilMatrix:
     """`code` (row, place) is -1 where nobody is free, else the number of the stencil in `stencils`
     (number, place, 4), numbers xx, xy, yx, yy; 0 is that of most. `kind` tells who is free and who
     leads. `scale` (number, 4) takes moves to what K c equals. `at` and `place` are where the
-    followers are here and on the scene's raster, flat; None where both rasters are one."""
+    followers are here and on the scene's raster, flat; None where both rasters are one. `held`
+    (axis, row, place) are the components of guided particles that lead; None where nobody is."""
 
     code: NDArray[np.int32]
     kind: NDArray[np.int8]
@@ -51,6 +53,7 @@ class StencilMatrix:
     scale: Floats
     at: Indices | None
     place: Indices | None
+    held: NDArray[np.bool_] | None = None
 
 
 def stencil_matrix(scene: Scene, state: State, step: int) -> StencilMatrix | None:
@@ -69,7 +72,8 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
 
     Who is moved by others farther away has a wrong one: to be compared with moves.
     """
-    grid, kind = PrimitiveRaster.of(scene), _kinds(scene, step)
+    grid = PrimitiveRaster.of(scene)
+    kind = kinds_of_places(scene.raster, scene.leading, step)
     if grid is None:
         return None
     place = np.flatnonzero(kind == FOLLOWER)
@@ -96,15 +100,6 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     return _on(grid, code, kind == LEADER, stencils.reshape(-1, WINDOW, 4), scale.copy())
 
 
-def _kinds(scene: Scene, step: int) -> NDArray[np.int8]:
-    """Of flat places, with the roles of a step."""
-    kind = scene.raster.kind.ravel().copy()
-    for leading in scene.leading:
-        if leading.group.leads(step):
-            kind[leading.place] = LEADER
-    return kind
-
-
 def _on(
     grid: PrimitiveRaster, code: Integers, led: Any, stencils: Floats, scale: Floats
 ) -> StencilMatrix:
@@ -127,7 +122,7 @@ class _Assembly:
 
     def __init__(self, scene: Scene, state: State, step: int, grid: PrimitiveRaster) -> None:
         self._scene, self._state, self._grid = scene, state, grid
-        self._kind = _kinds(scene, step)
+        self._kind = kinds_of_places(scene.raster, scene.leading, step)
         self._followers = np.flatnonzero(self._kind == FOLLOWER)
         self._code = np.full(self._kind.size, -1, np.int32)
         self._stencils, self._scale = list[Floats](), list[Floats]()

@@ -58,9 +58,10 @@ def leads_one_way(matrix: StencilMatrix) -> bool:
     return bool(matrix.stencils[..., 1].any() != matrix.stencils[..., 2].any())
 
 
-def is_held(matrix: StencilMatrix) -> bool:
-    """Whether every connected part of the body touches a leader, and no neighbours are apart, as
-    across a crack: without a bond, and without a neighbour that both have one with."""
+def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None) -> bool:
+    """Whether every connected part of the body touches a leader, along each axis, or has `held`
+    components, and no neighbours are apart, as across a crack: without a bond, and without a
+    neighbour that both have one with."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
@@ -69,8 +70,13 @@ def is_held(matrix: StencilMatrix) -> bool:
         return False
     pattern = (known | known[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
-    touched = np.unique(parts[binary_dilation(matrix.kind == LED, structure=pattern)])
-    return bool(np.count_nonzero(touched) == count)
+    for axis in range(2):
+        led = binary_dilation(matrix.kind == LED, structure=pattern)
+        if held is not None:
+            led |= held[axis]
+        if np.count_nonzero(np.unique(parts[led])) < count:
+            return False
+    return True
 
 
 def _apart(matrix: StencilMatrix, bonds: NDArray[np.bool_], s: int) -> bool:

@@ -20,11 +20,14 @@ from pbdkit.stepping.compiled.arguments import (
     state_arrays,
 )
 from pbdkit.stepping.compiled.emitter import write_kernel
+from pbdkit.stepping.compiled.leading import leading_arrays
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.guidance import Guidance
+from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import Led, prescribe, steady_steps
 from pbdkit.stepping.state import Floats, State, unmoved_state
@@ -52,6 +55,7 @@ class CompiledStepper(Engine):
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
         self._last: State | None = None
+        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
         levels = levels_of(scene)
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
@@ -91,7 +95,7 @@ class CompiledStepper(Engine):
 
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
-        led, starts = prescribe(self._scene, state, step)
+        led, starts = prescribe(self._scene, state, step, self._newton)
         self._clamped = self._clamps.turn(state, step)
         load = self._load(state)
         count = self._reach.before(led, load, steady_steps(self._scene, step, end - state.step))
@@ -104,11 +108,8 @@ class CompiledStepper(Engine):
 
     def _named(self, state: State, led: Led) -> Arrays:
         """The arrays of a kernel that steps in those of the state, by name."""
-        none = np.empty(0, np.intp), np.empty((self._scene.axes, 0))
-        places, values = zip(none, *led, strict=True)
-        led_values = np.concatenate(values, axis=1).astype(state.u.dtype)
-        leaders = {"led": np.concatenate(places), "led_values": led_values}
-        leaders["led_kept"] = np.empty_like(led_values)
+        slants = self._guidance.slants(state.step + 1) if led and self._guidance.slanted else {}
+        leaders = leading_arrays(self._plan, led, slants, state.u.dtype)
         reached = {"box": self._reach.box, "growth": self._reach.growth, "clamped": self._clamped}
         moved = state_arrays(self._plan, state.u, state.previous, state)
         load = self._load(state)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
+from pbdkit.stepping.compiled.leading import write_guiding, write_leading, write_slants
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
 from pbdkit.stepping.compiled.rows import GENERAL, write_row
 from pbdkit.stepping.compiled.slot_loop import write_general
@@ -72,9 +73,9 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     out.add(0, "for _ in range(count):", "    step += 1")
     for side in "uv":
         out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
-    for placing in ("led_kept[#, e] = fu_@[led[e]]", "fu_@[led[e]] = led_values[#, e]"):
-        out.add(1, "for e in range(led.size):")
-        out.add(2, *plan.each(placing))
+    write_leading(out, plan, "led_kept[#, e] = fu_@[led[e]]")
+    write_leading(out, plan, "fu_@[led[e]] = led_values[#, e]")
+    write_guiding(out, plan)
     out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
@@ -96,9 +97,8 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     for m in plan.rotations:
         out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
         out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
-    out.add(1, "for e in range(led.size):")
-    out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
-    out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))
+    write_slants(out, plan)
+    write_leading(out, plan, "fv_@[led[e]] = led_values[#, e]", "fu_@[led[e]] = led_kept[#, e]")
     if plan.scene.frame:
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")

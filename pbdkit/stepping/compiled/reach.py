@@ -59,7 +59,7 @@ class Reach:
         made in one go."""
         if not self._known:
             return count if self._renews else 1
-        for place, values in led:
+        for place, values, _ in led:
             self._join(np.unravel_index(place[(values != 0.0).any(axis=0)], self._shape)[1:])
         if load is not None:
             self._join(np.nonzero((load != 0.0).any(axis=(0, 1))))

@@ -1,0 +1,116 @@
+"""A motion known at scattered points: each particle by its own value, linear between them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, ValidationInfo, model_validator
+
+from pbdkit.experiment.columns import MOST_ROWS, or_a_file, read_columns
+from pbdkit.experiment.motion import Floats, Motion, Steps
+from pbdkit.experiment.parts import fault
+from pbdkit.interfaces.units import Place
+
+Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MOST_ROWS)]
+ON_EDGE = 1e-7
+"""By what share of a triangle, or of a line's length, a place outside counts as on the edge."""
+
+
+class Measured(Motion):
+    """Moves each particle by the displacement measured where it lies at rest: linear on the
+    Delaunay triangles of the points, or along the line on which they lie; within `ramp` steps.
+
+    `file`: a CSV with columns x, y, ux, uy; its content takes its place.
+    """
+
+    model_config = ConfigDict(json_schema_extra=or_a_file("points", "displacements"))
+
+    type: Literal["measured"] = "measured"
+    of_reference: ClassVar[bool] = True
+    file: str | None = Field(None, exclude=True)
+    points: Pairs
+    displacements: Pairs
+    ramp: Steps = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, given: Any, info: ValidationInfo) -> Any:
+        if not isinstance(given, dict) or given.get("file") is None:
+            return given
+        if "points" in given or "displacements" in given:
+            raise fault("give either a file, or points and displacements", key="file")
+        rows = read_columns(given["file"], info, ("x", "y", "ux", "uy"))
+        points, displacements = ([tuple(row[n : n + 2]) for row in rows] for n in (0, 2))
+        rest = {key: value for key, value in given.items() if key != "file"}
+        return rest | {"points": points, "displacements": displacements}
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Measured:
+        if len(self.points) != len(self.displacements):
+            raise ValueError(
+                f"as many displacements as points are needed: {len(self.displacements)} given for "
+                f"{len(self.points)}"
+            )
+        if len(set(self.points)) < len(self.points):
+            twice = next(p for p, times in Counter(self.points).items() if times > 1)
+            raise ValueError(f"({twice[0]:g}, {twice[1]:g}) is measured twice; keep one of them")
+        return self
+
+    def offset(self, n: float, start: Floats) -> Floats:
+        """The measured displacement of each, min(n / ramp, 1) of it; NaN outside the points."""
+        return self.at(start) * min(n / self.ramp, 1.0)
+
+    def knots(self) -> tuple[int, ...]:
+        """The end of the ramp."""
+        return (self.ramp,)
+
+    def at(self, places: Floats) -> Floats:
+        """The measured displacements at places, (place, axis), NaN outside."""
+        key = places.tobytes()
+        if key not in self._known:
+            self._known.clear()
+            self._known[key] = self._interpolated(places)
+        return self._known[key]
+
+    @cached_property
+    def _known(self) -> dict[bytes, Floats]:
+        """The last that were asked for."""
+        return {}
+
+    @cached_property
+    def _values(self) -> Floats:
+        return np.array(self.displacements)
+
+    @cached_property
+    def _triangles(self) -> Any:
+        """None where all points lie on a line."""
+        from scipy.spatial import Delaunay
+
+        at = np.array(self.points)
+        _, sizes, _ = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)
+        return Delaunay(at) if sizes[1] > ON_EDGE * sizes[0] else None
+
+    def _interpolated(self, places: Floats) -> Floats:
+        if self._triangles is None:
+            return self._on_line(places)
+        found = self._triangles.find_simplex(places, tol=ON_EDGE)
+        transform, corners = self._triangles.transform[found], self._triangles.simplices[found]
+        part = np.einsum("pab,pb->pa", transform[:, :2], places - transform[:, 2])
+        shares = np.concatenate([part, 1.0 - part.sum(axis=1, keepdims=True)], axis=1)
+        values = np.einsum("pc,pca->pa", shares, self._values[corners])
+        return np.where((found >= 0)[:, None], values, np.nan)
+
+    def _on_line(self, places: Floats) -> Floats:
+        at = np.array(self.points)
+        ends = at[[np.lexsort(at.T[::-1])[k] for k in (0, -1)]]
+        way = (ends[1] - ends[0]) / np.square(ends[1] - ends[0]).sum()
+        along, order = (places - ends[0]) @ way, np.argsort((at - ends[0]) @ way)
+        known, values = ((at - ends[0]) @ way)[order], self._values[order]
+        aside = places - ends[0] - along[:, None] * (ends[1] - ends[0])
+        off = np.linalg.norm(aside, axis=1) > ON_EDGE * np.linalg.norm(ends[1] - ends[0])
+        off |= (along < -ON_EDGE) | (along > 1.0 + ON_EDGE)
+        found = np.stack([np.interp(along, known, value) for value in values.T], axis=1)
+        return np.where(off[:, None], np.nan, found)

@@ -1,0 +1,103 @@
+"""Who is selected: body particles of the reference configuration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body
+from pbdkit.experiment.leaders import Selection
+from pbdkit.interfaces import Pair
+from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.field_values import signed_distance
+from pbdkit.scene.places import Floats, distinct
+from pbdkit.scene.raster import FOLLOWER, Raster
+
+
+@dataclass(frozen=True)
+class Selecting:
+    """Chooses body particles of a raster; what it looks at is made once."""
+
+    raster: Raster
+    regions: Mapping[str, Body] = field(default_factory=dict)
+
+    @cached_property
+    def _body(self) -> Indices:
+        return self.raster.body_rows
+
+    @cached_property
+    def _x(self) -> Floats:
+        return self.raster.reference(self._body)
+
+    def distance(self, point: Pair) -> Floats:
+        """(particle,): how far each body particle is from a point at rest."""
+        return np.asarray(np.hypot(*(self._x - point).T))
+
+    def select(self, selection: Selection, where: tuple[str | int, ...]) -> Indices:
+        """The rows of the selected body particles, sorted."""
+        if selection.edge is not None:
+            rows = self._edge(selection.edge)
+        elif selection.box is not None:
+            rows = self._box(selection.box)
+        elif selection.numbers is not None:
+            rows = _numbers(self.raster, selection.numbers, (*where, "numbers"))
+        elif selection.region is not None:
+            rows = self._region(selection.region, (*where, "region"))
+        else:
+            rows = self.nearest(selection.nearest or ())
+        if not len(rows):
+            low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
+            text = f"selects no particle; the body reaches from {low} to {high}"
+            raise ExperimentError(text, where)
+        return distinct(rows)
+
+    def _edge(self, edge: str) -> Indices:
+        """The body particle of smallest or largest i in every row j, or j in every column i."""
+        axis = 0 if edge in ("left", "right") else 1
+        return self.raster.ends_of_lines(axis, last=edge in ("right", "top"))
+
+    def _box(self, box: tuple[float, float, float, float]) -> Indices:
+        slack = 1e-9 * spacing(self.raster)
+        low, high = np.array(box[:2]) - slack, np.array(box[2:]) + slack
+        return self._body[((self._x >= low) & (self._x <= high)).all(axis=1)]
+
+    def _region(self, name: str, where: tuple[str | int, ...]) -> Indices:
+        if name not in self.regions:
+            known = ", ".join(self.regions) or "there is none: add `regions`"
+            hint = did_you_mean(name, self.regions)
+            raise ExperimentError(f"there is no region '{name}'{hint} (known: {known})", where)
+        distance = signed_distance(self.regions[name], self.raster.lattice.cell(), *self._x.T)
+        return self._body[distance <= 0.0]
+
+    def nearest(self, points: Iterable[Pair]) -> Indices:
+        """The row of the particle nearest to each point, the lowest number on ties."""
+        found = []
+        for point in points:
+            distance = self.distance(point)
+            ties = distance <= distance.min() * (1 + 1e-9) + 1e-12 * spacing(self.raster)
+            found.append(self._body[np.argmax(ties)])
+        return np.array(found, np.intp)
+
+
+def spacing(raster: Raster) -> float:
+    """The length of the lattice's first vector."""
+    return math.hypot(*raster.lattice.cell().vectors[0])
+
+
+def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
+    for n, number in enumerate(numbers):
+        if number > raster.count:
+            raise ExperimentError(
+                f"there is no particle {number}; they are numbered 1 to {raster.count}", (*where, n)
+            )
+        if raster.table_kind[number - 1] != FOLLOWER:
+            raise ExperimentError(
+                f"particle {number} is a frame point: only body particles can lead", (*where, n)
+            )
+    return np.array(numbers, np.intp) - 1
