@@ -16,9 +16,9 @@ SAMPLES = 16
 
 def events(scene: Scene) -> list[int]:
     """The moments, from 0 on, between which each leader moves by one formula and all keep their
-    roles: the ends of steps, up to the last of the load."""
+    roles and bonds that are not torn: the ends of steps, up to the last of the load."""
     steps, last = scene.experiment.steps, last_event(scene)
-    found = {0, last}
+    found = {0, last, *(cut.at - 1 for cut in scene.experiment.cuts)}
     for leading in scene.leading:
         group = leading.group
         end = group.last(steps)

@@ -19,6 +19,7 @@ from pydantic import (
 
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
+from pbdkit.experiment.cuts import Cut
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.parts import brief, fault, open_part, report
@@ -88,6 +89,7 @@ class Experiment(Strict):
     rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
     frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default("mean")
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
+    cuts: Annotated[tuple[Cut, ...], Field(strict=False)] = ()
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
@@ -101,11 +103,16 @@ class Experiment(Strict):
         anew, jumps = self.neighbours.nearness() is not None, not self.solver.makes_steps
         remembers = isinstance(self.rule, RenewsParticles)
         softens = isinstance(self.fracture, Softens)
+        late = max((cut.at for cut in self.cuts), default=0)
         clashes = [
             ("record", last > self.steps, f"step {last} is beyond the run's {self.steps}"),
             ("fracture", anew and self.fracture.can_break,
              "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
              "set neighbours.reevaluate: false or fracture: {type: none}"),
+            ("cuts", anew and bool(self.cuts),
+             "bonds cannot be cut where neighbours are re-evaluated: there are no lasting bonds; "
+             "set neighbours.reevaluate: false, or leave cuts out"),
+            ("cuts", late > self.steps, f"step {late} is beyond the run's {self.steps}"),
             ("solver", anew and jumps,
              "where neighbours are re-evaluated nothing tells where the steps lead; "
              "set neighbours.reevaluate: false or solver: {type: stepping}"),
@@ -181,9 +188,14 @@ class Experiment(Strict):
         return hash(tuple(self.__dict__.values()))
 
     @property
+    def parts_bonds(self) -> bool:
+        """Whether bonds can come to be broken: torn by fracture, or cut."""
+        return self.fracture.can_break or bool(self.cuts)
+
+    @property
     def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
-        return self.fracture.can_break or any("bonds" in d.needs for d in self.diagnostics)
+        """Whether the dataset has a table of bonds: fracture, a cut or a diagnostic uses it."""
+        return self.parts_bonds or any("bonds" in d.needs for d in self.diagnostics)
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""

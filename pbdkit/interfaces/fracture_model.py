@@ -112,6 +112,8 @@ def breaking_order(
     steps: NDArray[np.integer[Any]], strains: NDArray[np.floating[Any]]
 ) -> NDArray[np.intp]:
     """The places of the broken ones among some bonds, in the order in which they broke: by step
-    (-1: not broken), within a step the most strained first, what ties as it comes."""
+    (-1: not broken), within a step those that were cut (NaN) first, then the most strained, what
+    ties as it comes."""
     broken = np.flatnonzero(steps >= 0)
-    return broken[np.lexsort((-strains[broken], steps[broken]))]
+    order = np.where(np.isnan(strains), -np.inf, -strains)
+    return broken[np.lexsort((order[broken], steps[broken]))]

@@ -10,6 +10,7 @@ import numpy as np
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State
@@ -36,7 +37,7 @@ class Stepper(Engine):
     def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         self._scene = scene
         self._rule = scene.experiment.rule
-        self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        self._fracturing = Fracturing.of(scene)
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
 
@@ -48,6 +49,7 @@ class Stepper(Engine):
 
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
+        cut_bonds(self._scene, state.broken_step, step)
         led, starts = prescribe(self._scene, state, step)
         before = [(places, u.reshape(len(u), -1)[:, places].copy()) for places, _ in led]
         place(u, led)

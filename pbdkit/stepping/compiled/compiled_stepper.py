@@ -24,6 +24,7 @@ from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import Led, prescribe, steady_steps
 from pbdkit.stepping.state import State, unmoved_state
@@ -87,6 +88,8 @@ class CompiledStepper(Engine):
 
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
+        if cut_bonds(self._scene, state.broken_step, step):
+            self._begin(state)
         led, starts = prescribe(self._scene, state, step)
         count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
