@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         FramePolicy as FramePolicy,
         FrameSites as FrameSites,
         Here as Here,
+        KnowsStiffness as KnowsStiffness,
         Lattice as Lattice,
         LeaderRows as LeaderRows,
         Moment as Moment,
@@ -84,10 +85,10 @@ _HOME = {
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
         "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
-        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here Lattice "
-        "LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles Remembered Remembers "
-        "RenewsBonds RenewsParticles Setting Slot Softens SpaceVector StartsCracked Stiffness "
-        "StoresEnergy Variable Vector dot length squared_length where"
+        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here "
+        "KnowsStiffness Lattice LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles "
+        "Remembered Remembers RenewsBonds RenewsParticles Setting Slot Softens SpaceVector "
+        "StartsCracked Stiffness StoresEnergy Variable Vector dot length squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

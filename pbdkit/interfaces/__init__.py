@@ -5,6 +5,7 @@ from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variabl
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
+    KnowsStiffness,
     RenewsBonds,
     Softens,
     StartsCracked,
@@ -46,8 +47,8 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "INTERFACES", "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated",
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-    "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "Moment", "Nearness",
-    "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "FrameMap", "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows",
+    "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
+    "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
+    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
 ]  # fmt: skip

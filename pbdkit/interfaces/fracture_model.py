@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces.component import Component, Pair
 from pbdkit.interfaces.neighbour_metric import Slot
+from pbdkit.interfaces.rule import Setting
 from pbdkit.interfaces.values import Remembers
 
 Segment = tuple[Pair, Pair]
@@ -29,7 +30,7 @@ class FractureModel(Component):
     Afterwards a model that `Softens` says what the rule sees at bonds that have not broken.
 
     What only some models can do is a class that they take on besides: `Remembers`, `Draws`,
-    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`.
+    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     can_break: ClassVar[bool] = True
@@ -77,6 +78,22 @@ class RenewsBonds(Remembers):
 
         Where a configuration lasts the values must come to an end (a largest value so far does, a
         count of steps does not), or the solver `equilibrium` finds none.
+        """
+
+
+class KnowsStiffness(ABC):
+    """A fracture model that goes with calibrated rules, some constants of which follow from the
+    stiffness of bonds."""
+
+    @abstractmethod
+    def of_material(
+        self, slot: Slot, stiffness: Mapping[Slot, float], setting: Setting
+    ) -> dict[str, float]:
+        """Further constants of a slot, seen as ``c.name`` after those of `constants`.
+
+        `stiffness` is by slot the force along a whole bond inside the body over its elongation,
+        over Young's modulus and thickness. Raise ExperimentError where the model does not go with
+        them.
         """
 
 

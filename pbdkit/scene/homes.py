@@ -13,9 +13,21 @@ from enum import Enum
 from functools import cache
 from typing import Any
 
-from pbdkit.errors import PluginError
+from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Remembered, Setting, Slot
+from pbdkit.interfaces import (
+    Calibrated,
+    FollowerRule,
+    FractureModel,
+    Here,
+    KnowsStiffness,
+    Remembered,
+    Setting,
+    Slot,
+    dot,
+    squared_length,
+)
+from pbdkit.interfaces.component import as_values
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 
@@ -48,7 +60,10 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        limits = {s: _named("Constants", fracture.constants(s)) for s in slots}
+        further = _of_material(fracture, rule, weights, of_rule, setting)
+        limits = {
+            s: _named("Constants", fracture.constants(s), **further.get(s, {})) for s in slots
+        }
         _refuse_other_names(limits, "constants")
         names = (*limits[slots[0]]._fields, *(n.name for n in bond_numbers(experiment)))
         if twice := {name for name in names if names.count(name) > 1}:
@@ -59,6 +74,26 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     own = tuple(number.name for number in particle_numbers(experiment))
     kinds = _kind("Constants", names), _kind("Own", own)
     return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
+
+
+def _of_material(
+    fracture: FractureModel, rule: FollowerRule, weights: dict[Slot, Any], p: Any, setting: Setting
+) -> dict[Slot, dict[str, float]]:
+    """Further constants by slot of a model that knows how stiff bonds are."""
+    if not isinstance(fracture, KnowsStiffness):
+        return {}
+    if not isinstance(rule, Calibrated) or rule.stiffness() is None:
+        raise ExperimentError(
+            f"'{fracture.type}' needs a rule that is calibrated to a material, which '{rule.type}' "
+            "with these parameters is not; take 'springs' or 'elastic'"
+        )
+    stiffness = {}
+    for slot, w in weights.items():
+        u, r = 0.0 * slot.rest, slot.rest
+        # A bond that is drawn out to twice its length, along itself.
+        total = as_values(rule.gather(r, r, w, p), "gather")
+        stiffness[slot] = float(dot(rule.force(total, Here(u), p), r) / squared_length(r))
+    return {slot: fracture.of_material(slot, stiffness, setting) for slot in weights}
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:
