@@ -46,6 +46,7 @@ CAPABILITIES = {
         pbdkit.Softens,
         pbdkit.StartsCracked,
         pbdkit.BreaksAtStrain,
+        pbdkit.KnowsStiffness,
     ),
     "FramePolicy": (pbdkit.Anchors,),
 }
