@@ -44,8 +44,8 @@ class Cohesive(KnowsStiffness, Softening):
         if stiffness[slot] <= 0.0:
             raise ExperimentError(
                 f"'{self.type}' works on bonds that pull along themselves, and one along "
-                f"{tuple(slot.rest)} has the stiffness {stiffness[slot]:.3g}; take 'springs', or "
-                "'elastic' with poisson_ratio between -1 and 1/2 on cells of nearly equal sides"
+                f"{tuple(slot.rest)} has the stiffness {stiffness[slot]:.3g}; take 'springs' or "
+                "'elastic'"
             )
         strains = {s: 2.0 * _share(s, setting) / (k * length(s.rest) ** 2 * self.onset)
                    for s, k in stiffness.items()}  # fmt: skip
