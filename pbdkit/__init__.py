@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         FrameMap as FrameMap,
         FramePolicy as FramePolicy,
         FrameSites as FrameSites,
+        HasStiffBonds as HasStiffBonds,
         Here as Here,
         KnowsStiffness as KnowsStiffness,
         Lattice as Lattice,
@@ -85,8 +86,8 @@ _HOME = {
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
         "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
-        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites Here "
-        "KnowsStiffness Lattice LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles "
+        "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites "
+        "HasStiffBonds Here KnowsStiffness Lattice LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles "
         "Remembered Remembers RenewsBonds RenewsParticles Setting Slot Softens SpaceVector "
         "StartsCracked Stiffness StoresEnergy Variable Vector dot length squared_length where"
     ),

@@ -128,7 +128,7 @@ def test_kernels_soften_as_numpy_does():
     [
         (body(0.7), ["6e-05 is too little for this spacing", "make the spacing smaller than"]),
         (body(0.1, {"type": "barycentre"}) | {"frame": {"type": "mean"}},
-         ["'cohesive' needs a rule that is calibrated to a material, which 'barycentre'"]),
+         ["'cohesive' needs a rule that is calibrated to a material", "which 'barycentre'"]),
     ],
     ids=["spacing", "barycentre"],
 )  # fmt: skip

@@ -34,6 +34,7 @@ CAPABILITIES = {
     "FollowerRule": (
         pbdkit.Calibrated,
         pbdkit.StoresEnergy,
+        pbdkit.HasStiffBonds,
         pbdkit.Remembers,
         pbdkit.Draws,
         pbdkit.RenewsParticles,

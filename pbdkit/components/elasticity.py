@@ -12,8 +12,8 @@ from pbdkit.components.cell_stiffness import on_both_sides
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
-    Calibrated,
     FollowerRule,
+    HasStiffBonds,
     Here,
     Setting,
     Slot,
@@ -23,7 +23,7 @@ from pbdkit.interfaces import (
 )
 
 
-class CellElastic(Calibrated, FollowerRule):
+class CellElastic(HasStiffBonds, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -70,6 +70,12 @@ class CellElastic(Calibrated, FollowerRule):
         left, right = on_both_sides(slot, self.material()[1], setting.cells)
         mean = (left + right.T) / 2
         return {"xx": mean[0, 0], "xy": mean[0, 1], "yx": mean[1, 0], "yy": mean[1, 1]}
+
+    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
+        """Modulus · r·W r / |r|²."""
+        (modulus, _), (x, y), w = self.material(), slot.rest, self.weights(slot, setting)
+        along = w["xx"] * x * x + (w["xy"] + w["yx"]) * x * y + w["yy"] * y * y
+        return 2.0 * modulus * along / (x * x + y * y)
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:

@@ -17,6 +17,7 @@ from pbdkit.interfaces.rule import (
     AppliesTwice,
     Calibrated,
     FollowerRule,
+    HasStiffBonds,
     Here,
     RenewsParticles,
     Setting,
@@ -47,8 +48,9 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "INTERFACES", "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated",
     "Cell", "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel",
-    "FrameMap", "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows",
-    "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
+    "FrameMap", "FramePolicy", "FrameSites", "HasStiffBonds", "Here", "KnowsStiffness", "Lattice",
+    "LeaderRows", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered",
     "Remembers", "RenewsBonds", "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector",
-    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "StartsCracked", "Stiffness", "StoresEnergy", "Variable", "Vector", "dot", "length",
+    "squared_length", "where",
 ]  # fmt: skip

@@ -124,6 +124,15 @@ class Calibrated(ABC):
         in the lattice's units, from the sums. It vanishes in equilibrium."""
 
 
+class HasStiffBonds(Calibrated):
+    """A calibrated rule that knows how stiff bonds are, for fracture with energy."""
+
+    @abstractmethod
+    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
+        """The force along a whole bond inside the body over its elongation, over Young's modulus
+        and thickness, for small strain."""
+
+
 class StoresEnergy(Calibrated):
     """A calibrated rule that is not linear; the energy of others is -½ Σ u·force."""
 

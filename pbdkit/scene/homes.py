@@ -16,18 +16,14 @@ from typing import Any
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import (
-    Calibrated,
     FollowerRule,
     FractureModel,
-    Here,
+    HasStiffBonds,
     KnowsStiffness,
     Remembered,
     Setting,
     Slot,
-    dot,
-    squared_length,
 )
-from pbdkit.interfaces.component import as_values
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 
@@ -60,7 +56,7 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        further = _of_material(fracture, rule, weights, of_rule, setting)
+        further = _of_material(fracture, rule, setting)
         limits = {
             s: _named("Constants", fracture.constants(s), **further.get(s, {})) for s in slots
         }
@@ -77,23 +73,20 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
 
 
 def _of_material(
-    fracture: FractureModel, rule: FollowerRule, weights: dict[Slot, Any], p: Any, setting: Setting
+    fracture: FractureModel, rule: FollowerRule, setting: Setting
 ) -> dict[Slot, dict[str, float]]:
     """Further constants by slot of a model that knows how stiff bonds are."""
     if not isinstance(fracture, KnowsStiffness):
         return {}
-    if not isinstance(rule, Calibrated) or rule.stiffness() is None:
+    if not isinstance(rule, HasStiffBonds) or rule.stiffness() is None:
         raise ExperimentError(
-            f"'{fracture.type}' needs a rule that is calibrated to a material, which '{rule.type}' "
-            "with these parameters is not; take 'springs' or 'elastic'"
+            f"'{fracture.type}' needs a rule that is calibrated to a material, and knows how stiff "
+            f"bonds are, which '{rule.type}' with these parameters is not; take 'springs' or "
+            "'elastic'"
         )
-    stiffness = {}
-    for slot, w in weights.items():
-        u, r = 0.0 * slot.rest, slot.rest
-        # A bond that is drawn out to twice its length, along itself.
-        total = as_values(rule.gather(r, r, w, p), "gather")
-        stiffness[slot] = float(dot(rule.force(total, Here(u), p), r) / squared_length(r))
-    return {slot: fracture.of_material(slot, stiffness, setting) for slot in weights}
+    slots = [slot for own in setting.slots for slot in own]
+    stiffness = {slot: rule.stiffness_along(slot, setting) for slot in slots}
+    return {slot: fracture.of_material(slot, stiffness, setting) for slot in slots}
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:
