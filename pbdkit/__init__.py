@@ -87,7 +87,8 @@ _HOME = {
     "pbdkit.interfaces": (
         "Anchors AppliesTwice BasisSite Bonds BreaksAtStrain Calibrated Cell Component Components "
         "Diagnostic Draws FollowerRule FractureModel FrameMap FramePolicy FrameSites "
-        "HasStiffBonds Here KnowsStiffness Lattice LeaderRows Moment Nearness NeighbourMetric Offset Pair Particles "
+        "HasStiffBonds Here KnowsStiffness Lattice LeaderRows Moment Nearness NeighbourMetric "
+        "Offset Pair Particles "
         "Remembered Remembers RenewsBonds RenewsParticles Setting Slot Softens SpaceVector "
         "StartsCracked Stiffness StoresEnergy Variable Vector dot length squared_length where"
     ),

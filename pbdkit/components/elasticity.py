@@ -75,7 +75,7 @@ class CellElastic(HasStiffBonds, FollowerRule):
         """Modulus · r·W r / |r|²."""
         (modulus, _), (x, y), w = self.material(), slot.rest, self.weights(slot, setting)
         along = w["xx"] * x * x + (w["xy"] + w["yx"]) * x * y + w["yy"] * y * y
-        return 2.0 * modulus * along / (x * x + y * y)
+        return float(2.0 * modulus * along / (x * x + y * y))
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
