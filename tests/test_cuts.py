@@ -78,7 +78,8 @@ def test_kernels_cut_as_numpy_does(precision):
     parts["fracture"] = {"type": "strain", "failure": 0.25}
     found = run(**parts, solver={"type": "stepping"} | some)
     known = run(**parts, solver={"type": "stepping", "precision": precision, "engine": "numpy"})
-    assert np.array_equal(found.u.values, known.u.values)
+    off = np.abs(found.u.values - known.u.values).max()
+    assert off == 0.0 if precision == "float64" else off < 1e-6
     assert np.array_equal(found.broken_step.values, known.broken_step.values)
     assert np.isfinite(known.broken_strain.values).any()
 
