@@ -1,8 +1,8 @@
 """Fracture with energy against linear fracture mechanics: a double-cantilever beam and a plate with
 a central notch, over spacings.
 
-    python tests/reliability/fracture_energy.py beam 15 29 57 115
-    python tests/reliability/fracture_energy.py plate 15 31 63 127
+    python tests/reliability/fracture_energy.py beam 15 29 57 119
+    python tests/reliability/fracture_energy.py plate 31 63 127 255
 
 The bodies are the net of springs of ν = 1/3, which 'elastic' is for small strains, mirrored at the
 crack's plane. What is not on that plane is linear and condensed once; the bonds across it soften by
