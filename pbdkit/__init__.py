@@ -52,7 +52,9 @@ if TYPE_CHECKING:
         FrameMap as FrameMap,
         FramePolicy as FramePolicy,
         FrameSites as FrameSites,
+        HasStiffBonds as HasStiffBonds,
         Here as Here,
+        KnowsStiffness as KnowsStiffness,
         Lattice as Lattice,
         LeaderRows as LeaderRows,
         LoadRows as LoadRows,
@@ -95,10 +97,11 @@ _HOME = {
     "pbdkit.interfaces": (
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
         "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel FrameMap "
-        "FramePolicy FrameSites Here Lattice LeaderRows LoadRows Loadable Moment Nearness "
-        "NeighbourMetric Offset Pair Particles Quantity Remembered Remembers RenewsBonds "
-        "RenewsParticles Setting SharesParticles Slot Softens SpaceVector StartsCracked Stiffness "
-        "StoresEnergy TurnsParticles Variable Vector dot length squared_length where"
+        "FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows LoadRows "
+        "Loadable Moment Nearness NeighbourMetric Offset Pair Particles Quantity Remembered "
+        "Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot Softens SpaceVector "
+        "StartsCracked Stiffness StoresEnergy TurnsParticles Variable Vector dot length "
+        "squared_length where"
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",

@@ -35,6 +35,7 @@ CAPABILITIES = {
         pbdkit.Calibrated,
         pbdkit.Loadable,
         pbdkit.StoresEnergy,
+        pbdkit.HasStiffBonds,
         pbdkit.Remembers,
         pbdkit.Draws,
         pbdkit.RenewsParticles,
@@ -49,6 +50,7 @@ CAPABILITIES = {
         pbdkit.Softens,
         pbdkit.StartsCracked,
         pbdkit.BreaksAtStrain,
+        pbdkit.KnowsStiffness,
     ),
     "FramePolicy": (pbdkit.Anchors,),
 }

@@ -137,7 +137,8 @@ def _of_all(explained: Explained) -> dict[str, Any]:
     return {
         "fracture": explained.model.type,
         "bonds": len(steps),
-        "broken": int((steps > 0).sum()),
+        "broken": int((steps > 0).sum() - explained.cut.sum()),
+        "cut": int(explained.cut.sum()),
         "broken_from_the_start": int((steps == 0).sum()),
         "in_order": explained.standings(explained.order),
         "nearest": explained.nearest(),
@@ -161,10 +162,11 @@ def _of_one(explained: Explained, a: int, b: int) -> dict[str, Any]:
 
 
 def _run_in_words(found: dict[str, Any]) -> Iterator[str]:
-    broken, cut, model = found["broken"], found["broken_from_the_start"], found["fracture"]
-    start = f", {cut} broken from the start" if cut else ""
-    yield f"fracture {model}: {broken} of {found['bonds']} bonds broke{start}"
-    rows = [s for s in found["in_order"] if s.step]
+    broken, model = found["broken"], found["fracture"]
+    also = {"cut": found["cut"], "broken from the start": found["broken_from_the_start"]}
+    more = "".join(f", {count} {how}" for how, count in also.items() if count)
+    yield f"fracture {model}: {broken} of {found['bonds']} bonds broke{more}"
+    rows = [s for s in found["in_order"] if s.state == "broken"]
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
         yield "order  step  bond           strain       breaks above"
@@ -189,6 +191,8 @@ def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
         yield f"broke in step {s.step} at strain {strain}, {order}"
         if s.breaks_above is not None:
             yield f"fracture {found['fracture']} breaks it above {s.breaks_above:.6g}"
+    elif s.state == "cut":
+        yield f"cut at the beginning of step {s.step}"
     else:
         yield _standing(s)
     if s.state == "intact":

@@ -15,6 +15,7 @@ COMPONENTS = {
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame Natural TractionFree",
     "fracture": "NoFracture Threshold",
     "strain_fracture": "StrainFracture Damage",
+    "cohesive_fracture": "Cohesive",
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
     "fields": "Strain Rotation Stress",
     "forces": "StrainEnergy Reaction LoadDisplacement StressStrain",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Slot, Stiffness, Vector
+from pbdkit.interfaces import Slot, Stiffness, Vector, where
 from pbdkit.interfaces.polygons import Tiling
 
 Floats = NDArray[np.float64]
@@ -56,6 +56,15 @@ def pulled(d: Any, w: Any) -> tuple[Any, ...]:
     xx, yy = w.xx * whole, w.yy * whole
     xy, yx = w.xy * w.left + w.yx * w.right, w.yx * w.left + w.xy * w.right
     return Vector(xx * d.x + xy * d.y, yx * d.x + yy * d.y), xx, xy, yy
+
+
+def mean_move(total: Any) -> Vector:
+    """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
+    pull, xx, xy, yy = total
+    det = xx * yy - xy * xy
+    some = det > 0.0
+    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
+    return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
 
 
 def _on_both_sides(slot: Slot, c: Stiffness, cells: Tiling) -> list[Floats]:

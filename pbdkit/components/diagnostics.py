@@ -147,7 +147,7 @@ class SmallestCellArea(Diagnostic):
 
 class CrackPath(Diagnostic):
     """The bonds that broke, in the order in which they did: by step, and within a step the most
-    stretched first. Bonds that were broken from the start come first, with no strain."""
+    stretched first. Bonds that were cut or broken from the start come first, with no strain."""
 
     type: Literal["crack-path"] = "crack-path"
 
@@ -158,7 +158,7 @@ class CrackPath(Diagnostic):
     def variables(self) -> tuple[Variable, ...]:
         """`crack_bond`, `crack_step`, `crack_strain`, `crack_midpoint`."""
         bond = "broken bonds in their order, as positions along `bond` from 0"
-        strain = "strain with which the bond broke, NaN where it was broken from the start"
+        strain = "strain with which the bond broke, NaN where it was cut or broken from the start"
         where = "middle of the broken bond in the reference configuration"
         return (
             Variable("crack_bond", ("crack",), bond, "1", dtype="i8"),

@@ -8,11 +8,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import bond_weights, pulled
+from pbdkit.components.cell_stiffness import bond_weights, mean_move, pulled
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
     FollowerRule,
+    HasStiffBonds,
     Here,
     Loadable,
     MixesCells,
@@ -20,7 +21,6 @@ from pbdkit.interfaces import (
     Slot,
     Stiffness,
     Vector,
-    where,
 )
 from pbdkit.interfaces.units import LENGTH
 
@@ -30,7 +30,7 @@ Factor = Annotated[
 ]
 
 
-class CellElastic(MixesCells, Loadable, FollowerRule):
+class CellElastic(MixesCells, HasStiffBonds, Loadable, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -84,6 +84,12 @@ class CellElastic(MixesCells, Loadable, FollowerRule):
         modulus = self.stiffness * self.material()[0]
         return bond_weights(slot, Stiffness(*(value / modulus for value in c)), setting.cells)
 
+    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
+        """Stiffness · modulus · r·W r / |r|²."""
+        (modulus, _), (x, y), w = self.material(), slot.rest, self.weights(slot, setting)
+        along = w["xx"] * x * x + (w["xy"] + w["yx"]) * x * y + w["yy"] * y * y
+        return float(2.0 * self.stiffness * modulus * along / (x * x + y * y))
+
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """W d, and entries of W, of which the sum is symmetric."""
@@ -104,15 +110,6 @@ class CellElastic(MixesCells, Loadable, FollowerRule):
         """The load over the modulus, besides Σ W d."""
         pull, xx, xy, yy = total
         return pull + load / p.modulus, xx, xy, yy
-
-
-def mean_move(total: Any) -> Vector:
-    """(Σ W)⁻¹ Σ W d from the sums; zero where there is no cell."""
-    pull, xx, xy, yy = total
-    det = xx * yy - xy * xy
-    some = det > 0.0
-    move = Vector(yy * pull.x - xy * pull.y, xx * pull.y - xy * pull.x) / where(some, det, 1.0)
-    return Vector(where(some, move.x, 0.0), where(some, move.y, 0.0))
 
 
 class IsotropicElastic(CellElastic):

@@ -77,7 +77,37 @@ class StrainFracture(Draws, Parting):
         return np.sqrt(c.square) * (1.0 + c.failure_strain) / length(r) - 1.0
 
 
-class Damage(Softens, RenewsBonds, Draws, Parting):
+class Softening(Softens, RenewsBonds, Parting):
+    """What models share under which a bond loses its pull along a straight line, from its
+    `onset_strain` to zero at its `failure_strain`; `per_rest` is 1/|r|. They remember `damage`."""
+
+    @staticmethod
+    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
+        """The damage, where there is more than before."""
+        onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
+        strain = length(r + d) * c.per_rest - 1.0
+        softens = strain > onset
+        law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
+        law = where(strain < failure, law, 1.0)
+        return (where(softens & (law > damage), law, damage),)
+
+    @staticmethod
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+        """D = 1."""
+        return c.damage >= 1.0
+
+    @staticmethod
+    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
+        """(1 - D) d + D lost."""
+        return (1.0 - c.damage) * d + c.damage * lost
+
+    @staticmethod
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+        """The failure strain of the bond."""
+        return c.failure_strain
+
+
+class Damage(Draws, Softening):
     """A bond softens from strain `onset` on and is broken at strain `failure`.
 
     Its damage is the largest so far of D = failure / (failure - onset) (1 - onset / ε), from 0 at
@@ -113,7 +143,7 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
 
     def remembered(self) -> tuple[Remembered, ...]:
         """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
-        return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
+        return (_ONSET_STRAIN, _FAILURE_STRAIN, DAMAGE) if self.scatter else (DAMAGE,)
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
@@ -122,34 +152,9 @@ class Damage(Softens, RenewsBonds, Draws, Parting):
     def _strains(self) -> dict[str, float]:
         return {"onset_strain": self.onset, "failure_strain": self.failure}
 
-    @staticmethod
-    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
-        """The damage, where there is more than before."""
-        onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
-        strain = length(r + d) * c.per_rest - 1.0
-        softens = strain > onset
-        law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
-        law = where(strain < failure, law, 1.0)
-        return (where(softens & (law > damage), law, damage),)
-
-    @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
-        """D = 1."""
-        return c.damage >= 1.0
-
-    @staticmethod
-    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
-        """(1 - D) d + D lost."""
-        return (1.0 - c.damage) * d + c.damage * lost
-
-    @staticmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
-        """The failure strain of the bond."""
-        return c.failure_strain
-
 
 _FAILURE_STRAIN = Remembered(
     "failure_strain", "strain at which the bond breaks", "1", changes=False
 )
 _ONSET_STRAIN = Remembered("onset_strain", "strain at which the bond softens", "1", changes=False)
-_DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")
+DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")

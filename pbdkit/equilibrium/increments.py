@@ -17,6 +17,7 @@ from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State, initial_state
@@ -58,7 +59,7 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture or not finder.linear:
-        count = asked.increments if scene.has_fracture else 1
+        count = asked.increments if scene.experiment.fracture.can_break else 1
         return (yield from _load(scene, state, finder, moments(scene, count), since))
     if (last := _last_change(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
@@ -119,8 +120,12 @@ def _load(scene: Scene, state: State, finder: Finder, every: list[float], since:
     for moment in planned:
         finder.watch.load = f"step {moment:.6g} of {planned[-1]:g}, "
         before = state.copy()
+        step = math.floor(since) + 1
         try:
             most = MOST_SETTLINGS
+            if since == step - 1 and cut_bonds(scene, state.broken_step, step) and since > 0:
+                # What gives way to a cut does so under the load at which it is made.
+                _settle_bonds_at(scene, state, finder, since, since, most, step)
             settled, changes = quick.settle(state, moment, most) if quick else (False, 0)
             if not settled or moment == planned[-1]:  # which is certified
                 left = max(1, most - changes)
@@ -137,16 +142,23 @@ def _load(scene: Scene, state: State, finder: Finder, every: list[float], since:
 
 
 def _settle_bonds_at(
-    scene: Scene, state: State, finder: Finder, since: float, moment: float, most: int
+    scene: Scene,
+    state: State,
+    finder: Finder,
+    since: float,
+    moment: float,
+    most: int,
+    step: int = 0,
 ) -> Certificate:
-    """Until no bond changes any more, `most` times at most."""
-    fracturing = Fracturing(scene) if scene.has_fracture else None
+    """Until no bond changes any more, `most` times at most; what breaks does so in a `step`, by
+    default that of the moment."""
+    fracturing = Fracturing.of(scene)
     for _ in range(most):
         if finder.linear:
             certificate = _settle_at(scene, state, finder, moment)
         else:
             certificate = _follow(scene, state, finder, since, moment)
-        if not fracturing or not _bonds_change(scene, fracturing, state, math.ceil(moment)):
+        if not fracturing or not _bonds_change(scene, fracturing, state, step or math.ceil(moment)):
             return certificate
         since = moment
     raise UnconvergedError(

@@ -16,9 +16,10 @@ SAMPLES = 16
 
 def events(scene: Scene) -> list[int]:
     """The moments, from 0 on, between which each leader moves by one formula, all keep their roles
-    and loads come and go evenly: the ends of steps, up to the last of the load."""
+    and bonds that are not torn, and loads come and go evenly: the ends of steps, up to the last of
+    the load."""
     steps, last = scene.experiment.steps, last_event(scene)
-    found = {0, last}
+    found = {0, last, *(cut.at - 1 for cut in scene.experiment.cuts)}
     for change in scene.loads.changes(steps) if scene.loads else ():
         found |= {change - 1, change}
     for leading in scene.leading:

@@ -122,7 +122,7 @@ class Settling:
         first = max(last_event(scene), start.step + 1) if ends else NEVER
         self.pace = Pace(first, self._tolerance, first - 1)
         self._foresight = Foresight(scene, self._scale, watch)
-        self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        self._fracturing = Fracturing.of(scene)
         self._carrying = _carrying(scene)
         unended = "leaders do not come to rest before its end"
         self.obstacle = "steps are too few" if ends else unended

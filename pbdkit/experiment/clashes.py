@@ -29,6 +29,7 @@ def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
     anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
     remembers = isinstance(asked.rule, RenewsParticles)
     softens = isinstance(asked.fracture, Softens)
+    late = max((cut.at for cut in asked.cuts), default=0)
     masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
     knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
     return [
@@ -36,6 +37,10 @@ def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
         ("fracture", anew and asked.fracture.can_break,
          "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
          "set neighbours.reevaluate: false or fracture: {type: none}"),
+        ("cuts", anew and bool(asked.cuts),
+         "bonds cannot be cut where neighbours are re-evaluated: there are no lasting bonds; "
+         "set neighbours.reevaluate: false, or leave cuts out"),
+        ("cuts", late > asked.steps, f"step {late} is beyond the run's {asked.steps}"),
         ("solver", anew and jumps,
          "where neighbours are re-evaluated nothing tells where the steps lead; "
          "set neighbours.reevaluate: false or solver: {type: stepping}"),

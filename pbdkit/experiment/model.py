@@ -21,6 +21,7 @@ from pydantic import (
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.clashes import clashes_of
+from pbdkit.experiment.cuts import Cut
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.loads import Load
@@ -75,6 +76,7 @@ class Experiment(Strict):
     rule: Annotated[SerializeAsAny[FollowerRule], open_part(FollowerRule)]
     frame: Annotated[SerializeAsAny[FramePolicy], open_part(FramePolicy)] = _default("mean")
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
+    cuts: Annotated[tuple[Cut, ...], Field(strict=False)] = ()
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
     loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
@@ -160,9 +162,14 @@ class Experiment(Strict):
         return hash((self.name, self.seed, self.lattice, self.body, self.steps))
 
     @property
+    def parts_bonds(self) -> bool:
+        """Whether bonds can come to be broken: torn by fracture, or cut."""
+        return self.fracture.can_break or bool(self.cuts)
+
+    @property
     def shows_bonds(self) -> bool:
-        """Whether the dataset has a table of bonds: fracture or a diagnostic uses it."""
-        return self.fracture.can_break or any("bonds" in d.needs for d in self.diagnostics)
+        """Whether the dataset has a table of bonds: fracture, a cut or a diagnostic uses it."""
+        return self.parts_bonds or any("bonds" in d.needs for d in self.diagnostics)
 
     def materials(self) -> dict[str, Experiment]:
         """The experiment with the rule as it is at each place that its fields tell apart, the same

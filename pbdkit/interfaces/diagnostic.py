@@ -64,8 +64,8 @@ class LoadRows(NamedTuple):
 @dataclass(frozen=True)
 class BondHistory(Bonds):
     """The table of bonds and when they broke, (bond,): `broken_step`, -1 where one has not, 0 at a
-    given crack; `broken_strain` in the intermediate configuration, NaN where it has not broken or
-    was broken from the start."""
+    given crack; `broken_strain` in the intermediate configuration, NaN where it has not broken, was
+    cut or broken from the start."""
 
     broken_step: NDArray[np.int32]
     broken_strain: NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.neighbour_metric import Slot
+from pbdkit.interfaces.rule import Setting
 from pbdkit.interfaces.units import Place
 from pbdkit.interfaces.values import Remembers
 
@@ -30,7 +31,7 @@ class FractureModel(TakesFields):
     Afterwards a model that `Softens` says what the rule sees at bonds that have not broken.
 
     What only some models can do is a class that they take on besides: `Remembers`, `Draws`,
-    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`.
+    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     can_break: ClassVar[bool] = True
@@ -81,6 +82,22 @@ class RenewsBonds(Remembers):
         """
 
 
+class KnowsStiffness(ABC):
+    """A fracture model that goes with calibrated rules, some constants of which follow from the
+    stiffness of bonds."""
+
+    @abstractmethod
+    def of_material(
+        self, slot: Slot, stiffness: Mapping[Slot, float], setting: Setting
+    ) -> dict[str, float]:
+        """Further constants of a slot, seen as ``c.name`` after those of `constants`.
+
+        `stiffness` is by slot the force along a whole bond inside the body over its elongation,
+        over Young's modulus and thickness. Raise ExperimentError where the model does not go with
+        them.
+        """
+
+
 class Softens(ABC):
     """A fracture model under which the rule sees something else than d at bonds that have not
     broken."""
@@ -113,6 +130,8 @@ def breaking_order(
     steps: NDArray[np.integer[Any]], strains: NDArray[np.floating[Any]]
 ) -> NDArray[np.intp]:
     """The places of the broken ones among some bonds, in the order in which they broke: by step
-    (-1: not broken), within a step the most strained first, what ties as it comes."""
+    (-1: not broken), within a step those that were cut (NaN) first, then the most strained, what
+    ties as it comes."""
     broken = np.flatnonzero(steps >= 0)
-    return broken[np.lexsort((-strains[broken], steps[broken]))]
+    order = np.where(np.isnan(strains), -np.inf, -strains)
+    return broken[np.lexsort((order[broken], steps[broken]))]

@@ -142,6 +142,15 @@ class Loadable(Calibrated):
         """
 
 
+class HasStiffBonds(Calibrated):
+    """A calibrated rule that knows how stiff bonds are, for fracture with energy."""
+
+    @abstractmethod
+    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
+        """The force along a whole bond inside the body over its elongation, over Young's modulus
+        and thickness, for small strain."""
+
+
 class StoresEnergy(Calibrated):
     """A calibrated rule that is not linear; the energy of others is -½ Σ u·force."""
 

@@ -29,8 +29,8 @@ Rows = NDArray[np.intp]
 class Standing:
     """One bond: the numbers of its particles, its shell and rest length, and how it stands.
 
-    `state` is "intact", "broken", "broken from the start" or "cannot break". `step`, `order` (among
-    the broken ones, from 1) and `strain_at_break` are None unless they are known; `breaks_above` is
+    `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
+    (among the broken ones, from 1) and `strain_at_break` are None unless known; `breaks_above` is
     the strain that it bears, None where the model does not say. `strain` is that of the recorded
     step `at_step`.
     """
@@ -69,6 +69,9 @@ class Explained:
         """(bond,): when each broke, -1 where it has not."""
         self.strains_at_break: Floats = self._of_bonds("broken_strain", np.nan)
         """(bond,): NaN where it is not known."""
+        known = "broken_strain" in dataset.variables
+        self.cut = known & (self.steps > 0) & np.isnan(self.strains_at_break)
+        """(bond,): those that were cut after the first step had begun."""
         self.order: Rows = breaking_order(self.steps, self.strains_at_break)
         """The rows of the broken bonds, in the order in which they broke."""
         if not np.array_equal(self.bonds.ends - 1, dataset["bond"].values):
@@ -149,7 +152,9 @@ class Explained:
     def _state(self, row: int) -> str:
         if self.steps[row] < 0:
             return "cannot break" if self.spared[row] else "intact"
-        return "broken" if self.steps[row] > 0 else "broken from the start"
+        if self.steps[row] == 0:
+            return "broken from the start"
+        return "cut" if self.cut[row] else "broken"
 
     def nearest(self) -> Standing | None:
         """The bond that is nearest to breaking at the last recorded step, if that is known."""

@@ -97,7 +97,7 @@ def optional_columns() -> list[list[Column]]:
     groups and of loads."""
     bond, ends = ("bond",), "the two particles of the bond, as positions along `particle` from 0"
     step = "step at which the bond broke, -1 if it has not"
-    strain = "strain with which the bond broke, NaN if it has not or was broken from the start"
+    strain = "strain with which the bond broke, NaN if it has not, was cut or broken from the start"
     group = "leader group, by its place among the experiment's leaders, from 0"
     return [
         [

@@ -142,13 +142,13 @@ class StateMoment(Moment):
         return np.where(steps > self._no_later_than, np.int32(-1), steps)
 
     def broken_strain(self) -> NDArray[np.float64]:
-        """From the lengths, in float64 whatever the run's precision."""
+        """From the lengths, in float64 whatever the run's precision; what was cut has none."""
         scene, lengths, steps = self._scene, self._state.broken_length, self.broken_step()
         if lengths is None:
             return np.full(len(steps), np.nan)
         rests = np.array([length(plane.slot.rest) for plane in scene.neighbourhood.planes])
         strains = self._of_bonds(lengths) / rests[scene.bonds.plane] - 1
-        return np.where(steps > 0, strains, np.nan)
+        return np.where((steps > 0) & (strains > -1.0), strains, np.nan)
 
     def remembered(self, name: str) -> NDArray[Any]:
         """In the order of the bonds' table, or of the particles' numbers."""

@@ -1,7 +1,8 @@
-"""Cracks that are there from the start: the bonds that cross them."""
+"""The bonds of a scene, and those that cross a crack or a cut."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from operator import add
 
@@ -16,15 +17,30 @@ from pbdkit.scene.places import Block, Floats, Mask, hull
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 
 
-def crosses(start: Vector, end: Vector, crack: Segment) -> Mask:
-    """Whether each bond from `start` to `end` crosses the crack.
+def crosses(start: Vector, end: Vector, a: Vector, b: Vector) -> Mask:
+    """Whether each bond from `start` to `end` crosses the crack from a to b.
 
     A particle exactly on the crack's line counts to its left side, so that a crack along a row of
     particles parts the row from those on its right; a bond that a tip touches is crossed.
     """
-    a, b = (Vector(*point) for point in crack)
     parted = (_side(a, b, start) >= 0) ^ (_side(a, b, end) >= 0)
     return parted & (_side(start, end, a) * _side(start, end, b) <= 0)
+
+
+def crossed_bonds(
+    raster: Raster, neighbourhood: Neighbourhood, segments: Iterable[Segment]
+) -> Iterator[tuple[int, Block, Mask]]:
+    """Plane by plane its number, the block of its bonds, and which of them, those to the frame too,
+    cross one of the segments."""
+    # As the rasters count: from the lattice's site (0, 0).
+    origin = Vector(*raster.lattice.origin[:2])
+    local = [(Vector(*a) - origin, Vector(*b) - origin) for a, b in segments]
+    for n, plane in enumerate(neighbourhood.planes if local else ()):
+        if block := plane_block(raster, plane):
+            start = raster.reference_planes(block)
+            end, bonds = start + plane.slot.rest, bonds_in(raster, block, plane, frame_too=True)
+            crossed = np.any([crosses(start, end, *ends) for ends in local], axis=0)
+            yield n, block, bonds & crossed
 
 
 def _side(a: Vector, b: Vector, c: Vector) -> Floats:

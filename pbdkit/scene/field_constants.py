@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from operator import add, methodcaller
+from functools import partial
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, FollowerRule, Remembers, Setting
+from pbdkit.interfaces import AppliesTwice, FollowerRule, FractureModel, Remembers, Setting, Slot
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
 from pbdkit.scene.field_values import Values, kinds_of, values_at
-from pbdkit.scene.homes import SceneConstants
+from pbdkit.scene.homes import SceneConstants, of_material
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import Raster
@@ -47,7 +48,7 @@ def with_fields(
         constants = replace(constants, by_particle=found)
     if fracture.varying and fracture.can_break:
         with blaming(fracture, "when asked for its constants", "fracture"):
-            found = _by_bond(experiment, raster, neighbourhood, constants)
+            found = _by_bond(experiment, raster, neighbourhood, constants, setting)
         constants = replace(constants, by_bond=found)
     return constants
 
@@ -109,7 +110,11 @@ def _refuse_weights(rule: FollowerRule, values: Values, setting: Setting) -> Non
 
 
 def _by_bond(
-    experiment: Experiment, raster: Raster, around: Neighbourhood, constants: SceneConstants
+    experiment: Experiment,
+    raster: Raster,
+    around: Neighbourhood,
+    constants: SceneConstants,
+    setting: Setting,
 ) -> dict[str, Floats]:
     """(plane, cell, cell) by name, of the fracture model's limits; bonds take the values at their
     middle, and what the functions see besides must be the same everywhere."""
@@ -123,7 +128,7 @@ def _by_bond(
         x, y = np.broadcast_arrays(*middle)
         needed = bonds_in(raster, block, plane, frame_too=False)
         values = values_at(experiment, "fracture", x, y, needed)
-        own = _asked(fracture, values, methodcaller("constants", plane.slot))
+        own = _asked(fracture, values, partial(_limits, plane.slot, experiment.rule, setting))
         for name, limits in own.items():
             planes = found.setdefault(name, np.zeros(shape))
             block.within(planes[n])[...] = limits
@@ -137,6 +142,11 @@ def _by_bond(
     return {
         name: found[name] for name in constants.limits[around.every[0]]._fields if name in found
     }
+
+
+def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: FractureModel) -> Any:
+    """What a fracture model gives for a slot, what it makes of the rule's stiffness included."""
+    return {**fracture.constants(slot), **of_material(fracture, rule, setting).get(slot, {})}
 
 
 def _refuse_parameter(fracture: TakesFields) -> None:

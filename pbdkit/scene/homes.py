@@ -13,9 +13,17 @@ from enum import Enum
 from functools import cache
 from typing import Any
 
-from pbdkit.errors import PluginError
+from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import FollowerRule, Remembered, Setting, Slot
+from pbdkit.interfaces import (
+    FollowerRule,
+    FractureModel,
+    HasStiffBonds,
+    KnowsStiffness,
+    Remembered,
+    Setting,
+    Slot,
+)
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.places import Floats, Where
@@ -75,7 +83,10 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        limits = {s: _named("Constants", fracture.constants(s)) for s in slots}
+        further = of_material(fracture, rule, setting)
+        limits = {
+            s: _named("Constants", fracture.constants(s), **further.get(s, {})) for s in slots
+        }
         _refuse_other_names(limits, "constants")
         names = (*limits[slots[0]]._fields, *(n.name for n in bond_numbers(experiment)))
         if twice := {name for name in names if names.count(name) > 1}:
@@ -91,6 +102,23 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
 def named_weights(values: Any, rule: FollowerRule) -> Any:
     """w of what a rule gives for a slot."""
     return _named("Weights", values, **(WHOLE_CELLS if rule.uses_cells else {}))
+
+
+def of_material(
+    fracture: FractureModel, rule: FollowerRule, setting: Setting
+) -> dict[Slot, dict[str, float]]:
+    """Further constants by slot of a model that knows how stiff bonds are."""
+    if not isinstance(fracture, KnowsStiffness):
+        return {}
+    if not isinstance(rule, HasStiffBonds) or rule.elasticity() is None:
+        raise ExperimentError(
+            f"'{fracture.type}' needs a rule that is calibrated to a material, and knows how stiff "
+            f"bonds are, which '{rule.type}' with these parameters is not; take 'springs' or "
+            "'elastic'"
+        )
+    slots = [slot for own in setting.slots for slot in own]
+    stiffness = {slot: rule.stiffness_along(slot, setting) for slot in slots}
+    return {slot: fracture.of_material(slot, stiffness, setting) for slot in slots}
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:

@@ -14,7 +14,7 @@ from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.bonds import BondTable, build_bond_table
+from pbdkit.scene.bonds import BondTable, build_bond_table, crossed_bonds
 from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
@@ -57,8 +57,8 @@ class Scene:
 
     @property
     def has_fracture(self) -> bool:
-        """Whether any bond can break."""
-        return self.experiment.fracture.can_break
+        """Whether bonds can come to be broken, torn or cut, so that their state is kept."""
+        return self.experiment.parts_bonds
 
     @property
     def lag(self) -> int:
@@ -119,6 +119,7 @@ def _build(experiment: Experiment) -> Scene:
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += doubts(raster, experiment.leaders)
+    warnings += _missing_cuts(experiment, raster, neighbourhood)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
@@ -207,6 +208,17 @@ def _doubts(
     return doubts
 
 
+def _missing_cuts(
+    experiment: Experiment, raster: Raster, neighbourhood: Neighbourhood
+) -> list[str]:
+    """A warning for each cut that crosses nothing."""
+    return [
+        f"cuts.{n}: it crosses no bond of the body; look where it goes from and to"
+        for n, cut in enumerate(experiment.cuts)
+        if not any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
+    ]
+
+
 def with_inner(scene: Scene) -> Scene:
     """The scene with that of its inner rule, where the rule works on the moves of another.
 
@@ -221,6 +233,7 @@ def with_inner(scene: Scene) -> Scene:
     remembers = isinstance(rule, Remembers) or isinstance(inner, Remembers)
     for unfit, part, remedy in (
         (scene.lag, "frame", "lag: 0"),
+        (experiment.cuts, "cuts", "[]"),
         (experiment.fracture.can_break, "fracture", "{type: none}"),
         (experiment.neighbours.nearness(), "neighbours", "reevaluate: false"),
         (remembers, "rule", "one that remembers nothing"),
@@ -228,7 +241,7 @@ def with_inner(scene: Scene) -> Scene:
         if unfit:
             raise ExperimentError(
                 f"'{rule.type}' applies a rule to the moves of another, which does not go with "
-                f"this {part}; take {part}: {remedy}",
+                f"{'such' if part == 'cuts' else 'this'} {part}; take {part}: {remedy}",
                 (part,),
             )
     experiment = experiment.model_copy(update={"rule": inner})

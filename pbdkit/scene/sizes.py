@@ -53,11 +53,11 @@ def sizes_of(
     grids find an equilibrium, as far as that is known."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
-    state: float = 2 * 2 * value + experiment.fracture.can_break * planes * (4 + value)
+    state: float = 2 * 2 * value + experiment.parts_bonds * planes * (4 + value)
     state += planes * sum(_bytes_of(n.dtype, value) for n in bond_numbers(experiment))
     state += sum(_bytes_of(n.dtype, value) for n in particle_numbers(experiment))
     table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
-    table += experiment.fracture.can_break * planes
+    table += experiment.parts_bonds * planes
     made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
     memory = math.ceil(particles * (state + table + made))
     if not experiment.solver.makes_steps:
@@ -94,13 +94,9 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     each_time, every_step = 2 * recorded + 1.0, 0
-    once = (
-        (1 + bool(experiment.units)) * 2 * 8
-        + 2 * 8
-        + 2 * 4
-        + 2 * 8
-        + experiment.shows_bonds * planes * (17 + 12 * fracture.can_break)
-    )
+    each_bond = 17 + 12 * experiment.parts_bonds
+    once: float = (2 + bool(experiment.units)) * 2 * 8 + 2 * 4 + 2 * 8
+    once += experiment.shows_bonds * planes * each_bond
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
     of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
     for numbers, owners, renews in (of_bonds, of_particles):

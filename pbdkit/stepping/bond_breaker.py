@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,11 @@ DIRECTIONS = 8
 
 class Fracturing:
     """The fracture model of a scene on its planes of bonds."""
+
+    @classmethod
+    def of(cls, scene: Scene) -> Self | None:
+        """None where the model breaks nothing."""
+        return cls(scene) if scene.experiment.fracture.can_break else None
 
     def __init__(self, scene: Scene) -> None:
         self._model: FractureModel = scene.experiment.fracture

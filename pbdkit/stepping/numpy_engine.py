@@ -11,6 +11,7 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.clamps import Clamps
+from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.newton_forces import NewtonForces
@@ -39,7 +40,7 @@ class Stepper(Engine):
     def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         self._scene = scene
         self._rule = scene.experiment.rule
-        self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        self._fracturing = Fracturing.of(scene)
         self._clamps = Clamps(scene)
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
@@ -53,6 +54,7 @@ class Stepper(Engine):
 
     def _step(self, state: State) -> State:
         step, u, new = state.step + 1, state.u, state.previous
+        cut_bonds(self._scene, state.broken_step, step)
         led, starts = prescribe(self._scene, state, step, self._newton)
         before = placed(u, led)
         place(u, led)

@@ -90,8 +90,9 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
 
 
 def steady_steps(scene: Scene, step: int, most: int) -> int:
-    """How many steps from `step` on have the same leaders at the same places and the same loads, at
-    most `most`, at least 1."""
+    """How many steps from `step` on have the same leaders at the same places, the same loads and no
+    cut but those that the first begins with, at most `most`, at least 1."""
+    most = min([most, *(cut.at - step for cut in scene.experiment.cuts if cut.at > step)])
     for leading in scene.leading:
         group = leading.group
         begins, ends = group.from_, group.last(step + most)
@@ -107,9 +108,9 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
 
 
 def last_event(scene: Scene) -> int:
-    """The last step within the run at which leaders move, or roles or loads change, at least
-    1."""
-    steps, events = scene.experiment.steps, [1]
+    """The last step within the run at which leaders move, roles or loads change or bonds are cut,
+    at least 1."""
+    steps, events = scene.experiment.steps, [1, *(cut.at for cut in scene.experiment.cuts)]
     events += scene.loads.changes(steps) if scene.loads else []
     for leading in scene.leading:
         first, last = leading.group.from_, leading.group.last(steps)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from operator import sub
 from typing import Any
 
 import numpy as np
@@ -23,13 +22,12 @@ from pbdkit.interfaces import (
     StartsCracked,
 )
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.bonds import bonds_in, crosses, plane_block
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import LEADER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.cutting import break_crossed, cut_bonds
 
 Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]
@@ -45,9 +43,9 @@ class State:
     `previous` the same at the end of the step before: memory needs it, PE2 shows it, and the next
     step is written into it. `broken_step` holds, for each plane of bonds (plane, cell, cell), the
     step at which each broke and -1 where none did, and `broken_length` its length just then in the
-    intermediate configuration, 0 where none broke; None where nothing can break. `starts` has for
-    each leader group that has begun the displacements from which its motion counts, (axis,
-    particle); of one that moves by Newton's law, the velocities. `bond_values` and
+    intermediate configuration, 0 where none broke or was cut; None where nothing can break.
+    `starts` has for each leader group that has begun the displacements from which its motion
+    counts, (axis, particle); of one that moves by Newton's law, the velocities. `bond_values` and
     `particle_values` are what the fracture model remembers of each bond, as `broken_step` lies, and
     the rule of each particle, (sublattice, cell, cell).
     """
@@ -104,13 +102,14 @@ def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -
 
 def initial_state(scene: Scene) -> State:
     """The state at time 0: the body as the experiment starts it, the frame following, bonds across
-    the given cracks broken at step 0. Nothing has moved before."""
+    the given cracks, and cut before the first step, broken at step 0. Nothing has moved before."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))
         state.previous[...] = state.u
     if state.broken_step is not None and isinstance(experiment.fracture, StartsCracked):
-        _crack(scene, experiment.fracture.segments(), state.broken_step)
+        break_crossed(scene, experiment.fracture.segments(), state.broken_step, 0)
+    cut_bonds(scene, state.broken_step, 0)
     _draw(scene, "fracture", bond_numbers(experiment), state.bond_values)
     _draw(scene, "rule", particle_numbers(experiment), state.particle_values)
     return state
@@ -125,20 +124,6 @@ def _displace(scene: Scene, u: Floats) -> None:
     u[:, raster.place_of(body)] = initial.T
     if scene.frame:
         scene.frame.follow(u, u)
-
-
-def _crack(scene: Scene, cracks: Sequence[Segment], broken: NDArray[np.int32]) -> None:
-    """Breaks the bonds, (plane, cell, cell), that cross a crack, at step 0."""
-    raster, origin = scene.raster, scene.experiment.lattice.origin
-    for n, plane in enumerate(scene.neighbourhood.planes if cracks else ()):
-        if block := plane_block(raster, plane):
-            start = raster.reference_planes(block)
-            bonds = bonds_in(raster, block, plane, frame_too=True)
-            for crack in cracks:
-                # As the rasters count: from the lattice's site (0, 0).
-                a, b = (tuple(map(sub, point, origin)) for point in crack)
-                crossed = bonds & crosses(start, start + plane.slot.rest, (a, b))
-                block.within(broken[n])[crossed] = 0
 
 
 def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Values) -> None:

@@ -19,6 +19,7 @@ from pbdkit.interfaces import (
     Component,
     Diagnostic,
     FramePolicy,
+    KnowsStiffness,
     Lattice,
     NeighbourMetric,
 )
@@ -96,6 +97,8 @@ def _rules(component: Component) -> list[dict[str, Any]]:
     if isinstance(component, Diagnostic) and component.needs & {"material", "forces", "loads"}:
         return [ELASTIC]
     if isinstance(component, FramePolicy) and component.edges_are_free:
+        return [ELASTIC]
+    if isinstance(component, KnowsStiffness):
         return [ELASTIC]
     return list(PARTNERS if isinstance(component, (Lattice, NeighbourMetric)) else PARTNERS[:1])
 

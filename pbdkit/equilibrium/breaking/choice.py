@@ -24,11 +24,11 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
     """For a scene whose rule is linear; None where compiling would take longer than numpy, where
     nothing compiles, or where the solver's method is not direct. Decided by the experiment alone,
     so that what is resumed goes on as it began."""
-    solver, plain = scene.experiment.solver.sought, scene.axes == 2 and scene.inner is None
+    solver = scene.experiment.solver.sought
     direct = solver.method == "lu" or (
         solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
     )
-    if not (scene.has_fracture and direct and plain) or _seconds(scene) < PATIENCE_S or obstacle():
+    if not (direct and _is_plain(scene)) or _seconds(scene) < PATIENCE_S or obstacle():
         return None
     from pbdkit.equilibrium.breaking.settler import Settler
 
@@ -37,6 +37,17 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
     except PluginError:
         return None
     return found if found.is_small else None
+
+
+def _is_plain(scene: Scene) -> bool:
+    """Whether the kernel knows all that such a scene has: loads, cuts, fields and leaders along one
+    axis it does not."""
+    asked, constants = scene.experiment, scene.constants
+    more = asked.cuts or asked.loads or constants.by_bond or constants.by_particle
+    mixed = scene.cells is not None and bool(scene.cells.mixed)
+    guided = any(leading.group.axes for leading in scene.leading)
+    flat = scene.axes == 2 and scene.inner is None
+    return scene.has_fracture and flat and not (more or mixed or guided)
 
 
 def _seconds(scene: Scene) -> float:

@@ -26,6 +26,7 @@ from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.numpy_engine import Engine, Stepper
@@ -95,6 +96,8 @@ class CompiledStepper(Engine):
 
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
+        if cut_bonds(self._scene, state.broken_step, step):
+            self._begin(state)
         led, starts = prescribe(self._scene, state, step, self._newton)
         self._clamped = self._clamps.turn(state, step)
         load = self._load(state)

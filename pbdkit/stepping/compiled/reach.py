@@ -97,7 +97,7 @@ def _rests_by_construction(levels: Sequence[Level]) -> bool:
     particles or bonds have numbers of their own it is looked at instead."""
     scene = levels[-1].scene
     experiment, raster, fracture = scene.experiment, scene.raster, scene.experiment.fracture
-    cracked = isinstance(fracture, StartsCracked) and fracture.segments()
+    cracked = (isinstance(fracture, StartsCracked) and fracture.segments()) or experiment.cuts
     fields = scene.constants.by_particle or scene.constants.by_bond
     remembered = particle_numbers(experiment) or bond_numbers(experiment) or fields
     if not experiment.initial.at_rest or experiment.rule.uses_reference or cracked or remembered:

@@ -1,0 +1,209 @@
+"""Cuts in time: which bonds they break, when, and what follows in steps and in equilibrium."""
+
+import json
+
+import numpy as np
+import pytest
+
+import pbdkit
+
+HEIGHT = 8
+CUT = {"from": [-1.0, 3.5], "to": [3.2, 3.5]}
+
+
+def moved(edge, way, steps=10):
+    motion = {"type": "velocity", "velocity": [0.0, way / steps], "steps": steps}
+    return {"select": {"edge": edge}, "motion": motion}
+
+
+PLATE = {
+    "name": "plate",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 9, "rows": HEIGHT},
+    "neighbours": {"type": "chebyshev"},
+    "rule": {"type": "springs"},
+    "frame": {"type": "natural"},
+    "leaders": [moved("bottom", -0.02), moved("top", 0.02)],
+    "steps": 40,
+    "diagnostics": [{"type": "displacement"}, {"type": "broken"}],
+}
+ELASTIC = {"type": "elastic", "poisson_ratio": 1 / 3}
+SLOWLY = [moved("bottom", -0.02, 150), moved("top", 0.02, 150)]
+STRAIGHT = {"type": "equilibrium", "tolerance": 1e-10}
+
+
+def run(**parts):
+    return pbdkit.run(PLATE | parts, progress=False)
+
+
+def cut(at):
+    return [CUT | {"at": at}]
+
+
+def crossed(ds):
+    """Whether each bond crosses the cut, by its ends."""
+    a, b = (ds.reference.values[ds.bond.values[:, end]] for end in (0, 1))
+    parted = (a[:, 1] > 3.5) != (b[:, 1] > 3.5)
+    return parted & ((a + b)[:, 0] / 2 <= 3.2)
+
+
+def test_bonds_that_cross_are_broken_in_their_step_and_no_others():
+    ds = run(cuts=cut(20))
+    assert np.array_equal(ds.broken_step.values, np.where(crossed(ds), 20, -1))
+    assert np.isnan(ds.broken_strain.values).all()
+    assert ds.broken_bonds.values.tolist() == [0] * 20 + [int(crossed(ds).sum())] * 21
+    until = ds.u.values[:20]
+    assert np.array_equal(until, run(steps=19).u.values)
+    assert not np.array_equal(ds.u.values[20], run().u.values[20])
+
+
+@pytest.mark.parametrize(
+    "fracture",
+    [{"type": "strain", "failure": 9.0}, {"type": "damage", "onset": 8.0, "failure": 9.0}],
+)
+def test_a_cut_before_the_first_step_is_a_crack(fracture):
+    crack = fracture | {"cracks": [[CUT["from"], CUT["to"]]]}
+    one, other, alone = run(fracture=crack), run(fracture=fracture, cuts=cut(0)), run(cuts=cut(0))
+    assert (one.broken_step.values == 0).any()
+    for ds in (other, alone):
+        assert np.array_equal(one.u.values, ds.u.values)
+        assert np.array_equal(one.broken_step.values, ds.broken_step.values)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_kernels_cut_as_numpy_does(precision):
+    pytest.importorskip("numba")
+    some = {"engine": "compiled", "precision": precision, "threads": 2}
+    pulled = [moved("bottom", -0.9), moved("top", 0.9)]
+    parts = {"cuts": [*cut(20), CUT | {"to": [5.0, 3.5], "at": 26}], "leaders": pulled}
+    parts["fracture"] = {"type": "strain", "failure": 0.25}
+    found = run(**parts, solver={"type": "stepping"} | some)
+    known = run(**parts, solver={"type": "stepping", "precision": precision, "engine": "numpy"})
+    off = np.abs(found.u.values - known.u.values).max()
+    assert off == 0.0 if precision == "float64" else off < 1e-6
+    assert np.array_equal(found.broken_step.values, known.broken_step.values)
+    assert np.isfinite(known.broken_strain.values).any()
+
+
+def test_kernels_cut_where_nothing_tears():
+    pytest.importorskip("numba")
+    rule = {"type": "barycentre"}
+    parts = {"rule": rule, "frame": {"type": "mean"}, "cuts": cut(20)}
+    found, known = (
+        run(**parts, solver={"type": "stepping", "engine": e}) for e in ("compiled", "numpy")
+    )
+    assert np.array_equal(found.u.values, known.u.values)
+    assert np.array_equal(found.broken_step.values, known.broken_step.values)
+
+
+@pytest.mark.parametrize("at", [1, 5, 11, 40])
+@pytest.mark.parametrize("rule", [ELASTIC, {"type": "springs"}], ids=["linear", "springs"])
+def test_the_equilibrium_of_an_elastic_body_forgets_when_it_was_cut(rule, at):
+    before, later = (run(rule=rule, cuts=cut(n), solver=STRAIGHT) for n in (0, at))
+    assert later.status == "complete"
+    assert set(later.broken_step.values) == {-1, at}
+    assert np.abs(before.u.values[-1] - later.u.values[-1]).max() < 1e-9
+    steps = run(rule=rule, cuts=cut(at), steps=1500, record={"every": 1500})
+    assert np.abs(steps.u.values[-1] - later.u.values[-1]).max() < 1e-9
+
+
+def test_a_loaded_body_goes_on_tearing_from_its_cut():
+    """Under a load that the whole plate bears, and the cut one does not."""
+    parts = {"fracture": {"type": "strain", "failure": 0.007}, "rule": ELASTIC}
+    parts["leaders"] = SLOWLY
+    assert not (run(**parts, solver=STRAIGHT, steps=300).broken_step.values >= 0).any()
+    for solver, steps in ((STRAIGHT, 300), ({"type": "stepping"}, 800)):
+        ds = run(**parts, cuts=cut(200), solver=solver, steps=steps, record={"every": steps})
+        was_cut, steps_of = crossed(ds), ds.broken_step.values
+        assert (steps_of[was_cut] == 200).all()
+        assert np.isnan(ds.broken_strain.values[was_cut]).all()
+        torn = (steps_of >= 0) & ~was_cut
+        assert torn.any()
+        assert (steps_of[torn] >= 200).all()
+        assert (ds.broken_strain.values[torn] > 0.007).all()
+
+
+def test_a_part_that_is_cut_off_stays_where_it_is():
+    """Nothing holds it from then on; the rest relaxes."""
+    off = [{"from": [-1.0, 3.5], "to": [9.0, 3.5], "at": 30}]
+    held = [PLATE["leaders"][0] | {"motion": {"type": "hold"}},
+            PLATE["leaders"][1] | {"until": 29}]  # fmt: skip
+    straight = run(cuts=off, leaders=held, rule=ELASTIC, solver=STRAIGHT)
+    steps = run(cuts=off, leaders=held, rule=ELASTIC, steps=4000, record={"every": 4000})
+    lower = straight.reference.values[:, 1] < 3.5
+    for ds in (straight, steps):
+        assert np.abs(ds.u.values[-1, lower]).max() < 1e-9
+        assert np.ptp(ds.u.values[-1, ~lower, 1]) < 1e-9
+        assert ds.u.values[-1, ~lower, 1].mean() > 0.005
+
+
+def test_runs_settle_after_their_last_cut():
+    solver = {"type": "stepping", "settle": {"tolerance": 1e-6}}
+    ds = run(cuts=cut(900), steps=3000, solver=solver, record={"every": 3000})
+    assert ds.status == "settled"
+    assert ds.time.values[-1] > 900
+    assert run(steps=3000, solver=solver, record={"every": 3000}).time.values[-1] < 900
+
+
+def test_explain_tells_cut_from_torn(call, tmp_path):
+    file = tmp_path / "plate.json"
+    parts = {"fracture": {"type": "strain", "failure": 0.007}, "cuts": [*cut(200)], "steps": 800,
+             "leaders": SLOWLY}  # fmt: skip
+    file.write_text(json.dumps(PLATE | parts))
+    assert call("run", str(file), "-o", "out.nc", "--quiet").code == 0
+    told = json.loads(call("explain", "out.nc", "--json").out)
+    cuts = [s for s in told["in_order"] if s["state"] == "cut"]
+    assert told["cut"] == len(cuts) == 10
+    assert told["broken"] == len(told["in_order"]) - 10 > 0
+    assert {(s["step"], s["strain_at_break"]) for s in cuts} == {(200, None)}
+    assert told["in_order"][:10] == cuts
+    assert "10 cut" in call("explain", "out.nc").out.splitlines()[0]
+    ends = map(str, cuts[0]["bond"])
+    assert "cut at the beginning of step 200" in call("explain", "out.nc", "--bond", *ends).out
+
+
+def test_a_run_goes_on_before_and_after_its_cut(call, tmp_path):
+    file = tmp_path / "plate.json"
+    file.write_text(json.dumps(PLATE | {"cuts": cut(20), "steps": 19}))
+    whole = run(cuts=cut(20))
+    with pytest.raises(pbdkit.ExperimentError, match="step 20 is beyond the run's 19"):
+        pbdkit.load(str(file))
+    for steps in (20, 25):
+        file.write_text(json.dumps(PLATE | {"cuts": cut(20), "steps": steps}))
+        assert call("run", str(file), "-o", "part.nc", "--quiet", "--force").code == 0
+        assert call("resume", "part.nc", "--steps", "40").code == 0
+        with pbdkit.open("part.nc") as ds:
+            assert np.array_equal(ds.u.values, whole.u.values)
+            assert np.array_equal(ds.broken_step.values, whole.broken_step.values)
+
+
+def test_it_runs_again_from_its_dataset():
+    ds = run(cuts=cut(20))
+    again = pbdkit.rerun(ds, progress=False)
+    assert np.array_equal(again.u.values, ds.u.values)
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"cuts": [{"from": [1.0, 1.0], "to": [1.0, 1.0]}]},
+         "cuts.0.to: is the point that the cut comes from; move one of the two"),
+        ({"cuts": cut(41)}, "cuts: step 41 is beyond the run's 40"),
+        ({"cuts": cut(-1)}, "cuts.0.at: "),
+        ({"cuts": [{"from": [0.0, 0.0]}]}, "cuts.0"),
+        ({"cuts": cut(3), "frame": {"type": "none"}, "rule": {"type": "barycentre"},
+          "neighbours": {"type": "euclidean", "radius": 1.5, "reevaluate": True}},
+         "bonds cannot be cut where neighbours are re-evaluated"),
+        ({"cuts": cut(3), "rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 1.0}},
+         "which does not go with such cuts; take cuts: "),
+    ],
+)  # fmt: skip
+def test_wrong_cuts_are_told(parts, words):
+    with pytest.raises(pbdkit.ExperimentError) as error:
+        run(**parts)
+    assert words in str(error.value)
+
+
+def test_a_cut_that_misses_the_body_is_warned_of():
+    with pytest.warns(pbdkit.PbdkitWarning, match=r"cuts\.0: it crosses no bond of the body"):
+        run(cuts=[{"from": [20.0, 0.0], "to": [21.0, 0.0]}], steps=1)
