@@ -75,7 +75,7 @@ UNKNOWN = Certificate(
 def scale_of(scene: Scene, start: State) -> float:
     """The largest prescribed displacement: of the leaders, or of the start; the lattice's spacing
     where nothing is prescribed but rest."""
-    ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
+    ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = max([float(abs(start.u).max()), *ways])
     return prescribed or spacing_of(scene)
 

@@ -19,7 +19,7 @@ def events(scene: Scene) -> list[int]:
     roles: the ends of steps, up to the last of the load."""
     steps, last = scene.experiment.steps, last_event(scene)
     found = {0, last}
-    for leading in scene.leading:
+    for leading in scene.driven:
         group = leading.group
         end = group.last(steps)
         knots = (group.from_ - 1 + n for n in group.motion.knots())
@@ -49,7 +49,7 @@ def moments(scene: Scene, count: int) -> list[float]:
 def _way(scene: Scene, begin: int, end: int) -> float:
     """How far the leader that goes farthest goes between two events."""
     most = 0.0
-    for leading in scene.leading:
+    for leading in scene.driven:
         group = leading.group
         if not (group.from_ - 1 <= begin and group.leads(end)):
             continue

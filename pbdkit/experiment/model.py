@@ -21,6 +21,7 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.body_algebra import AnyBody
 from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
+from pbdkit.experiment.obstacles import Obstacle
 from pbdkit.experiment.parts import brief, fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.solvers import AnySolver, Stepping
@@ -90,6 +91,7 @@ class Experiment(Strict):
     fracture: Annotated[SerializeAsAny[FractureModel], open_part(FractureModel)] = _default("none")
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()

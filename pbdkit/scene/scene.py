@@ -22,6 +22,7 @@ from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
 from pbdkit.scene.places import Mask, distinct, hull
 from pbdkit.scene.raster import Raster, positions
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
@@ -37,7 +38,7 @@ class Scene:
 
     `constants` are what the elementwise functions are called with. `frame`, `cells` and `inner`
     (the scene with the rule's inner rule) are None where the scene has none. `leading` are the
-    leader groups, `warnings` are for the user.
+    leader groups, `warnings` are for the user, `barriers` the obstacles.
     """
 
     experiment: Experiment
@@ -49,6 +50,12 @@ class Scene:
     inner: Scene | None
     leading: tuple[Leading, ...]
     warnings: tuple[str, ...]
+    barriers: tuple[Barrier, ...] = ()
+
+    @property
+    def driven(self) -> tuple[Leading | Barrier, ...]:
+        """All that motions drive."""
+        return (*self.leading, *self.barriers)
 
     @property
     def has_fracture(self) -> bool:
@@ -125,8 +132,10 @@ def _build(experiment: Experiment) -> Scene:
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
     cells = filling.on(raster, neighbourhood.tiling)
+    barriers = build_obstacles(raster, experiment)
+    warnings += collisions(raster, leading, barriers, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
-    return with_inner(Scene(experiment, *parts, tuple(warnings)))
+    return with_inner(Scene(experiment, *parts, tuple(warnings), barriers))
 
 
 def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:

@@ -10,6 +10,7 @@ import numpy as np
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State
@@ -37,6 +38,7 @@ class Stepper(Engine):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing(scene) if scene.has_fracture else None
+        self._contact = Contact(scene) if scene.barriers else None
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
 
@@ -56,6 +58,8 @@ class Stepper(Engine):
         # What leaves the finite numbers is found at recording.
         with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
             self._followers.move(u, new, state)
+        if self._contact:
+            self._contact.push_out(new, step)
         place(new, led)
         place(u, before)
         if self._scene.frame:

@@ -20,10 +20,12 @@ from pbdkit.stepping.compiled.arguments import (
 )
 from pbdkit.stepping.compiled.emitter import write_kernel
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
+from pbdkit.stepping.compiled.obstacle_pass import wall_arrays
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import Led, prescribe, steady_steps
 from pbdkit.stepping.state import State, unmoved_state
@@ -51,6 +53,7 @@ class CompiledStepper(Engine):
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
         self._last: State | None = None
+        self._contact = Contact(scene) if scene.barriers else None
         levels = levels_of(scene)
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
@@ -88,6 +91,8 @@ class CompiledStepper(Engine):
     def _some_steps(self, state: State, end: int) -> State:
         step = state.step + 1
         led, starts = prescribe(self._scene, state, step)
+        if self._contact:
+            self._reach.touch(self._contact.touched_at_rest(step))
         count = self._reach.before(led, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
@@ -105,7 +110,8 @@ class CompiledStepper(Engine):
         leaders["led_kept"] = np.empty_like(led_values)
         reached = {"box": self._reach.box, "growth": self._reach.growth}
         moved = state_arrays(self._plan, state.u, state.previous, state)
-        return self._arrays | moved | leaders | reached
+        walls = wall_arrays(self._scene, state.step + 1)
+        return self._arrays | moved | leaders | reached | walls
 
     def _given(self, state: State, led: Led, count: int) -> tuple[Any, ...]:
         """The arguments of the kernel that makes `count` steps."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
+from pbdkit.stepping.compiled.obstacle_pass import write_obstacle_pass
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
 from pbdkit.stepping.compiled.rows import GENERAL, write_row
 from pbdkit.stepping.compiled.slot_loop import write_general
@@ -27,8 +28,10 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
         passes.append(functions[-1])
+    pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
+    functions += [pushing] if pushing else []
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes)
+    _write_run(run, plan, passes, pushing)
     return write_module(plan, functions, run)
 
 
@@ -68,7 +71,9 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
     return [*dict.fromkeys(found), out]
 
 
-def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
+def _write_run(
+    out: Function, plan: Plan, passes: Sequence[Function], pushing: Function | None
+) -> None:
     out.add(0, "for _ in range(count):", "    step += 1")
     for side in "uv":
         out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
@@ -92,6 +97,8 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
             if n + 1 < len(passes) and plan.scene.frame:
                 out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
                 _write_frame(out, plan, f"fz{n}", f"fz{n}")
+    if pushing:
+        write_pass(out, plan, 1, pushing, "i0", "i1")
     out.add(1, "for e in range(led.size):")
     out.add(2, *plan.each("fv_@[led[e]] = led_values[#, e]"))
     out.add(2, *plan.each("fu_@[led[e]] = led_kept[#, e]"))

@@ -18,6 +18,7 @@ from pbdkit.interfaces import (
 )
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
+from pbdkit.scene import outlines
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.kernel_cache import load_kernel
@@ -54,6 +55,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
         for kind, names in FUNCTIONS.items():
             if isinstance(part, kind):
                 found |= {f"{name}{number}": getattr(part, name) for name in names}
+    if levels[-1].scene.barriers:
+        found["facing"] = outlines.facing
     return found
 
 

@@ -10,7 +10,7 @@ looked at in every step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -62,6 +62,11 @@ class Reach:
         for place, values in led:
             self._join(np.unravel_index(place[(values != 0.0).any(axis=0)], self._shape)[1:])
         return count
+
+    def touch(self, touched: Iterable[tuple[NDArray[np.intp], ...]]) -> None:
+        """Takes in the cells that obstacles push from where they rest."""
+        for cells in touched if self._known else ():
+            self._join(cells)
 
     def after(self, now: Floats, before: Floats) -> None:
         """Looks once at what the first step has moved."""

@@ -1,0 +1,97 @@
+"""Keeps particles out of obstacles: whoever lies inside one is put on the nearest point of its
+outline, without friction, as position-based dynamics does it after its step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from pbdkit.scene.obstacles import outlines_at
+from pbdkit.scene.outlines import Outline
+from pbdkit.scene.places import Block, Mask
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import Floats
+
+
+class Contact:
+    """The obstacles of a scene and the particles of its body.
+
+    Only those are looked at that can be in an obstacle's box, as far as displacements reach. One
+    obstacle comes after the other, in the order of the experiment.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._vectors = np.array(scene.raster.lattice.cell().vectors)
+        self._inverse = np.linalg.inv(self._vectors)
+
+    def push_out(self, u: Floats, moment: float) -> None:
+        """Puts the body's particles, leaders too, out of the obstacles as they are at the end of a
+        step, or at a moment within it; `u` are planes."""
+        for _, outline in outlines_at(self._scene.barriers, moment):
+            for block in self._blocks():
+                near = self._near(block, block.of(u), outline.box)
+                if near is not None:
+                    self._push_block(near, u, outline)
+
+    def touched_at_rest(self, moment: float) -> Iterator[tuple[np.ndarray, ...]]:
+        """The cells of particles that would be pushed where they rest, index by index."""
+        still = np.zeros((2, *self._scene.raster.shape))
+        for _, outline in outlines_at(self._scene.barriers, moment):
+            for block in self._blocks():
+                near = self._near(block, block.of(still), outline.box)
+                if near is not None:
+                    inside, *_ = self._inside(near, still, outline)
+                    yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
+
+    def _blocks(self) -> list[Block]:
+        blocks = (self._scene.raster.body_block(s) for s in range(self._scene.raster.shape[0]))
+        return [block for block in blocks if block]
+
+    def _near(self, block: Block, u: Floats, box: Floats) -> Block | None:
+        """The part of a block whose particles can be in the box; u are its displacements."""
+        raster = self._scene.raster
+        low, high = np.array([[np.fmin.reduce(p, axis=None) for p in u],
+                              [np.fmax.reduce(p, axis=None) for p in u]])  # fmt: skip
+        corner = np.array([box[:2] - high, box[2:] - low])
+        if np.isnan(corner).any():
+            return None
+        at = np.array(raster.lattice.cell().sites[block.sublattice].at)
+        low, high = self._ends(block)
+        # Boxes that do not end are those of the body here, and a little more.
+        corner = np.clip(corner, low - 1.0, high + 1.0)
+        corners = np.array([[corner[i, 0], corner[j, 1]] for i, j in product((0, 1), repeat=2)])
+        cells = (corners - at) @ self._inverse - raster.first
+        first = np.maximum(np.floor(cells.min(axis=0) - 1e-6).astype(int), block.start)
+        last = np.minimum(np.ceil(cells.max(axis=0) + 1e-6).astype(int) + 1, block.stop)
+        if (first >= last).any():
+            return None
+        return Block(block.sublattice, tuple(first.tolist()), tuple(last.tolist()))
+
+    def _push_block(self, block: Block, u: Floats, outline: Outline) -> None:
+        inside, gap, *normal = self._inside(block, u, outline)
+        for plane, n in zip(block.of(u), normal, strict=True):
+            plane[inside] = plane[inside] - gap[inside] * n[inside]
+
+    def _inside(
+        self, block: Block, u: Floats, outline: Outline
+    ) -> tuple[Mask, Floats, Floats, Floats]:
+        """Which of the body's particles in a block are inside, and of all the gap and the normal."""
+        X, low = self._scene.raster.reference_planes(block), outline.box
+        x, y = (a + b for a, b in zip(X, block.of(u), strict=True))
+        near = (x >= low[0]) & (y >= low[1]) & (x <= low[2]) & (y <= low[3])
+        near &= block.of(self._scene.raster.kind) == FOLLOWER
+        gap, *normal = (np.zeros(x.shape) for _ in range(3))
+        gap[near], normal[0][near], normal[1][near], _ = outline.facing(x[near], y[near])
+        return near & (gap < 0.0), gap, normal[0], normal[1]
+
+    def _ends(self, block: Block) -> tuple[Floats, Floats]:
+        """(low, high) of the places of a block's sites, from site (0, 0)."""
+        corners = product(*((a, b - 1) for a, b in zip(block.start, block.stop, strict=True)))
+        sites = np.array(list(corners)) + self._scene.raster.first
+        at = np.array(self._scene.raster.lattice.cell().sites[block.sublattice].at)
+        places = sites @ self._vectors + at
+        return places.min(axis=0), places.max(axis=0)
