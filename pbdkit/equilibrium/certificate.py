@@ -148,7 +148,8 @@ class Foresight:
         broken = broken_bonds(state)
         if self._at_rest is None or broken != self._broken:
             self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
-            self._linear = self._is_linear(here, self._at_rest)
+            bare = not self._scene.barriers
+            self._linear = bare and self._is_linear(here, self._at_rest)
         if self._linear:
             return self._outlook(here, self._at_rest)
         known = self._linearised(here, u)

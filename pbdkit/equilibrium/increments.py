@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of
+from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of, spacing_of
 from pbdkit.equilibrium.load_path import moments
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
 from pbdkit.errors import ExperimentError
@@ -16,6 +16,7 @@ from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.guard import way_of
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.prescription import place, prescribe
 from pbdkit.stepping.state import State, initial_state
@@ -47,17 +48,18 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     the watch says so: then the state is the last that had been reached.
     """
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
-    for n, leading in enumerate(scene.leading):
-        if leading.group.leads(steps) and leading.group.motion.rests_after() is None:
-            raise ExperimentError(
-                "never comes to rest, so that there is no equilibrium; take solver: "
-                "{type: stepping}, or a motion that ends",
-                ("leaders", n, "motion"),
-            )
+    for field, every in (("leaders", scene.leading), ("obstacles", scene.barriers)):
+        for n, driven in enumerate(every):
+            if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
+                raise ExperimentError(
+                    "never comes to rest, so that there is no equilibrium; take solver: "
+                    "{type: stepping}, or a motion that ends",
+                    (field, n, "motion"),
+                )
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture or not finder.linear:
-        count = asked.increments if scene.has_fracture else 1
+        count = asked.increments if scene.has_fracture else _spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))
     if (last := _last_change_of_roles(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
@@ -158,7 +160,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         led, state.starts = prescribe(scene, state, target)
         place(state.u, led)
         try:
-            certificate = finder.follow(state, math.ceil(target), before)
+            certificate = finder.follow(state, target, before)
         except UnconvergedError as error:
             vars(state).update(vars(before))
             part /= 2.0
@@ -182,12 +184,12 @@ def _stepped(
     place(state.u, led)
     for _ in range(MOST_ROUNDS):
         for _ in range(STEPS_A_ROUND):
-            state.u += finder.moves.at(state, math.ceil(moment))
+            state.u += finder.moves.at(state, moment)
         if not np.isfinite(state.u).all():
             break
         found = state.copy()
         with suppress(UnconvergedError):
-            certificate = finder.follow(found, math.ceil(moment), found.copy())
+            certificate = finder.follow(found, moment, found.copy())
             vars(state).update(vars(found))
             return certificate
     raise UnconvergedError(
@@ -212,6 +214,12 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     for old, new in pairs:
         new[...] = old
     return False
+
+
+def _spacings(scene: Scene) -> int:
+    """By how many lattice spacings the obstacle that goes farthest goes, at least 1."""
+    ways = [way_of(barrier, scene.experiment.steps) for barrier in scene.barriers]
+    return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
 
 
 def _last_change_of_roles(scene: Scene) -> int:

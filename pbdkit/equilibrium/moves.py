@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from pbdkit.scene.leader_groups import Leading, kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import Floats, State
@@ -24,16 +26,17 @@ ROUNDING = 4 * float(np.finfo(float).eps)
 
 class Moves:
     """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
-    frame standing where the body tells it to."""
+    frame standing where the body tells it to, and obstacles where they are at a moment."""
 
     def __init__(self, scene: Scene) -> None:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
+        self._contact = Contact(scene) if scene.barriers else None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            stepped = replace(scene, experiment=experiment, leading=_resting(scene))
+            stepped = replace(scene, experiment=experiment, leading=_resting(scene), barriers=())
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
         self._followers = None if self._engine else SlotFollowers(scene, stepping)
@@ -43,8 +46,21 @@ class Moves:
         """Whether evaluating them is cheap."""
         return self._engine is not None and self._engine.name == "compiled"
 
-    def at(self, state: State, step: int) -> Floats:
-        """Planes, zero where nobody follows in that step; brings the state's frame into line."""
+    def at(self, state: State, moment: float) -> Floats:
+        """Planes, zero where nobody follows in the moment's step; who would enter an obstacle moves
+        onto its outline. Brings the state's frame into line."""
+        moves = self.free(state, moment)
+        if self._contact:
+            there = state.u + moves
+            with np.errstate(all="ignore"):
+                self._contact.push_out(there, moment)
+                np.subtract(there, state.u, out=moves)
+            self._stop(moves, math.ceil(moment))
+        return moves
+
+    def free(self, state: State, moment: float) -> Floats:
+        """The same without obstacles."""
+        step = math.ceil(moment)
         u, frame = state.u, self._scene.frame
         flat = u.reshape(len(u), -1)
         if frame:
@@ -60,10 +76,15 @@ class Moves:
                 self._followers.move(u, moves, state)
         with np.errstate(all="ignore"):
             moves -= u
+        self._stop(moves, step)
+        return moves
+
+    def _stop(self, moves: Floats, step: int) -> None:
+        """Only followers move."""
+        frame = self._scene.frame
         still = [led.place for led in self._scene.leading if led.group.leads(step)]
         for place in [*still, *([frame.place] if frame else [])]:
-            moves.reshape(len(u), -1)[:, place] = 0.0
-        return moves
+            moves.reshape(len(moves), -1)[:, place] = 0.0
 
 
 def _resting(scene: Scene) -> tuple[Leading, ...]:

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, UNKNOWN, Certificate
+from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
@@ -17,7 +18,7 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State, initial_state
 
-MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 12
+MOST_CORRECTIONS, MOST_LINEARISATIONS, MOST_SETS = 8, 12, 60
 CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
@@ -57,9 +58,11 @@ class Finder:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the rule is: it says so, or followers put elsewhere, at random and as far as the
+        """Whether the rule is, and no obstacle stands in the way: it says so, or followers put elsewhere, at random and as far as the
         load goes, move by what the linearisation at rest says."""
         scene, steps = self.scene, self.scene.experiment.steps
+        if scene.barriers:
+            return False
         if scene.experiment.rule.linear:
             return True
         with one_thread():
@@ -79,13 +82,15 @@ class Finder:
         with one_thread():
             return _Linear(self, state, step).run()
 
-    def follow(self, state: State, step: int, before: State) -> Certificate:
+    def follow(self, state: State, moment: float, before: State) -> Certificate:
         """The same for rules that are not linear, from the equilibrium `before` the leaders went on
         a little: by Newton's iteration, as long as each correction is much smaller than the last,
         so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
             try:
-                return _Newton(self, state, step, before).run()
+                if self.scene.barriers:
+                    return _Contact(self, state, moment, state, "finding the contact").run()
+                return _Newton(self, state, moment, before).run()
             except IndefiniteError:
                 raise UnconvergedError(UNSTABLE, UNKNOWN) from None
 
@@ -93,8 +98,10 @@ class Finder:
 class _Search(ABC):
     _linear = False
 
-    def __init__(self, finder: Finder, state: State, step: int, at: State, what: str) -> None:
-        self._finder, self._state, self._step = finder, state, step
+    def __init__(
+        self, finder: Finder, state: State, moment: float, at: State, what: str
+    ) -> None:
+        self._finder, self._state, self._moment = finder, state, moment
         self._linearisations = self._inner = 0
         self._system = self._linearised(at, what)
         self._left = self._moves()
@@ -136,14 +143,14 @@ class _Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return linearised(finder.scene, at, self._step, finder.method, finder.watch, finder.moves)
+        return linearised(finder.scene, at, self._moment, finder.method, finder.watch, finder.moves)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
         self._left = self._moves()
 
     def _moves(self) -> Floats:
-        return self._finder.moves.at(self._state, self._step)
+        return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
         known, of, by = self._known
@@ -198,8 +205,8 @@ class _Linear(_Search):
 class _Newton(_Search):
     """By linearisations at each state it comes to, from an equilibrium nearby."""
 
-    def __init__(self, finder: Finder, state: State, step: int, before: State) -> None:
-        super().__init__(finder, state, step, before, "following the load")
+    def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
+        super().__init__(finder, state, moment, before, "following the load")
         self._before, self._led = before, state.u - before.u
         self._way = float(np.abs(self._led).max())
         """How far leaders went on."""
@@ -218,9 +225,9 @@ class _Newton(_Search):
         """As far as the equilibrium before says, leaders their whole way: by what moves a small
         part of it makes."""
         moves, part = self._finder.moves, min(1.0, NUDGE / self._way) if self._way else 1.0
-        here = moves.at(self._before, self._step)
+        here = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._led)
-        pull = here + (moves.at(nudged, self._step) - here) / part
+        pull = here + (moves.at(nudged, self._moment) - here) / part
         self._shift(self._system.solve(pull, max(self._wanted, NEAR * self._way)))
 
     def _correct(self) -> None:
@@ -239,6 +246,33 @@ class _Newton(_Search):
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
+
+
+class _Contact(_Search):
+    """By linearisations at each state it comes to, with those held who would enter an obstacle,
+    until nobody else would."""
+
+    def run(self) -> Certificate:
+        """Raises UnconvergedError where who is held goes on changing, where corrections do not
+        become smaller once it stays, or where what they lead to is not stable."""
+        held, size = None, math.inf
+        for _ in range(MOST_SETS):
+            self._system.refuse_moving_floats(self._left, self._rounding())
+            far = self._distance()
+            if far <= self._finder.tolerance or not math.isfinite(far):
+                break
+            assert isinstance(self._system, ContactSystem)
+            same, held = held is not None and (held == self._system.held).all(), self._system.held
+            correction = self._system.solve(self._left, self._wanted)
+            before, size = size, float(np.abs(correction).max(initial=0.0))
+            if same and not size <= CONTRACTION * before:
+                break
+            self._shift(correction)
+            self._system = self._linearised(self._state, "finding the contact")
+        certificate = self._certified()
+        if not self._system.is_stable():
+            raise UnconvergedError(UNSTABLE, certificate)
+        return certificate
 
 
 def _size(moves: Floats) -> float:
