@@ -73,7 +73,7 @@ class ContactSystem(System):
         if held:
             ground = Ground(2, self._X[some[::2] // 2], self._led)
             with suppress(np.linalg.LinAlgError):
-                return Held(own, "lu" if self._method == "auto" else self._method, ground, self._watch)
+                return Held(own, self._method, ground, self._watch)
         return Floating(own, None, self._watch)
 
     @property

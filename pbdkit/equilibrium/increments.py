@@ -48,14 +48,15 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     the watch says so: then the state is the last that had been reached.
     """
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
-    for field, every in (("leaders", scene.leading), ("obstacles", scene.barriers)):
-        for n, driven in enumerate(every):
-            if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
-                raise ExperimentError(
-                    "never comes to rest, so that there is no equilibrium; take solver: "
-                    "{type: stepping}, or a motion that ends",
-                    (field, n, "motion"),
-                )
+    for n, driven in enumerate(scene.driven):
+        if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
+            count = len(scene.leading)
+            field, n = ("leaders", n) if n < count else ("obstacles", n - count)
+            raise ExperimentError(
+                "never comes to rest, so that there is no equilibrium; take solver: "
+                "{type: stepping}, or a motion that ends",
+                (field, n, "motion"),
+            )
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture or not finder.linear:

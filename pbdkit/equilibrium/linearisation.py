@@ -30,8 +30,8 @@ def linearised(
     watch: Watch,
     moves: Moves | None = None,
 ) -> System:
-    """The system of a scene at a state with the roles of a moment's step, by one of the solver's methods;
-    `moves`, where known, serve it.
+    """The system of a scene at a state with the roles of a moment's step, by one of the solver's
+    methods; `moves`, where known, serve it.
 
     Raises ExperimentError where there is no unique solution.
     """

@@ -58,8 +58,8 @@ class Finder:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the rule is, and no obstacle stands in the way: it says so, or followers put elsewhere, at random and as far as the
-        load goes, move by what the linearisation at rest says."""
+        """Whether the rule is, and there is no obstacle: it says so, or followers put elsewhere, at
+        random and as far as the load goes, move by what the linearisation at rest says."""
         scene, steps = self.scene, self.scene.experiment.steps
         if scene.barriers:
             return False
@@ -98,9 +98,7 @@ class Finder:
 class _Search(ABC):
     _linear = False
 
-    def __init__(
-        self, finder: Finder, state: State, moment: float, at: State, what: str
-    ) -> None:
+    def __init__(self, finder: Finder, state: State, moment: float, at: State, what: str) -> None:
         self._finder, self._state, self._moment = finder, state, moment
         self._linearisations = self._inner = 0
         self._system = self._linearised(at, what)

@@ -51,7 +51,7 @@ def _shape(value: Any, info: ValidationInfo) -> Any:
         return Facing.model_validate(value)
     if isinstance(value, dict) and value.get("type") in NO_OBSTACLES:
         raise fault(NO_OBSTACLES[value["type"]], key="type")
-    return _bodies.func(value, info)  # type: ignore[call-arg, arg-type]
+    return _bodies.func(value, info)  # type: ignore[call-arg]
 
 
 AnyShape = Annotated[

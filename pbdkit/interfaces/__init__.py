@@ -1,7 +1,7 @@
 """What the author of a component reads: the six interfaces and the data they exchange."""
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, Variable
+from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, Moment, TouchingRows, Variable
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
@@ -49,5 +49,6 @@ __all__ = [
     "FrameMap", "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "Moment", "Nearness",
     "NeighbourMetric", "Offset", "Pair", "Particles", "Remembered", "Remembers", "RenewsBonds",
     "RenewsParticles", "Setting", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "StoresEnergy", "TouchingRows", "Variable", "Vector", "dot", "length", "squared_length",
+    "where",
 ]  # fmt: skip

@@ -88,8 +88,8 @@ def forecast(scene: Scene) -> Forecast:
 def _sizes(analysis: Analysis) -> Sizes:
     """Of a large equilibrium by what serves it."""
     scene = analysis.scene
-    count, grids = scene.raster.count, True
-    if count > LARGEST_DIRECT and not scene.experiment.solver.makes_steps:
+    count, grids = scene.raster.count, not scene.barriers
+    if grids and count > LARGEST_DIRECT and not scene.experiment.solver.makes_steps:
         grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
     return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
@@ -120,7 +120,10 @@ def _doubts(scene: Scene) -> list[str]:
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
             warnings.append(f"leaders.{n}: begins to lead after the run's last step")
-    if not scene.leading:
+    for n, barrier in enumerate(scene.barriers):
+        if barrier.group.from_ > scene.experiment.steps:
+            warnings.append(f"obstacles.{n}: begins after the run's last step")
+    if not scene.driven:
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():
         warnings.append(

@@ -39,7 +39,15 @@ class Measured:
     @cached_property
     def shows_leaders(self) -> bool:
         """Whether anything is measured of each leader group."""
-        return any("leader_group" in v.dims for d in self._diagnostics for v in d.variables())
+        return self._shows("leader_group")
+
+    @cached_property
+    def shows_obstacles(self) -> bool:
+        """Whether anything is measured of each obstacle."""
+        return self._shows("obstacle")
+
+    def _shows(self, dim: str) -> bool:
+        return any(dim in v.dims for d in self._diagnostics for v in d.variables())
 
     @cached_property
     def sizes(self) -> dict[str, int]:
@@ -50,6 +58,8 @@ class Measured:
             sizes |= {"bond": len(scene.bonds.ends), "end": 2}
         if self.shows_leaders:
             sizes["leader_group"] = len(scene.leading)
+        if self.shows_obstacles:
+            sizes["obstacle"] = len(scene.barriers)
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:

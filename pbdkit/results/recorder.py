@@ -70,6 +70,8 @@ class Recorder:
             yield {"bond": scene.bonds.ends, "shell": scene.bonds.shell}
         if self._measured.shows_leaders:
             yield {"leader_group": np.arange(len(scene.leading))}
+        if self._measured.shows_obstacles:
+            yield {"obstacle": np.arange(len(scene.barriers))}
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
@@ -138,6 +140,7 @@ def columns_of(scene: Scene) -> list[Column]:
         scene.has_fracture,
         measured.every_step,
         measured.shows_leaders,
+        measured.shows_obstacles,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
     columns = [*layout.base_columns(), *some, *measured.columns()]

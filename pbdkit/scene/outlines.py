@@ -45,8 +45,8 @@ class Outline:
                 if abs(along) == 1.0:
                     box[axis + (2 if along > 0.0 else 0)] = self.points[0, axis]
             return box
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
-        return np.concatenate([low - self.outer, high + self.outer])
+        low, high = self.points.min(axis=0) - self.outer, self.points.max(axis=0) + self.outer
+        return np.array([*low, *high])
 
     def facing(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """`facing` of some places."""

@@ -3,17 +3,24 @@ outline, without friction, as position-based dynamics does it after its step."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pbdkit.scene.obstacles import outlines_at
+from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.leader_groups import kinds_at
+from pbdkit.scene.obstacles import SLACK, outlines_at
 from pbdkit.scene.outlines import Outline
-from pbdkit.scene.places import Block, Mask
+from pbdkit.scene.places import Block, Mask, Places
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
+
+Touching = list[tuple[Indices, NDArray[np.float64]]]
+"""Of each obstacle some rows, and the normals there, (row, axis)."""
 
 
 class Contact:
@@ -25,7 +32,7 @@ class Contact:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._vectors = np.array(scene.raster.lattice.cell().vectors)
+        self._vectors: Floats = np.array(scene.raster.lattice.cell().vectors)
         self._inverse = np.linalg.inv(self._vectors)
 
     def push_out(self, u: Floats, moment: float) -> None:
@@ -37,7 +44,7 @@ class Contact:
                 if near is not None:
                     self._push_block(near, u, outline)
 
-    def touched_at_rest(self, moment: float) -> Iterator[tuple[np.ndarray, ...]]:
+    def touched_at_rest(self, moment: float) -> Iterator[tuple[NDArray[np.intp], ...]]:
         """The cells of particles that would be pushed where they rest, index by index."""
         still = np.zeros((2, *self._scene.raster.shape))
         for _, outline in outlines_at(self._scene.barriers, moment):
@@ -46,6 +53,25 @@ class Contact:
                 if near is not None:
                     inside, *_ = self._inside(near, still, outline)
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
+
+    def touching(self, state: State) -> Touching:
+        """The rows of the followers on each obstacle's outline, as the state has them, and the
+        normals there, (row, axis): within what rounding allows, and 1e-9 of a lattice constant."""
+        scene, raster = self._scene, self._scene.raster
+        rows = np.flatnonzero(kinds_at(raster, scene.leading, state.step) == FOLLOWER)
+        places = Places(raster.shape, raster.place_of(rows))
+        at = [np.asarray(a) for a in raster.reference_planes(places)]
+        reach = max(float(np.abs(a).max(initial=1.0)) for a in at)
+        digits = 16.0 * float(np.finfo(state.u.dtype).eps) * reach
+        u = state.u.reshape(2, -1)[:, places.place]
+        x, y = (a + b for a, b in zip(at, u, strict=True))
+        slack = SLACK * math.hypot(*self._vectors[0]) + digits
+        found: Touching = [(rows[:0], np.zeros((0, 2)))] * len(scene.barriers)
+        for n, outline in outlines_at(scene.barriers, state.step):
+            gap, nx, ny, _ = outline.facing(x, y)
+            on = np.abs(gap) <= slack
+            found[n] = rows[on], np.stack([nx[on], ny[on]], axis=1)
+        return found
 
     def _blocks(self) -> list[Block]:
         blocks = (self._scene.raster.body_block(s) for s in range(self._scene.raster.shape[0]))
@@ -79,7 +105,7 @@ class Contact:
     def _inside(
         self, block: Block, u: Floats, outline: Outline
     ) -> tuple[Mask, Floats, Floats, Floats]:
-        """Which of the body's particles in a block are inside, and of all the gap and the normal."""
+        """Which of the body's particles in a block are inside; the gap and the normal of all."""
         X, low = self._scene.raster.reference_planes(block), outline.box
         x, y = (a + b for a, b in zip(X, block.of(u), strict=True))
         near = (x >= low[0]) & (y >= low[1]) & (x <= low[2]) & (y <= low[3])

@@ -20,6 +20,7 @@ from pbdkit.interfaces import (
     LeaderRows,
     Particles,
     Remembered,
+    TouchingRows,
     Vector,
 )
 from pbdkit.results.moment import StateMoment
@@ -159,6 +160,8 @@ class Shown:
             return place[found]
         if name == "leader_groups":
             return tuple(LeaderRows(place[group.rows], group.leads) for group in found)
+        if name == "touching":
+            return tuple(TouchingRows(place[one.rows], one.normals) for one in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
 
