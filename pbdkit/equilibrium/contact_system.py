@@ -34,7 +34,11 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
-NOWHERE = "let a leader hold it, or take solver: {type: stepping}"
+WEAK = 1e-6
+"""The stiffness of springs to where particles are, as a share of that of their neighbours."""
+DIGITS = 16.0 * float(np.finfo(float).eps)
+"""Of a place: nearer to an outline than this, a particle lies on it."""
+REMEDY = "let a leader hold it, or take solver: {type: stepping}"
 
 
 class ContactSystem(System):
@@ -53,7 +57,7 @@ class ContactSystem(System):
         self._amplification = float(np.abs(free.diagonal()).max(initial=1.0))
         there = state.u + moves.free(state, moment)
         self.held, turned = _turned(scene, there, self._place, moment)
-        matrix = _contacting(free, turned, self.held)
+        self._matrix = matrix = _contacting(free, turned)
         led = operator.couplings_led.entries()
         held = np.repeat(self.held, scene.axes)
         held[led.rows[led.values != 0.0]] = True
@@ -101,9 +105,15 @@ class ContactSystem(System):
         """(unknown,) of planes."""
         return planes.reshape(len(planes), -1)[:, self._place].T.ravel()
 
+    def _planes(self, table: Floats) -> Floats:
+        """Planes of (unknown,)."""
+        planes = np.zeros(self._shape)
+        planes.reshape(len(planes), -1)[:, self._place] = table.reshape(-1, len(planes)).T
+        return planes
+
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
         """Part by part."""
-        r, planes = self._table(moves), np.zeros(self._shape)
+        r = self._table(moves)
         x = np.zeros_like(r)
         for some, part in self._parts:
             try:
@@ -111,11 +121,10 @@ class ContactSystem(System):
             except DriftingError:
                 raise ExperimentError(
                     f"there is no equilibrium: neither leaders nor obstacles hold a part of "
-                    f"{self._named(some)}, and it is pushed on for ever; {NOWHERE}",
+                    f"{self._named(some)}, and it is pushed on for ever; {REMEDY}",
                     ("obstacles",),
                 ) from None
-        planes.reshape(len(planes), -1)[:, self._place] = x.reshape(-1, len(planes)).T
-        return planes
+        return self._planes(x)
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """Nothing is linear where particles come to rest on obstacles."""
@@ -130,13 +139,39 @@ class ContactSystem(System):
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """Looks at each part by itself."""
         r = self._table(moves)
-        for some, part in self._parts:
-            if isinstance(part, Floating) and np.abs(r[some]).max(initial=0.0) > 8 * rounding:
-                raise ExperimentError(
-                    "there is no unique equilibrium: leaders and obstacles leave a part of "
-                    f"{self._named(some)} free to slide or turn; {NOWHERE}",
-                    ("obstacles",),
-                )
+        for some in self._floats:
+            if np.abs(r[some]).max(initial=0.0) > 8 * rounding:
+                raise self._not_unique(some)
+
+    def refuse_floats(self) -> None:
+        """Raises ExperimentError where anything floats."""
+        for some in self._floats:
+            raise self._not_unique(some)
+
+    def is_loose(self, moves: Floats, rounding: float) -> bool:
+        """Whether a part that nothing holds yet has moves left."""
+        r = self._table(moves)
+        return any(np.abs(r[some]).max(initial=0.0) > 8 * rounding for some in self._floats)
+
+    def solve_loose(self, moves: Floats, most: float) -> Floats:
+        """A correction, as far as `most`, where weak springs hold what nothing else does: it leads
+        to where obstacles may."""
+        matrix = self._matrix + WEAK * _one(self._matrix)
+        ground = Ground(2, self._X, self._led)
+        found = Held(matrix, "lu", ground, self._watch).solve(self._table(moves))
+        found *= min(1.0, most / np.abs(found).max())
+        return self._planes(found)
+
+    @property
+    def _floats(self) -> list[Indices]:
+        return [some for some, part in self._parts if isinstance(part, Floating)]
+
+    def _not_unique(self, some: Indices) -> ExperimentError:
+        return ExperimentError(
+            "there is no unique equilibrium: leaders and obstacles leave a part of "
+            f"{self._named(some)} free to slide or turn; {REMEDY}",
+            ("obstacles",),
+        )
 
     def is_stable(self) -> bool:
         """Part by part."""
@@ -150,14 +185,15 @@ class ContactSystem(System):
 def _turned(
     scene: Scene, u: Floats, place: Indices, moment: float
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Who of some followers is inside an obstacle at displacements u, (follower,), and T of each,
-    (follower, axis, axis), through one obstacle after the other."""
+    """Who of some followers is inside an obstacle at displacements u, (follower,), or on its
+    outline, and T of each, (follower, axis, axis), through one obstacle after the other."""
     X = scene.raster.reference_planes(Places(scene.raster.shape, place))
     at = np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
+    on = DIGITS * float(np.abs(at).max(initial=1.0))
     held, turned = np.zeros(len(place), bool), np.tile(np.eye(2), (len(place), 1, 1))
     for _, outline in outlines_at(scene.barriers, moment):
         gap, nx, ny, spread = outline.facing(*at)
-        inside, n = gap < 0.0, np.stack([nx, ny])
+        inside, n = gap <= on, np.stack([nx, ny])
         at = at - np.where(inside, gap * n, 0.0)
         along = spread[:, None, None] * (np.eye(2) - n.T[:, :, None] * n.T[:, None, :])
         turned = np.where(inside[:, None, None], along @ turned, turned)
@@ -165,14 +201,18 @@ def _turned(
     return held, turned
 
 
-def _contacting(free: Any, turned: Floats, held: NDArray[np.bool_]) -> Any:
+def _contacting(free: Any, turned: Floats) -> Any:
     """1 - T (1 - A)."""
-    from scipy.sparse import bsr_array, csr_array, eye_array
+    from scipy.sparse import bsr_array
 
-    count = len(turned)
-    rows = np.arange(count + 1)
-    T = bsr_array((turned, rows[:-1], rows), shape=free.shape).tocsr()
-    if isinstance(free, np.ndarray):
-        return np.eye(2 * count) - T @ (np.eye(2 * count) - free)
-    one = eye_array(2 * count, format="csr")
-    return csr_array(one - T @ (one - free))
+    rows = np.arange(len(turned) + 1)
+    T, one = bsr_array((turned, rows[:-1], rows), shape=free.shape).tocsr(), _one(free)
+    return one - T @ (one - free)
+
+
+def _one(like: Any) -> Any:
+    """The identity as a matrix of the same kind and size."""
+    from scipy.sparse import eye_array
+
+    size = like.shape[0]
+    return np.eye(size) if isinstance(like, np.ndarray) else eye_array(size, format="csr")

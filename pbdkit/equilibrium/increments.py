@@ -9,6 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, broken_bonds, scale_of, spacing_of
+from pbdkit.equilibrium.contact_search import follow_contact
 from pbdkit.equilibrium.load_path import moments
 from pbdkit.equilibrium.newton import Finder, UnconvergedError
 from pbdkit.errors import ExperimentError
@@ -161,7 +162,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         led, state.starts = prescribe(scene, state, target)
         place(state.u, led)
         try:
-            certificate = finder.follow(state, target, before)
+            certificate = _nearby(finder, state, target, before)
         except UnconvergedError as error:
             vars(state).update(vars(before))
             part /= 2.0
@@ -174,6 +175,12 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         if here >= moment:
             return certificate
         part = min(2.0 * part, moment - here)
+
+
+def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certificate:
+    if finder.scene.barriers:
+        return follow_contact(finder, state, moment)
+    return finder.follow(state, moment, before)
 
 
 def _stepped(
@@ -190,7 +197,7 @@ def _stepped(
             break
         found = state.copy()
         with suppress(UnconvergedError):
-            certificate = finder.follow(found, moment, found.copy())
+            certificate = _nearby(finder, found, moment, found.copy())
             vars(state).update(vars(found))
             return certificate
     raise UnconvergedError(

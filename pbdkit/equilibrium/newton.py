@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, UNKNOWN, Certificate
-from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
@@ -18,7 +17,7 @@ from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State, initial_state
 
-MOST_CORRECTIONS, MOST_LINEARISATIONS, MOST_SETS = 8, 12, 60
+MOST_CORRECTIONS, MOST_LINEARISATIONS = 8, 12
 CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
@@ -88,14 +87,14 @@ class Finder:
         so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
             try:
-                if self.scene.barriers:
-                    return _Contact(self, state, moment, state, "finding the contact").run()
                 return _Newton(self, state, moment, before).run()
             except IndefiniteError:
                 raise UnconvergedError(UNSTABLE, UNKNOWN) from None
 
 
-class _Search(ABC):
+class Search(ABC):
+    """Goes from a state, in place, to an equilibrium, with the roles of a moment's step."""
+
     _linear = False
 
     def __init__(self, finder: Finder, state: State, moment: float, at: State, what: str) -> None:
@@ -169,7 +168,7 @@ class _Search(ABC):
         return self._rounding() * math.sqrt(max(1, self._left.size))
 
 
-class _Linear(_Search):
+class _Linear(Search):
     """By one linearisation."""
 
     def __init__(self, finder: Finder, state: State, step: int) -> None:
@@ -200,7 +199,7 @@ class _Linear(_Search):
                 return
 
 
-class _Newton(_Search):
+class _Newton(Search):
     """By linearisations at each state it comes to, from an equilibrium nearby."""
 
     def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:
@@ -244,33 +243,6 @@ class _Newton(_Search):
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
-
-
-class _Contact(_Search):
-    """By linearisations at each state it comes to, with those held who would enter an obstacle,
-    until nobody else would."""
-
-    def run(self) -> Certificate:
-        """Raises UnconvergedError where who is held goes on changing, where corrections do not
-        become smaller once it stays, or where what they lead to is not stable."""
-        held, size = None, math.inf
-        for _ in range(MOST_SETS):
-            self._system.refuse_moving_floats(self._left, self._rounding())
-            far = self._distance()
-            if far <= self._finder.tolerance or not math.isfinite(far):
-                break
-            assert isinstance(self._system, ContactSystem)
-            same, held = held is not None and (held == self._system.held).all(), self._system.held
-            correction = self._system.solve(self._left, self._wanted)
-            before, size = size, float(np.abs(correction).max(initial=0.0))
-            if same and not size <= CONTRACTION * before:
-                break
-            self._shift(correction)
-            self._system = self._linearised(self._state, "finding the contact")
-        certificate = self._certified()
-        if not self._system.is_stable():
-            raise UnconvergedError(UNSTABLE, certificate)
-        return certificate
 
 
 def _size(moves: Floats) -> float:

@@ -61,6 +61,11 @@ ANALYSED = (
 )
 """What the analysis calls by the same names."""
 
+WITHOUT = (
+    "obstacles: stability and settling are told of the body without them, and whether they hold it "
+    "is not looked at",
+)
+
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
@@ -80,7 +85,7 @@ def forecast(scene: Scene) -> Forecast:
         period=swing.period if swing else None,
         decay=swing.decay if swing else None,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
-        warnings=[*_doubts(scene), *analysis.warnings(), *waves],
+        warnings=[*_doubts(scene), *WITHOUT[: len(scene.barriers)], *analysis.warnings(), *waves],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
 

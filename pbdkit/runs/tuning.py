@@ -60,7 +60,7 @@ def chosen_weights(scene: Scene) -> Weights:
         None if number == "auto" else number
         for number in (asked.asked_relaxation, asked.asked_memory)
     ]
-    plain = replace(_with(scene, Stepping()), barriers=())
+    plain = _with(scene.bare, Stepping())
     rest = initial_state(scene)
     rest.u[...] = 0.0
     try:

@@ -74,7 +74,7 @@ def outline_of(shape: AnyShape) -> Outline:
 
 
 def _counter_clockwise(vertices: Sequence[tuple[float, float]]) -> Floats:
-    points = np.array(vertices)
+    points: Floats = np.array(vertices)
     ways = np.roll(points, -1, axis=0) - points
     points = points[ways.any(axis=1)]
     x, y = (points - points.mean(axis=0)).T

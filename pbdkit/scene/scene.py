@@ -57,6 +57,11 @@ class Scene:
         """All that motions drive."""
         return (*self.leading, *self.barriers)
 
+    @cached_property
+    def bare(self) -> Scene:
+        """The same without obstacles."""
+        return replace(self, barriers=()) if self.barriers else self
+
     @property
     def has_fracture(self) -> bool:
         """Whether any bond can break."""
