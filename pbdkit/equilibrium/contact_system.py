@@ -2,7 +2,8 @@
 
 A step puts followers where y = u + move lies, and those who would enter an obstacle on its outline.
 With T = 1 for who is free and T = s (1 - n nᵀ) for who is held there (n the normal, s how a round
-outline spreads what moves along it; s = 1 before flat ones), its linearisation is
+outline spreads what moves along it; s = 1 before flat ones; times 1 - C n nᵀ / (n·C n) for who
+gives way more easily along some directions), its linearisation is
 
     Ã = 1 - T (1 - A),  A that of the body alone,
 
@@ -29,6 +30,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.results.progress import Watch
 from pbdkit.scene.obstacles import outlines_at
+from pbdkit.scene.outlines import slide
 from pbdkit.scene.places import Places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -56,7 +58,9 @@ class ContactSystem(System):
         free = one_minus(operator.couplings_both.entries().matrix())
         self._amplification = float(np.abs(free.diagonal()).max(initial=1.0))
         there = state.u + moves.free(state, moment)
-        self.held, turned = _turned(scene, there, self._place, moment)
+        assert moves.contact
+        gives = moves.contact.compliance
+        self.held, turned = _turned(scene, there, self._place, moment, gives)
         self._matrix = matrix = _contacting(free, turned)
         led = operator.couplings_led.entries()
         held = np.repeat(self.held, scene.axes)
@@ -183,7 +187,7 @@ class ContactSystem(System):
 
 
 def _turned(
-    scene: Scene, u: Floats, place: Indices, moment: float
+    scene: Scene, u: Floats, place: Indices, moment: float, gives: Floats | None
 ) -> tuple[NDArray[np.bool_], Floats]:
     """Who of some followers is inside an obstacle at displacements u, (follower,), or on its
     outline, and T of each, (follower, axis, axis), through one obstacle after the other."""
@@ -194,11 +198,23 @@ def _turned(
     for _, outline in outlines_at(scene.barriers, moment):
         gap, nx, ny, spread = outline.facing(*at)
         inside, n = gap <= on, np.stack([nx, ny])
+        if gives is not None:
+            own = gives.reshape(3, -1)[:, place]
+            turned = _along(inside, np.stack(slide(1.0, nx, ny, *own)), n, 1.0) @ turned
+            at = at - np.where(inside, np.stack(slide(gap, nx, ny, *own)), 0.0)
+            gap, nx, ny, spread = outline.facing(*at)
+            n = np.stack([nx, ny])
+        turned = _along(inside, n, n, spread[:, None, None]) @ turned
         at = at - np.where(inside, gap * n, 0.0)
-        along = spread[:, None, None] * (np.eye(2) - n.T[:, :, None] * n.T[:, None, :])
-        turned = np.where(inside[:, None, None], along @ turned, turned)
         held |= inside
     return held, turned
+
+
+def _along(inside: NDArray[np.bool_], way: Floats, n: Floats, spread: Any) -> Floats:
+    """(follower, axis, axis): spread · (1 - way nᵀ) for who is inside, 1 for others."""
+    turned = spread * (np.eye(2) - way.T[:, :, None] * n.T[:, None, :])
+    found: Floats = np.where(inside[:, None, None], turned, np.eye(2))
+    return found
 
 
 def _contacting(free: Any, turned: Floats) -> Any:

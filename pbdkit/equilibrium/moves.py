@@ -32,7 +32,7 @@ class Moves:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
-        self._contact = Contact(scene) if scene.barriers else None
+        self.contact = Contact(scene) if scene.barriers else None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
@@ -50,10 +50,10 @@ class Moves:
         """Planes, zero where nobody follows in the moment's step; who would enter an obstacle moves
         onto its outline. Brings the state's frame into line."""
         moves = self.free(state, moment)
-        if self._contact:
+        if self.contact:
             there = state.u + moves
             with np.errstate(all="ignore"):
-                self._contact.push_out(there, moment)
+                self.contact.push_out(there, moment)
                 np.subtract(there, state.u, out=moves)
             self._stop(moves, math.ceil(moment))
         return moves

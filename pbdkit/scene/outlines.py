@@ -95,6 +95,14 @@ def facing(
     return _before_polygon(x, y, points, first, last)
 
 
+def slide(gap: Any, nx: Any, ny: Any, xx: Any, xy: Any, yy: Any) -> Any:
+    """The way off an outline, up to a sign, gap · C n / (n·C n): that which a particle takes that
+    gives way as C says where it is pushed along n. Along n where C is a multiple of 1."""
+    sx, sy = xx * nx + xy * ny, xy * nx + yy * ny
+    over = sx * nx + sy * ny
+    return gap * sx / over, gap * sy / over
+
+
 def _before_half_plane(x: Any, y: Any, points: Any, first: Any) -> Any:
     px, py = points[first, 0], points[first, 1]
     nx, ny = points[first + 1, 0] - px, points[first + 1, 1] - py

@@ -1,5 +1,10 @@
-"""Keeps particles out of obstacles: whoever lies inside one is put on the nearest point of its
-outline, without friction, as position-based dynamics does it after its step."""
+"""Keeps particles out of obstacles: whoever lies inside one is put on its outline after the step,
+as position-based dynamics does it, without friction.
+
+That is the nearest point. Where the rule knows forces, and a particle gives way more easily along
+some directions than others, as at corners, it goes C n / (n·C n) times the gap first, the way on
+which a push along the normal n sends it: what is left of the forces at rest is then along n.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +18,11 @@ from numpy.typing import NDArray
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.obstacles import SLACK, outlines_at
-from pbdkit.scene.outlines import Outline
+from pbdkit.scene.outlines import Outline, slide
 from pbdkit.scene.places import Block, Mask, Places
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compliance import compliance
 from pbdkit.stepping.state import Floats, State
 
 Touching = list[tuple[Indices, NDArray[np.float64]]]
@@ -34,6 +40,7 @@ class Contact:
         self._scene = scene
         self._vectors: Floats = np.array(scene.raster.lattice.cell().vectors)
         self._inverse = np.linalg.inv(self._vectors)
+        self.compliance = compliance(scene)
 
     def push_out(self, u: Floats, moment: float) -> None:
         """Puts the body's particles, leaders too, out of the obstacles as they are at the end of a
@@ -98,9 +105,17 @@ class Contact:
         return Block(block.sublattice, tuple(first.tolist()), tuple(last.tolist()))
 
     def _push_block(self, block: Block, u: Floats, outline: Outline) -> None:
-        inside, gap, *normal = self._inside(block, u, outline)
+        inside, *facing = self._inside(block, u, outline)
+        gap, *normal = (value[inside] for value in facing)
+        if self.compliance is not None:
+            own = [c[inside] for c in block.of(self.compliance)]
+            for plane, way in zip(block.of(u), slide(gap, *normal, *own), strict=True):
+                plane[inside] = plane[inside] - way
+            X = np.broadcast_arrays(*self._scene.raster.reference_planes(block))
+            at = [a[inside] + plane[inside] for a, plane in zip(X, block.of(u), strict=True)]
+            gap, *normal, _ = outline.facing(*at)
         for plane, n in zip(block.of(u), normal, strict=True):
-            plane[inside] = plane[inside] - gap[inside] * n[inside]
+            plane[inside] = plane[inside] - gap * n
 
     def _inside(
         self, block: Block, u: Floats, outline: Outline

@@ -53,12 +53,14 @@ class CompiledStepper(Engine):
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
         self._last: State | None = None
-        self._contact = Contact(scene) if scene.barriers else None
+        self._contact = contact = Contact(scene) if scene.barriers else None
         levels = levels_of(scene)
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
         self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
+        if contact and contact.compliance is not None:
+            self._arrays["compliance"] = contact.compliance
         start = unmoved_state(scene, (1,) * scene.axes)
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)

@@ -56,7 +56,7 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
             if isinstance(part, kind):
                 found |= {f"{name}{number}": getattr(part, name) for name in names}
     if levels[-1].scene.barriers:
-        found["facing"] = outlines.facing
+        found |= {"facing": outlines.facing, "slide": outlines.slide}
     return found
 
 

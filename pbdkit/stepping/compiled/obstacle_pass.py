@@ -33,6 +33,7 @@ def wall_arrays(scene: Scene, step: int) -> Arrays:
 def write_obstacle_pass(plan: Plan) -> Function:
     """The function that pushes the particles of some rows out of every obstacle, one after the
     other."""
+    has_compliance = "compliance" in plan.shared
     out = Function(plan.shared, "push_out", "first_row", "last_row")
     out.add(0, "j0, j1 = max(0, box[2]), min(kind.shape[2], box[3])", "width = j1 - j0")
     out.add(0, "for s in range(kind.shape[0]):", "    for i in range(first_row, last_row):")
@@ -53,6 +54,11 @@ def write_obstacle_pass(plan: Plan) -> Function:
     given = "wall_first[w], wall_first[w + 1], wall_radii[w, 0], wall_radii[w, 1]"
     out.add(4, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], wall_points, {given})")
     out.add(4, "if gap < 0.0:")
+    if has_compliance:
+        own = ", ".join(f"compliance[{n}, s, i, j0 + j]" for n in range(3))
+        out.add(5, f"sx, sy = slide(gap, nx, ny, {own})")
+        out.add(5, *plan.each("o@[j] = o@[j] - s@"), *plan.each("p@ = A@ + o@[j]"))
+        out.add(5, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], wall_points, {given})")
     out.add(5, *plan.each("o@[j] = o@[j] - gap * n@"), *plan.each("p@ = A@ + o@[j]"))
     return out
 
