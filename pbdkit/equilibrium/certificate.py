@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.system import System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
@@ -170,9 +170,11 @@ class Foresight:
         if correction is not None:
             ahead += correction
             left = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
-            bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
+            bound = known.distance(left, self._moves.rounding(ahead)) * (
+                FIRST_ORDER if anew else 1.0
+            )
             distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
-            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding(ahead)
+            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + self._moves.rounding(ahead)
             if anew and not np.abs(left).max(initial=0.0) <= most:
                 distance, obstacle = math.inf, BENT
         distance = math.inf if math.isnan(distance) else distance
@@ -196,7 +198,7 @@ class Foresight:
         """None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:
-                known.refuse_moving_floats(moves, rounding(here.u))
+                known.refuse_moving_floats(moves, self._moves.rounding(here.u))
             return known.solve(moves, ACCURACY * self._scale, here), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"

@@ -58,6 +58,12 @@ class Moves:
             self._stop(moves, math.ceil(moment))
         return moves
 
+    def rounding(self, u: Floats) -> float:
+        """How far rounding alone may put a move off at displacements u: before obstacles, where
+        places count, by what it leaves of those."""
+        reach = self.contact.reach if self.contact else 0.0
+        return ROUNDING * max(float(np.abs(u).max()), reach)
+
     def free(self, state: State, moment: float) -> Floats:
         """The same without obstacles."""
         step = math.ceil(moment)
@@ -92,11 +98,6 @@ def _resting(scene: Scene) -> tuple[Leading, ...]:
     groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
     pairs = zip(scene.leading, groups, strict=True)
     return tuple(replace(leading, group=group) for leading, group in pairs)
-
-
-def rounding(u: Floats) -> float:
-    """How far rounding alone may put a move off at displacements u."""
-    return ROUNDING * float(np.abs(u).max())
 
 
 def random_displacements(scene: Scene, size: float) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, UNKNOWN, Certificate
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -162,7 +162,7 @@ class Search(ABC):
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
-        return self._system.amplification * rounding(self._state.u)
+        return self._system.amplification * self._finder.moves.rounding(self._state.u)
 
     def _floor(self) -> float:
         return self._rounding() * math.sqrt(max(1, self._left.size))

@@ -41,6 +41,9 @@ class Contact:
         self._vectors: Floats = np.array(scene.raster.lattice.cell().vectors)
         self._inverse = np.linalg.inv(self._vectors)
         self.compliance = compliance(scene)
+        ends = [end for block in self._blocks() for end in self._ends(block)]
+        self.reach = float(np.abs(ends).max())
+        """How far any particle rests from the lattice's site (0, 0), along an axis."""
 
     def push_out(self, u: Floats, moment: float) -> None:
         """Puts the body's particles, leaders too, out of the obstacles as they are at the end of a
@@ -68,8 +71,7 @@ class Contact:
         rows = np.flatnonzero(kinds_at(raster, scene.leading, state.step) == FOLLOWER)
         places = Places(raster.shape, raster.place_of(rows))
         at = [np.asarray(a) for a in raster.reference_planes(places)]
-        reach = max(float(np.abs(a).max(initial=1.0)) for a in at)
-        digits = 16.0 * float(np.finfo(state.u.dtype).eps) * reach
+        digits = 16.0 * float(np.finfo(state.u.dtype).eps) * self.reach
         u = state.u.reshape(2, -1)[:, places.place]
         x, y = (a + b for a, b in zip(at, u, strict=True))
         slack = SLACK * math.hypot(*self._vectors[0]) + digits
