@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -40,10 +41,14 @@ class Contact:
         self._scene = scene
         self._vectors: Floats = np.array(scene.raster.lattice.cell().vectors)
         self._inverse = np.linalg.inv(self._vectors)
-        self.compliance = compliance(scene)
         ends = [end for block in self._blocks() for end in self._ends(block)]
         self.reach = float(np.abs(ends).max())
         """How far any particle rests from the lattice's site (0, 0), along an axis."""
+
+    @cached_property
+    def compliance(self) -> Floats | None:
+        """How particles give way along different directions."""
+        return compliance(self._scene)
 
     def push_out(self, u: Floats, moment: float) -> None:
         """Puts the body's particles, leaders too, out of the obstacles as they are at the end of a
