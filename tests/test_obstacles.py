@@ -217,8 +217,8 @@ def test_the_equilibrium_is_where_steps_lead(shape: str) -> None:
 def test_rules_that_are_not_linear_come_to_rest_on_obstacles() -> None:
     springs = {"rule": {"type": "springs"}, "body": {"type": "grid", "columns": 9, "rows": 9}}
     straight = run(pressed("wedge", 0.4, **springs, solver={"type": "equilibrium"}))
-    stepping = {"solver": {"type": "stepping", "memory": 0.75}, "record": {"at": [0]}}
-    stepped = run(pressed("wedge", 0.4, **springs, **stepping, steps=400))
+    stepping = {"solver": {"type": "stepping", "memory": 0.8}, "record": {"at": [0]}}
+    stepped = run(pressed("wedge", 0.4, **springs, **stepping, steps=1000))
     assert straight.status == "complete"
     far = np.abs(straight.position[-1].values - stepped.position[-1].values).max()
     assert far <= 1e-6

@@ -28,6 +28,12 @@ Call = Callable[..., Any]
 OUT = Path("tensile.nc")
 EVERYTHING = [{"type": "pe1"}, {"type": "displacement"}, {"type": "track", "numbers": [13]}]
 FRACTURE = {"type": "threshold", "thresholds": [1.6]}
+COMES = [
+    {
+        "shape": {"type": "disc", "radius": 3.0, "centre": [4.5, 14.0]},
+        "motion": {"type": "velocity", "velocity": [0.0, -0.2], "steps": 12},
+    }
+]
 RUNS: dict[str, dict[str, Any]] = {
     "plain": {},
     "everything": {"diagnostics": EVERYTHING},
@@ -39,7 +45,9 @@ RUNS: dict[str, dict[str, Any]] = {
     "auto": {"solver": {"type": "stepping", "relaxation": "auto", "memory": "auto"}},
     "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
     "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
+    "obstacles": {"obstacles": COMES},
     "equilibrium": {"solver": {"type": "equilibrium"}},
+    "equilibrium, obstacles": {"solver": {"type": "equilibrium"}, "obstacles": COMES},
     "equilibrium, fracture": {
         "solver": {"type": "equilibrium", "increments": 20},
         "fracture": FRACTURE,
