@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -48,6 +49,11 @@ PULLED = [
     {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [0.3, 0.1]}},
 ]
 """The leaders of the scenes that diagnostics measure."""
+PRESSING = {
+    "shape": {"half_plane": {"point": [0.0, -0.1], "normal": [0.0, 1.0]}},
+    "motion": {"type": "displace", "displacement": [0.0, 0.3]},
+}
+"""The obstacle of the scenes that diagnostics of obstacles measure."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
@@ -64,6 +70,9 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
     if field == "diagnostics":
         given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
+        with suppress(Exception):  # what fails is asked about directly, and named there
+            if any("obstacle" in v.dims for v in component.variables()):  # type: ignore[attr-defined]
+                given |= {"obstacles": [PRESSING]}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
     choices = {
         "lattice": list(LATTICES.values()),
