@@ -9,7 +9,8 @@ import pytest
 
 import pbdkit
 from pbdkit.interfaces import length
-from pbdkit.scene.scene import build_scene, setting_of
+from pbdkit.scene.scene import build_scene
+from pbdkit.scene.setting import setting_of
 
 sys.path.append(str(Path(__file__).parent / "reliability"))
 

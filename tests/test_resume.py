@@ -35,6 +35,12 @@ LOADED: dict[str, Any] = {
     "loads": [{"select": {"edge": "top"}, "force": [0.0, 0.02], "from": 3, "until": 6}],
     "diagnostics": [{"type": "load-displacement", "youngs_modulus": 1.0}],
 }
+COMES = [
+    {
+        "shape": {"type": "disc", "radius": 3.0, "centre": [4.5, 14.0]},
+        "motion": {"type": "velocity", "velocity": [0.0, -0.2], "steps": 12},
+    }
+]
 RUNS: dict[str, dict[str, Any]] = {
     "plain": {},
     "everything": {"diagnostics": EVERYTHING},
@@ -46,9 +52,11 @@ RUNS: dict[str, dict[str, Any]] = {
     "auto": {"solver": {"type": "stepping", "relaxation": "auto", "memory": "auto"}},
     "settles": {"solver": {"type": "stepping", "settle": {"tolerance": 1e-2}}, "steps": 3000},
     "diverges": {"solver": {"type": "stepping", "relaxation": 9.0}, "steps": 900},
+    "obstacles": {"obstacles": COMES},
     "equilibrium": {"solver": {"type": "equilibrium"}},
     "loads": LOADED,
     "equilibrium, loads": LOADED | {"solver": {"type": "equilibrium"}},
+    "equilibrium, obstacles": {"solver": {"type": "equilibrium"}, "obstacles": COMES},
     "equilibrium, fracture": {
         "solver": {"type": "equilibrium", "increments": 20},
         "fracture": FRACTURE,

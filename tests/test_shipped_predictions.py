@@ -20,6 +20,8 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
+BARE = [n for n in shipped_names() if not pbdkit.load(n).obstacles]
+"""Of obstacles `check` says nothing."""
 TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
 STEPPED = "solver={type: stepping, relaxation: 0.2}"
 SWINGING = "solver={type: stepping, memory: 0.9}"
@@ -66,7 +68,7 @@ def shaken(scene, state):
     return state
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", BARE)
 def test_runs_settle_in_the_steps_that_check_says(call, name):
     """With bonds that hold: torn bodies have another operator, see below."""
     whole = ["fracture={type: none}"] if name in TORN else []

@@ -19,6 +19,7 @@ COMPONENTS = {
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
     "fields": "Strain Rotation Stress",
     "forces": "StrainEnergy Reaction LoadDisplacement StressStrain",
+    "contact_forces": "Contact",
 }
 """By module of this folder the classes that it offers."""
 

@@ -92,8 +92,8 @@ class LoadDisplacement(Diagnostic):
     """
 
     type: Literal["load-displacement"] = "load-displacement"
-    youngs_modulus: Modulus
-    thickness: Thickness = 1.0
+    youngs_modulus: Modulus = Field(default_factory=unset)
+    thickness: Thickness = Field(default_factory=unset)
 
     needs: ClassVar[frozenset[Need]] = frozenset({"loads"})
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.system import StuckError, System, one_thread, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
@@ -86,7 +86,7 @@ class UnconvergedError(Exception):
 def scale_of(scene: Scene, start: State) -> float:
     """The largest prescribed displacement: of the leaders, or of the start; where nothing is
     prescribed but rest the largest that loads make, and without any the lattice's spacing."""
-    ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
+    ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = max([float(abs(start.u).max()), *ways])
     return prescribed or _way_under_loads(scene, start) or spacing_of(scene)
 
@@ -173,7 +173,8 @@ class Foresight:
         broken = broken_bonds(state)
         if self._at_rest is None or broken != self._broken:
             self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
-            self._linear = self._is_linear(here, self._at_rest)
+            bare = not self._scene.barriers
+            self._linear = bare and self._is_linear(here, self._at_rest)
         if self._linear:
             return self._outlook(here, self._at_rest)
         known = self._linearised(here, u)
@@ -194,9 +195,11 @@ class Foresight:
         if correction is not None:
             ahead += correction
             left = self._moves.at(replace(here, u=ahead), self._scene.experiment.steps)
-            bound = known.distance(left, rounding(ahead)) * (FIRST_ORDER if anew else 1.0)
+            bound = known.distance(left, self._moves.rounding(ahead)) * (
+                FIRST_ORDER if anew else 1.0
+            )
             distance = float(np.sqrt((correction**2).sum(axis=0)).max(initial=0.0)) + bound
-            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + rounding(ahead)
+            most = CONTRACTION * float(np.abs(moves).max(initial=0.0)) + self._moves.rounding(ahead)
             if anew and not np.abs(left).max(initial=0.0) <= most:
                 distance, obstacle = math.inf, BENT
         distance = math.inf if math.isnan(distance) else distance
@@ -220,7 +223,7 @@ class Foresight:
         """None, and why, where there is no equilibrium, or none that is known."""
         try:
             if anew:
-                known.refuse_moving_floats(moves, rounding(here.u))
+                known.refuse_moving_floats(moves, self._moves.rounding(here.u))
             return known.solve(moves, ACCURACY * self._scale, here), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"

@@ -9,8 +9,14 @@ from contextlib import suppress
 import numpy as np
 
 from pbdkit.equilibrium.breaking.choice import settler_of
-from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, broken_bonds, scale_of
-from pbdkit.equilibrium.load_path import moments
+from pbdkit.equilibrium.certificate import (
+    Certificate,
+    UnconvergedError,
+    broken_bonds,
+    scale_of,
+)
+from pbdkit.equilibrium.contact_search import follow_contact
+from pbdkit.equilibrium.load_path import last_change, moments, spacings
 from pbdkit.equilibrium.newton import Finder
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
@@ -49,19 +55,21 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     the watch says so: then the state is the last that had been reached.
     """
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
-    for n, leading in enumerate(scene.leading):
-        if leading.group.leads(steps) and leading.group.motion.rests_after() is None:
+    for n, driven in enumerate(scene.driven):
+        if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
+            count = len(scene.leading)
+            field, n = ("leaders", n) if n < count else ("obstacles", n - count)
             raise ExperimentError(
                 "never comes to rest, so that there is no equilibrium; take solver: "
                 "{type: stepping}, or a motion that ends",
-                ("leaders", n, "motion"),
+                (field, n, "motion"),
             )
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
     finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture or not finder.linear:
-        count = asked.increments if scene.experiment.fracture.can_break else 1
+        count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))
-    if (last := _last_change(scene)) > state.step:
+    if (last := last_change(scene)) > state.step:
         yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
     return _settle_at(scene, state, finder, steps)
 
@@ -177,7 +185,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         led, state.starts = prescribe(scene, state, target)
         place(state.u, led)
         try:
-            certificate = finder.follow(state, target, before)
+            certificate = _nearby(finder, state, target, before)
         except UnconvergedError as error:
             vars(state).update(vars(before))
             part /= 2.0
@@ -190,6 +198,12 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         if here >= moment:
             return certificate
         part = min(2.0 * part, moment - here)
+
+
+def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certificate:
+    if finder.scene.barriers:
+        return follow_contact(finder, state, moment)
+    return finder.follow(state, moment, before)
 
 
 def _stepped(
@@ -206,7 +220,7 @@ def _stepped(
             break
         found = state.copy()
         with suppress(UnconvergedError):
-            certificate = finder.follow(found, moment, found.copy())
+            certificate = _nearby(finder, found, moment, found.copy())
             vars(state).update(vars(found))
             return certificate
     raise UnconvergedError(
@@ -231,13 +245,3 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     for old, new in pairs:
         new[...] = old
     return False
-
-
-def _last_change(scene: Scene) -> int:
-    """The last step before roles or loads change within the run; 0 where they never do."""
-    steps, changes = scene.experiment.steps, [0]
-    changes += [step - 1 for step in scene.loads.changes(steps)] if scene.loads else []
-    for leading in scene.leading:
-        first, last = leading.group.from_, leading.group.last(steps)
-        changes += [step for step in (first - 1, last) if 0 <= step < steps]
-    return max(changes)

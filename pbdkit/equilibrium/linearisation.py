@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TypeVar
 
+from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
@@ -20,16 +22,19 @@ T = TypeVar("T")
 def linearised(
     scene: Scene,
     state: State,
-    step: int,
+    moment: float,
     method: str,
     watch: Watch,
     moves: Moves | None = None,
 ) -> System:
-    """The system of a scene at a state with the roles of a step, by one of the solver's methods;
-    `moves`, where known, serve it.
+    """The system of a scene at a state with the roles of a moment's step, by one of the solver's
+    methods; `moves`, where known, serve it.
 
     Raises ExperimentError where there is no unique solution.
     """
+    if scene.barriers:
+        return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
+    step = math.ceil(moment)
 
     def by_matrix() -> System:
         return MatrixSystem(scene, state, method, watch, step)

@@ -7,7 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.guard import way_of
 from pbdkit.stepping.prescription import last_event
 
 SAMPLES = 16
@@ -22,7 +24,7 @@ def events(scene: Scene) -> list[int]:
     found = {0, last, *(cut.at - 1 for cut in scene.experiment.cuts)}
     for change in scene.loads.changes(steps) if scene.loads else ():
         found |= {change - 1, change}
-    for leading in scene.leading:
+    for leading in scene.driven:
         group = leading.group
         end = group.last(steps)
         knots = (group.from_ - 1 + n for n in group.motion.knots())
@@ -58,7 +60,7 @@ def _in_parts(count: int, ways: list[float]) -> list[float]:
 def _way(scene: Scene, begin: int, end: int) -> float:
     """How far the leader that goes farthest goes between two events."""
     most = 0.0
-    for leading in scene.leading:
+    for leading in scene.driven:
         group = leading.group
         if not (group.from_ - 1 <= begin and group.leads(end)):
             continue
@@ -67,3 +69,19 @@ def _way(scene: Scene, begin: int, end: int) -> float:
         ways = sum(np.hypot.reduce(abs(b - a), axis=1) for a, b in pairwise(at))
         most = max(most, float(np.max(ways)))
     return most if math.isfinite(most) else 0.0
+
+
+def spacings(scene: Scene) -> int:
+    """By how many lattice spacings the obstacle that goes farthest goes, at least 1."""
+    ways = [way_of(barrier, scene.experiment.steps) for barrier in scene.barriers]
+    return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
+
+
+def last_change(scene: Scene) -> int:
+    """The last step before roles or loads change within the run; 0 where they never do."""
+    steps, changes = scene.experiment.steps, [0]
+    changes += [step - 1 for step in scene.loads.changes(steps)] if scene.loads else []
+    for leading in scene.leading:
+        first, last = leading.group.from_, leading.group.last(steps)
+        changes += [step for step in (first - 1, last) if 0 <= step < steps]
+    return max(changes)

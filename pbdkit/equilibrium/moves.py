@@ -14,6 +14,7 @@ from pbdkit.scene.leader_groups import Leading, kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, make_engine, obstacle
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.numpy_engine import Engine
@@ -26,19 +27,21 @@ ROUNDING = 4 * float(np.finfo(float).eps)
 
 class Moves:
     """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
-    frame standing where the body tells it to."""
+    frame standing where the body tells it to, and obstacles where they are at a moment."""
 
     def __init__(self, scene: Scene) -> None:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
         self._guidance = Guidance(scene)
+        self.contact = Contact(scene) if scene.barriers else None
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         self._loads = replace(scene.loads) if scene.loads else None
         stepped = replace(scene, loads=self._loads)
         if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            stepped = replace(stepped, experiment=experiment, leading=_resting(scene))
+            free = replace(stepped, barriers=())
+            stepped = replace(free, experiment=experiment, leading=_resting(scene))
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)
         self._followers = None if self._engine else SlotFollowers(stepped, stepping)
@@ -49,8 +52,26 @@ class Moves:
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
-        """Planes, zero where nobody follows in the step of a moment, or along that axis, under
-        the loads of that moment; brings the state's frame into line."""
+        """Planes, zero where nobody follows in the moment's step, or along that axis, under the
+        loads of that moment; who would enter an obstacle moves onto its outline. Brings the state's
+        frame into line."""
+        moves = self.free(state, moment)
+        if self.contact:
+            there = state.u + moves
+            with np.errstate(all="ignore"):
+                self.contact.push_out(there, moment)
+                np.subtract(there, state.u, out=moves)
+            self._stop(moves, math.ceil(moment))
+        return moves
+
+    def rounding(self, u: Floats) -> float:
+        """How far rounding alone may put a move off at displacements u: before obstacles, where
+        places count, by what it leaves of those."""
+        reach = self.contact.reach if self.contact else 0.0
+        return ROUNDING * max(float(np.abs(u).max()), reach)
+
+    def free(self, state: State, moment: float) -> Floats:
+        """The same without obstacles."""
         u, frame, step = state.u, self._scene.frame, math.ceil(moment)
         if self._loads:
             self._loads.held_at = moment
@@ -69,13 +90,17 @@ class Moves:
                 self._guidance.correct(moves, u, step)
         with np.errstate(all="ignore"):
             moves -= u
-        still = moves.reshape(len(u), -1)
+        self._stop(moves, step)
+        return moves
+
+    def _stop(self, moves: Floats, step: int) -> None:
+        """Only followers move."""
+        still, frame = moves.reshape(len(moves), -1), self._scene.frame
         for led in self._scene.leading:
             for axis in led.axes if led.group.leads(step) else ():
                 still[axis, led.place] = 0.0
         if frame:
             still[:, frame.place] = 0.0
-        return moves
 
 
 def _resting(scene: Scene) -> tuple[Leading, ...]:
@@ -83,11 +108,6 @@ def _resting(scene: Scene) -> tuple[Leading, ...]:
     groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
     pairs = zip(scene.leading, groups, strict=True)
     return tuple(replace(leading, group=group) for leading, group in pairs)
-
-
-def rounding(u: Floats) -> float:
-    """How far rounding alone may put a move off at displacements u."""
-    return ROUNDING * float(np.abs(u).max())
 
 
 def random_displacements(scene: Scene, size: float) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, UnconvergedError
 from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements, rounding
+from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -51,9 +51,11 @@ class Finder:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the rule is: it says so, or followers put elsewhere, at random and as far as the
-        load goes, move by what the linearisation at rest says."""
+        """Whether the rule is, and there is no obstacle: it says so, or followers put elsewhere, at
+        random and as far as the load goes, move by what the linearisation at rest says."""
         scene, steps = self.scene, self.scene.experiment.steps
+        if scene.barriers:
+            return False
         if scene.experiment.rule.linear:
             return True
         with one_thread():
@@ -85,7 +87,9 @@ class Finder:
                 raise UnconvergedError(UNSTABLE) from None
 
 
-class _Search(ABC):
+class Search(ABC):
+    """Goes from a state, in place, to an equilibrium, with the roles of a moment's step."""
+
     _linear = False
 
     def __init__(self, finder: Finder, state: State, moment: float, at: State, what: str) -> None:
@@ -131,8 +135,7 @@ class _Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        how = math.ceil(self._moment), finder.method, finder.watch, finder.moves
-        return linearised(finder.scene, at, *how)
+        return linearised(finder.scene, at, self._moment, finder.method, finder.watch, finder.moves)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
@@ -154,13 +157,13 @@ class _Search(ABC):
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
-        return self._system.amplification * rounding(self._state.u)
+        return self._system.amplification * self._finder.moves.rounding(self._state.u)
 
     def _floor(self) -> float:
         return self._rounding() * math.sqrt(max(1, self._left.size))
 
 
-class _Linear(_Search):
+class _Linear(Search):
     """By one linearisation."""
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -191,7 +194,7 @@ class _Linear(_Search):
                 return
 
 
-class _Newton(_Search):
+class _Newton(Search):
     """By linearisations at each state it comes to, from an equilibrium nearby."""
 
     def __init__(self, finder: Finder, state: State, moment: float, before: State) -> None:

@@ -117,7 +117,7 @@ class Settling:
     def __init__(self, scene: Scene, settle: Settle, start: State, watch: Watch) -> None:
         self._scale = scale_of(scene, start)
         self._tolerance = settle.tolerance * self._scale
-        steps, leading = scene.experiment.steps, scene.leading
+        steps, leading = scene.experiment.steps, scene.driven
         ends = not any(is_cut_short(group, steps) for group in leading)
         first = max(last_event(scene), start.step + 1) if ends else NEVER
         self.pace = Pace(first, self._tolerance, first - 1)

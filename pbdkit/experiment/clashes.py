@@ -29,6 +29,7 @@ def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
     anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
     remembers = isinstance(asked.rule, RenewsParticles)
     softens = isinstance(asked.fracture, Softens)
+    guided = any(group.axes is not None for group in asked.leaders)
     late = max((cut.at for cut in asked.cuts), default=0)
     masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
     knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
@@ -59,6 +60,9 @@ def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
         ("rule", masses and not isinstance(asked.rule, Calibrated),
          f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none; "
          "take a calibrated rule: elastic, springs"),
+        ("obstacles", bool(asked.obstacles) and (jumps or settles) and guided,
+         "with leaders along one axis the equilibrium before obstacles is not known; take solver: "
+         "{type: stepping} without settle, or lead along both axes"),
         ("loads", bool(asked.loads) and not knows_forces,
          f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
          "particle goes, and of no material how far a force would move it; take a calibrated "

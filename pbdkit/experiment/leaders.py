@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     ConfigDict,
@@ -54,7 +54,29 @@ class Selection(Strict):
         return self._given()
 
 
-class LeaderGroup(Strict):
+class Driven(Strict):
+    """Common to what a motion drives from step `from` to step `until`, both included."""
+
+    motion: AnyMotion
+    from_: Annotated[int, Field(ge=1, alias="from")] = 1
+    until: Annotated[int, Field(ge=1)] | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.until is not None and self.until < self.from_:
+            raise ValueError(f"until ({self.until}) is before from ({self.from_})")
+        return self
+
+    def leads(self, step: int) -> bool:
+        """Whether it is driven during that step."""
+        return self.from_ <= step and (self.until is None or step <= self.until)
+
+    def last(self, steps: int) -> int:
+        """The last step of a run of `steps` in which it is driven."""
+        return steps if self.until is None else min(self.until, steps)
+
+
+class LeaderGroup(Driven):
     """Particles that lead from step `from` to step `until`, both included, and follow otherwise.
 
     The motion counts its steps from `from` and starts where the particle then is. With `axes` the
@@ -63,16 +85,11 @@ class LeaderGroup(Strict):
     """
 
     select: Selection
-    motion: AnyMotion
-    from_: Annotated[int, Field(ge=1, alias="from")] = 1
-    until: Annotated[int, Field(ge=1)] | None = None
     axes: Axes | None = None
     clamped: bool = False
 
     @model_validator(mode="after")
-    def _in_order(self) -> LeaderGroup:
-        if self.until is not None and self.until < self.from_:
-            raise ValueError(f"until ({self.until}) is before from ({self.from_})")
+    def _axes_once(self) -> Self:
         if self.axes and len({*self.axes}) < len(self.axes):
             raise ValueError(f"axes name one twice: {', '.join(self.axes)}")
         return self
@@ -84,11 +101,3 @@ class LeaderGroup(Strict):
         if self.axes is None:
             del found["axes"]
         return found
-
-    def leads(self, step: int) -> bool:
-        """Whether the group leads during that step."""
-        return self.from_ <= step and (self.until is None or step <= self.until)
-
-    def last(self, steps: int) -> int:
-        """The last step of a run of `steps` in which the group leads."""
-        return steps if self.until is None else min(self.until, steps)

@@ -26,6 +26,7 @@ from pbdkit.experiment.initial import AnyInitial
 from pbdkit.experiment.leaders import LeaderGroup
 from pbdkit.experiment.loads import Load
 from pbdkit.experiment.names import Name, RegionName, Version
+from pbdkit.experiment.obstacles import Obstacle
 from pbdkit.experiment.parts import fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.sampling import sampled
@@ -80,6 +81,7 @@ class Experiment(Strict):
     initial: AnyInitial = _default("reference")
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
     loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()

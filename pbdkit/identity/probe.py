@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pbdkit.analysis.stencil import NOWHERE, Stencil, linearised, move
 from pbdkit.interfaces import Here, Slot
 from pbdkit.interfaces.vector import vector
-from pbdkit.scene.scene import Scene, body_box
+from pbdkit.scene.scene import Scene
+from pbdkit.scene.setting import body_box
 
 Floats = NDArray[np.float64]
 Slots = tuple[Slot, ...]

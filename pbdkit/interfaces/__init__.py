@@ -1,7 +1,14 @@
 """What the author of a component reads: the six interfaces and the data they exchange."""
 
 from pbdkit.interfaces.component import Component, Pair
-from pbdkit.interfaces.diagnostic import Diagnostic, LeaderRows, LoadRows, Moment, Variable
+from pbdkit.interfaces.diagnostic import (
+    Diagnostic,
+    LeaderRows,
+    LoadRows,
+    Moment,
+    TouchingRows,
+    Variable,
+)
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
     FractureModel,
@@ -58,6 +65,6 @@ __all__ = [
     "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles",
     "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles", "Setting",
     "SharesParticles", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "TurnsParticles", "Variable", "Vector", "dot",
-    "length", "squared_length", "where",
+    "StoresEnergy", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
+    "squared_length", "where",
 ]  # fmt: skip

@@ -61,6 +61,14 @@ class LoadRows(NamedTuple):
     force: Floats
 
 
+class TouchingRows(NamedTuple):
+    """The rows of the followers that touch an obstacle, and the normals there, which point out of
+    it, (row, axis)."""
+
+    rows: NDArray[np.intp]
+    normals: NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class BondHistory(Bonds):
     """The table of bonds and when they broke, (bond,): `broken_step`, -1 where one has not, 0 at a
@@ -181,6 +189,10 @@ class Moment(ABC):
         """The loads in the order of the experiment; none acts yet at time 0."""
 
     @abstractmethod
+    def touching(self) -> tuple[TouchingRows, ...]:
+        """Who touches each obstacle, in their order; nobody while one is not there."""
+
+    @abstractmethod
     def broken_bonds(self) -> int:
         """How many bonds have broken so far."""
 
@@ -225,7 +237,8 @@ class Diagnostic(Component):
 
     def check(self, particles: int, leader_groups: int) -> None:
         """Raise ExperimentError where it does not go with a scene of so many particles and leader
-        groups. A variable can have a dimension `leader_group`, an entry a group."""
+        groups. A variable can have a dimension `leader_group`, an entry a group, or
+        `obstacle`."""
         return
 
     @abstractmethod

@@ -46,15 +46,15 @@ class Analysis:
     @property
     def exact(self) -> bool:
         """Whether the numbers hold for the whole run, and not near its start alone: the rule
-        declares itself linear, and neither bonds nor neighbours change."""
+        declares itself linear, and neither bonds nor neighbours nor contacts change."""
         experiment = self.scene.experiment
         lasting = not self.scene.has_fracture and experiment.neighbours.nearness() is None
-        return experiment.rule.linear and lasting
+        return experiment.rule.linear and lasting and not self.scene.barriers
 
     @cached_property
     def spectra(self) -> Spectra:
         """Where the eigenvalues come from."""
-        return Spectra(self.scene)
+        return Spectra(self.scene.bare)
 
     @property
     def operator(self) -> StepOperator:
@@ -173,7 +173,7 @@ class Analysis:
         state = initial_state(self.scene)
 
         def system_at(step: int) -> System:
-            return linearised(self.scene, state, step, "auto", Watch())
+            return linearised(self.scene.bare, state, step, "auto", Watch())
 
         return lag_of(self.scene, state, system_at, self._slowness)
 
@@ -210,7 +210,7 @@ class Analysis:
     def warnings(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
-        parts = [] if anchored else self.parts_without_leader
+        parts = [] if anchored or self.scene.barriers else self.parts_without_leader
         found = [
             f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
             "nothing holds it"

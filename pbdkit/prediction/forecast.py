@@ -66,6 +66,11 @@ ANALYSED = (
 )
 """What the analysis calls by the same names."""
 
+WITHOUT = (
+    "obstacles: stability and settling are told of the body without them, and whether they hold it "
+    "is not looked at",
+)
+
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
@@ -86,7 +91,7 @@ def forecast(scene: Scene) -> Forecast:
         decay=swing.decay if swing else None,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
         size_mm=_size_mm(scene),
-        warnings=[*_doubts(scene), *analysis.warnings(), *waves],
+        warnings=[*_doubts(scene), *WITHOUT[: len(scene.barriers)], *analysis.warnings(), *waves],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
 
@@ -101,8 +106,8 @@ def _size_mm(scene: Scene) -> tuple[float, ...] | None:
 def _sizes(analysis: Analysis) -> Sizes:
     """Of a large equilibrium by what serves it."""
     scene = analysis.scene
-    count, grids = scene.raster.count, True
-    if count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
+    count, grids = scene.raster.count, not scene.barriers
+    if grids and count > LARGEST_ANEW and not scene.experiment.solver.makes_steps:
         grids = analysis.spectra.estimate.system(scene.experiment.steps) is not None
     return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
@@ -137,7 +142,10 @@ def _doubts(scene: Scene) -> list[str]:
         if load.from_ > scene.experiment.steps:
             warnings.append(f"loads.{n}: begins to act after the run's last step")
     warnings += too_light(scene)
-    if not (scene.leading or scene.loads):
+    for n, barrier in enumerate(scene.barriers):
+        if barrier.group.from_ > scene.experiment.steps:
+            warnings.append(f"obstacles.{n}: begins after the run's last step")
+    if not (scene.driven or scene.loads):
         warnings.append("leaders: there are none, nothing will move")
     if sizes.output > machine_memory():
         warnings.append(

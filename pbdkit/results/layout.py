@@ -93,12 +93,13 @@ def base_columns() -> list[Column]:
 
 def optional_columns() -> list[list[Column]]:
     """What only some datasets have, whatever their diagnostics: the table of bonds, when each
-    broke, the coordinate of what is measured at every step, and those of leader
-    groups and of loads."""
+    broke, the coordinate of what is measured at every step, and those of leader groups, of loads
+    and of obstacles."""
     bond, ends = ("bond",), "the two particles of the bond, as positions along `particle` from 0"
     step = "step at which the bond broke, -1 if it has not"
     strain = "strain with which the bond broke, NaN if it has not, was cut or broken from the start"
     group = "leader group, by its place among the experiment's leaders, from 0"
+    obstacle = "obstacle, by its place among the experiment's obstacles, from 0"
     return [
         [
             Column("bond", ("bond", "end"), "i8", When.START, f"{ends}, lower first", "", True),
@@ -111,6 +112,7 @@ def optional_columns() -> list[list[Column]]:
         [coordinate("step", "step", when=When.STEP, units="step")],
         [coordinate("leader_group", group)],
         [coordinate("load", "load, by its place among the experiment's loads, from 0")],
+        [coordinate("obstacle", obstacle)],
     ]
 
 

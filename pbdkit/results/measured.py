@@ -41,14 +41,19 @@ class Measured:
     @cached_property
     def shows_leaders(self) -> bool:
         """Whether anything is measured of each leader group."""
-        return self._measures_each("leader_group")
+        return self._shows("leader_group")
 
     @cached_property
     def shows_loads(self) -> bool:
         """Whether anything is measured of each load."""
-        return self._measures_each("load")
+        return self._shows("load")
 
-    def _measures_each(self, dim: str) -> bool:
+    @cached_property
+    def shows_obstacles(self) -> bool:
+        """Whether anything is measured of each obstacle."""
+        return self._shows("obstacle")
+
+    def _shows(self, dim: str) -> bool:
         return any(dim in v.dims for d in self._diagnostics for v in d.variables())
 
     @cached_property
@@ -62,6 +67,8 @@ class Measured:
             sizes["leader_group"] = len(scene.leading)
         if self.shows_loads:
             sizes["load"] = len(scene.experiment.loads)
+        if self.shows_obstacles:
+            sizes["obstacle"] = len(scene.barriers)
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import LeaderRows, LoadRows, Moment, Pair, Stiffness, length
+from pbdkit.interfaces import (
+    LeaderRows,
+    LoadRows,
+    Moment,
+    Pair,
+    Stiffness,
+    TouchingRows,
+    length,
+)
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
@@ -21,6 +29,7 @@ from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.selecting import Selecting
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.evaluator import Neighbour
 from pbdkit.stepping.state import Floats, State, describe_bonds
 
@@ -121,6 +130,13 @@ class StateMoment(Moment):
             LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self.step))
             for each in (loads.each if loads else ())
         )
+
+    def touching(self) -> tuple[TouchingRows, ...]:
+        """Found anew each time."""
+        if not self._scene.barriers:
+            return ()
+        found = Contact(self._scene).touching(self._state)
+        return tuple(TouchingRows(read_only(rows), read_only(n)) for rows, n in found)
 
     def broken_bonds(self) -> int:
         """Every bond that breaks is marked on one plane, once."""

@@ -75,6 +75,8 @@ class Recorder:
             yield {"leader_group": np.arange(len(scene.leading))}
         if self._measured.shows_loads:
             yield {"load": np.arange(len(scene.experiment.loads))}
+        if self._measured.shows_obstacles:
+            yield {"obstacle": np.arange(len(scene.barriers))}
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
@@ -144,6 +146,7 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.every_step,
         measured.shows_leaders,
         measured.shows_loads,
+        measured.shows_obstacles,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
     all_of_them = [*layout.base_columns(), *some, *measured.columns()]

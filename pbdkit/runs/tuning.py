@@ -60,7 +60,8 @@ def chosen_weights(scene: Scene) -> Weights:
         None if number == "auto" else number
         for number in (asked.asked_relaxation, asked.asked_memory)
     ]
-    plain, rest = _with(scene, Stepping()), initial_state(scene)
+    plain = _with(scene.bare, Stepping())
+    rest = initial_state(scene)
     rest.u[...] = 0.0
     try:
         known, is_sure = _eigenvalues(plain, rest)

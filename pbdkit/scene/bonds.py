@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.experiment.cuts import Cut
 from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
@@ -110,3 +111,12 @@ def _bonds_of_plane(
     shell, of_plane = np.full(len(a), slot.shell, np.int8), np.full(len(a), number)
     ends = np.stack([np.minimum(a, b), np.maximum(a, b)], axis=1)
     return ends, shell, of_plane, within
+
+
+def missing_cuts(raster: Raster, neighbourhood: Neighbourhood, cuts: Sequence[Cut]) -> list[str]:
+    """A warning for each cut that crosses nothing."""
+    return [
+        f"cuts.{n}: it crosses no bond of the body; look where it goes from and to"
+        for n, cut in enumerate(cuts)
+        if not any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
+    ]

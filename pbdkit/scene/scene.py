@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import add
 
 import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
+from pbdkit.interfaces import AppliesTwice, Components, Remembers
 from pbdkit.interfaces.rule import material_of
-from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.bonds import BondTable, build_bond_table, crossed_bonds
+from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
@@ -26,8 +24,10 @@ from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
-from pbdkit.scene.places import Mask, distinct, hull
-from pbdkit.scene.raster import Raster, positions
+from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
+from pbdkit.scene.places import Mask, distinct
+from pbdkit.scene.raster import Raster
+from pbdkit.scene.setting import body_box, setting_of
 from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
 from pbdkit.scene.sizes import refuse_too_large
 
@@ -41,7 +41,7 @@ class Scene:
 
     `constants` are what the elementwise functions are called with. `frame`, `cells`, `inner` (the
     scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
-    the leader groups, `warnings` are for the user.
+    the leader groups, `warnings` are for the user, `barriers` the obstacles.
     """
 
     experiment: Experiment
@@ -54,6 +54,17 @@ class Scene:
     leading: tuple[Leading, ...]
     loads: Loads | None
     warnings: tuple[str, ...]
+    barriers: tuple[Barrier, ...] = ()
+
+    @property
+    def driven(self) -> tuple[Leading | Barrier, ...]:
+        """All that motions drive."""
+        return (*self.leading, *self.barriers)
+
+    @cached_property
+    def bare(self) -> Scene:
+        """The same without obstacles."""
+        return replace(self, barriers=()) if self.barriers else self
 
     @property
     def has_fracture(self) -> bool:
@@ -119,7 +130,7 @@ def _build(experiment: Experiment) -> Scene:
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += doubts(raster, experiment.leaders)
-    warnings += _missing_cuts(experiment, raster, neighbourhood)
+    warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
@@ -136,8 +147,10 @@ def _build(experiment: Experiment) -> Scene:
     cells = filling.on(raster, neighbourhood.tiling)
     cells = weighed(experiment, raster, setting, cells)
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
+    barriers = build_obstacles(raster, experiment)
+    warnings += collisions(raster, leading, barriers, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading, loads)
-    return with_inner(Scene(experiment, *parts, tuple(warnings)))
+    return with_inner(Scene(experiment, *parts, tuple(warnings), barriers))
 
 
 def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
@@ -159,23 +172,6 @@ def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
             ("neighbours",),
         )
     return fill_with_cells(experiment.body, experiment.lattice, neighbourhood.tiling)
-
-
-def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
-    """What a rule may derive its constants from."""
-    lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
-    cell, slots = raster.lattice.cell(), neighbourhood.slots
-    return Setting(cell, slots, lower, upper, neighbourhood.tiling)
-
-
-def body_box(raster: Raster) -> tuple[Components, Components]:
-    """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
-    ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
-    at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]
-    lower, upper = hull(
-        ([x.min() for x in here], [x.max() for x in here]) for here in at if here[0].size
-    )
-    return vector(map(float, lower)), vector(map(float, upper))
 
 
 def _doubts(
@@ -206,17 +202,6 @@ def _doubts(
             "take {type: natural} or {type: traction-free}"
         )
     return doubts
-
-
-def _missing_cuts(
-    experiment: Experiment, raster: Raster, neighbourhood: Neighbourhood
-) -> list[str]:
-    """A warning for each cut that crosses nothing."""
-    return [
-        f"cuts.{n}: it crosses no bond of the body; look where it goes from and to"
-        for n, cut in enumerate(experiment.cuts)
-        if not any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
-    ]
 
 
 def with_inner(scene: Scene) -> Scene:

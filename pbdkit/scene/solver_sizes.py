@@ -36,7 +36,7 @@ def equilibrium_size(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
 ) -> int:
     """Bytes of the systems of an equilibrium, on grids where these serve."""
-    linear = experiment.rule.linear
+    linear = experiment.rule.linear and not experiment.obstacles
     if grids and _on_grids(experiment, neighbourhood, particles):
         return KERNELS + particles * (GRIDS if linear else OWN_STENCILS)
     each = len(neighbourhood.slots[0])
@@ -60,6 +60,8 @@ def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: i
     if not (asks_for_grids(experiment, method, particles) and find_spec("numba")) or isinstance(
         experiment.rule, AppliesTwice
     ):
+        return False
+    if experiment.obstacles:
         return False
     if experiment.neighbours.nearness() or len(cell.primitive) != 2:
         return False

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pbdkit.scene.leader_groups import Leading
+from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
@@ -42,7 +43,7 @@ class Guard:
         ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
         spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
         size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
-        ways = [way_of(leading, scene.experiment.steps) for leading in scene.leading]
+        ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
         kept = start.copy() if start.step else None
         return cls(size + sum(ways), start.step, start.step + EVERY, kept)
 
@@ -81,7 +82,7 @@ def _most(state: State) -> float:
     return max(float(state.u.max()), -float(state.u.min()))
 
 
-def way_of(leading: Leading, steps: int) -> float:
+def way_of(leading: Leading | Barrier, steps: int) -> float:
     """How far a group gets from where it starts, looked at here and there."""
     group = leading.group
     last = group.last(steps) - group.from_ + 1

@@ -11,6 +11,7 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.clamps import Clamps
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
 from pbdkit.stepping.guidance import Guidance
@@ -41,6 +42,7 @@ class Stepper(Engine):
         self._scene = scene
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing.of(scene)
+        self._contact = Contact(scene) if scene.barriers else None
         self._clamps = Clamps(scene)
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
@@ -67,9 +69,11 @@ class Stepper(Engine):
         # What leaves the finite numbers is found at recording.
         with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
             self._followers.move(u, new, state)
+            self._guidance.correct(new, u, step)
         for values, prescribed in kept:
             values[clamped] = prescribed
-            self._guidance.correct(new, u, step)
+        if self._contact:
+            self._contact.push_out(new, step)
         place(new, led)
         place(u, before)
         if self._scene.frame:

@@ -11,6 +11,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
+from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.newton_forces import NewtonForces
 from pbdkit.stepping.state import Floats, State
@@ -90,10 +91,10 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
 
 
 def steady_steps(scene: Scene, step: int, most: int) -> int:
-    """How many steps from `step` on have the same leaders at the same places, the same loads and no
-    cut but those that the first begins with, at most `most`, at least 1."""
+    """How many steps from `step` on have the same leaders and obstacles at the same places, the
+    same loads and no cut but those that the first begins with, at most `most`, at least 1."""
     most = min([most, *(cut.at - step for cut in scene.experiment.cuts if cut.at > step)])
-    for leading in scene.leading:
+    for leading in scene.driven:
         group = leading.group
         begins, ends = group.from_, group.last(step + most)
         if begins <= step <= ends:
@@ -108,11 +109,11 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
 
 
 def last_event(scene: Scene) -> int:
-    """The last step within the run at which leaders move, roles or loads change or bonds are cut,
-    at least 1."""
+    """The last step within the run at which leaders or obstacles move, roles or loads change or
+    bonds are cut, at least 1."""
     steps, events = scene.experiment.steps, [1, *(cut.at for cut in scene.experiment.cuts)]
     events += scene.loads.changes(steps) if scene.loads else []
-    for leading in scene.leading:
+    for leading in scene.driven:
         first, last = leading.group.from_, leading.group.last(steps)
         rests = leading.group.motion.rests_after() or 0
         moments = (first, last + 1, min(last, first - 1 + rests))
@@ -120,7 +121,7 @@ def last_event(scene: Scene) -> int:
     return max(events)
 
 
-def is_cut_short(leading: Leading, steps: int) -> bool:
+def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:
     """Whether a group leads in the last step, and its motion is not over then."""
     rests = leading.group.motion.rests_after()
     over = rests is not None and leading.group.from_ - 1 + rests <= steps

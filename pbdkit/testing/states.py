@@ -22,6 +22,7 @@ from pbdkit.interfaces import (
     Here,
     Particles,
     Remembered,
+    TouchingRows,
     Vector,
 )
 from pbdkit.interfaces.rule import shares_particles
@@ -202,6 +203,8 @@ class Shown:
             return tuple(group._replace(rows=place[group.rows]) for group in found)
         if name == "loads":
             return tuple(load._replace(rows=place[load.rows]) for load in found)
+        if name == "touching":
+            return tuple(TouchingRows(place[one.rows], one.normals) for one in found)
         in_order = name in self.OF_PARTICLES and len(found) == len(place)
         return found[self._order] if in_order else found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -55,6 +56,11 @@ LOADED = [
     {"select": {"edge": "right"}, "body_force": [0.01, -0.03], "from": 2},
 ]
 """The loads of those that measure loads."""
+PRESSING = {
+    "shape": {"half_plane": {"point": [0.0, -0.1], "normal": [0.0, 1.0]}},
+    "motion": {"type": "displace", "displacement": [0.0, 0.3]},
+}
+"""The obstacle of the scenes that diagnostics of obstacles measure."""
 TEARING = {"type": "threshold", "thresholds": [1.6]}
 
 
@@ -71,6 +77,9 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
     if field == "diagnostics":
         given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
+        with suppress(Exception):  # what fails is asked about directly, and named there
+            if any("obstacle" in v.dims for v in component.variables()):  # type: ignore[attr-defined]
+                given |= {"obstacles": [PRESSING]}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
         given |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
     choices = {

@@ -22,10 +22,12 @@ from pbdkit.stepping.compiled.arguments import (
 from pbdkit.stepping.compiled.emitter import write_kernel
 from pbdkit.stepping.compiled.leading import leading_arrays
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
+from pbdkit.stepping.compiled.obstacle_pass import wall_arrays
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.guidance import Guidance
 from pbdkit.stepping.newton_forces import NewtonForces
@@ -57,11 +59,14 @@ class CompiledStepper(Engine):
             return
         self._last: State | None = None
         self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
+        self._contact = contact = Contact(scene) if scene.barriers else None
         levels = levels_of(scene)
         self._reach = Reach(levels)
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
         self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
+        if contact and contact.compliance is not None:
+            self._arrays["compliance"] = contact.compliance
         start = unmoved_state(scene, (1,) * scene.axes)
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)
@@ -101,6 +106,8 @@ class CompiledStepper(Engine):
         led, starts = prescribe(self._scene, state, step, self._newton)
         self._clamped = self._clamps.turn(state, step)
         load = self._load(state)
+        if self._contact:
+            self._reach.touch(self._contact.touched_at_rest(step))
         count = self._reach.before(led, load, steady_steps(self._scene, step, end - state.step))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, led, count))
@@ -117,7 +124,8 @@ class CompiledStepper(Engine):
         moved = state_arrays(self._plan, state.u, state.previous, state)
         load = self._load(state)
         loads = {} if load is None else dict(zip(self._plan.each("load_@"), load, strict=True))
-        return self._arrays | moved | leaders | reached | loads
+        walls = wall_arrays(self._scene, state.step + 1)
+        return self._arrays | moved | leaders | reached | loads | walls
 
     def _load(self, state: State) -> Floats | None:
         """What acts in the step after a state."""

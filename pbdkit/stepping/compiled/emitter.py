@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
 from pbdkit.stepping.compiled.leading import write_guiding, write_leading, write_slants
+from pbdkit.stepping.compiled.obstacle_pass import write_obstacle_pass
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
 from pbdkit.stepping.compiled.rows import GENERAL, write_row
 from pbdkit.stepping.compiled.slot_loop import write_general
@@ -28,8 +29,10 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
         passes.append(functions[-1])
+    pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
+    functions += [pushing] if pushing else []
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes)
+    _write_run(run, plan, passes, pushing)
     return write_module(plan, functions, run)
 
 
@@ -69,7 +72,9 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
     return [*dict.fromkeys(found), out]
 
 
-def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
+def _write_run(
+    out: Function, plan: Plan, passes: Sequence[Function], pushing: Function | None
+) -> None:
     out.add(0, "for _ in range(count):", "    step += 1")
     for side in "uv":
         out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
@@ -97,6 +102,8 @@ def _write_run(out: Function, plan: Plan, passes: Sequence[Function]) -> None:
     for m in plan.rotations:
         out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
         out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
+    if pushing:
+        write_pass(out, plan, 1, pushing, "i0", "i1")
     write_slants(out, plan)
     write_leading(out, plan, "fv_@[led[e]] = led_values[#, e]", "fu_@[led[e]] = led_kept[#, e]")
     if plan.scene.frame:

@@ -19,6 +19,7 @@ from pbdkit.interfaces import (
 )
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
+from pbdkit.scene import outlines
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.kernel_cache import load_kernel
@@ -57,6 +58,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
                 found |= {f"{name}{number}": getattr(part, name) for name in names}
         if isinstance(part, Loadable) and levels[-1].scene.loads:
             found[f"loaded{number}"] = part.loaded
+    if levels[-1].scene.barriers:
+        found |= {"facing": outlines.facing, "slide": outlines.slide}
     return found
 
 

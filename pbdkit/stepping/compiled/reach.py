@@ -10,7 +10,7 @@ everything is looked at in every step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -64,6 +64,11 @@ class Reach:
         if load is not None:
             self._join(np.nonzero((load != 0.0).any(axis=(0, 1))))
         return count
+
+    def touch(self, touched: Iterable[tuple[NDArray[np.intp], ...]]) -> None:
+        """Takes in the cells that obstacles push from where they rest."""
+        for cells in touched if self._known else ():
+            self._join(cells)
 
     def after(self, now: Floats, before: Floats) -> None:
         """Looks once at what the first step has moved."""

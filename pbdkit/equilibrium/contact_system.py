@@ -1,0 +1,234 @@
+"""The linear system of an equilibrium before obstacles: an active set.
+
+A step puts followers where y = u + move lies, and those who would enter an obstacle on its outline.
+With T = 1 for who is free and T = s (1 - n nᵀ) for who is held there (n the normal, s how a round
+outline spreads what moves along it; s = 1 before flat ones; times 1 - C n nᵀ / (n·C n) for who
+gives way more easily along some directions), its linearisation is
+
+    Ã = 1 - T (1 - A),  A that of the body alone,
+
+so that a correction keeps who is held on the outline, free along it: the step of a semi-smooth
+Newton iteration (Hintermüller, Ito, Kunisch), which changes the set until it stays.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.analysis.couplings import connected, one_minus
+from pbdkit.analysis.operator import step_operator
+from pbdkit.equilibrium.linear_solver import Ground
+from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces.frame import Indices
+from pbdkit.results.progress import Watch
+from pbdkit.scene.obstacles import outlines_at
+from pbdkit.scene.outlines import slide
+from pbdkit.scene.places import Places
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State
+
+Floats = NDArray[np.floating[Any]]
+WEAK = 1e-6
+"""The stiffness of springs to where particles are, as a share of that of their neighbours."""
+DIGITS = 16.0 * float(np.finfo(float).eps)
+"""Of a place: nearer to an outline than this, a particle lies on it."""
+REMEDY = "let a leader hold it, or take solver: {type: stepping}"
+
+
+class ContactSystem(System):
+    """The system at a state, with those held who would enter an obstacle from there."""
+
+    def __init__(
+        self, scene: Scene, state: State, moment: float, method: str, watch: Watch, moves: Moves
+    ) -> None:
+        operator = step_operator(scene, state, math.ceil(moment))
+        self._shape, self._followers = state.u.shape, operator.followers
+        self._place = scene.raster.place_of(operator.followers)
+        self._method, self._watch = method, watch
+        self._X = scene.raster.reference(operator.followers)
+        self._led = scene.raster.reference(operator.leaders)
+        free = one_minus(operator.couplings_both.entries().matrix())
+        self._amplification = float(np.abs(free.diagonal()).max(initial=1.0))
+        there = state.u + moves.free(state, moment)
+        assert moves.contact
+        gives = moves.contact.compliance
+        self.held, turned = _turned(scene, there, self._place, moment, gives)
+        self._matrix = matrix = _contacting(free, turned)
+        led = operator.couplings_led.entries()
+        held = np.repeat(self.held, scene.axes)
+        held[led.rows[led.values != 0.0]] = True
+        self._parts = self._split(matrix, held)
+
+    def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Part]]:
+        """What leaders or obstacles hold together, and each part that nothing holds by itself."""
+        count, label = connected(matrix, strongly=False)
+        is_held = np.bincount(label, held, count) > 0.0
+        groups = [np.flatnonzero(is_held[label])] if held.any() else []
+        groups += [np.flatnonzero(label == n) for n in np.flatnonzero(~is_held)]
+        return [(some, self._part(matrix, some, bool(is_held[label[some[0]]]))) for some in groups]
+
+    def _part(self, matrix: Any, some: Indices, held: bool) -> Part:
+        """Held parts have an inverse, unless they are left some freedom: then they float."""
+        own = matrix if len(some) == matrix.shape[0] else matrix[some][:, some]
+        if held:
+            ground = Ground(2, self._X[some[::2] // 2], self._led)
+            with suppress(np.linalg.LinAlgError):
+                return Held(own, self._method, ground, self._watch)
+        return Floating(own, None, self._watch)
+
+    @property
+    def methods(self) -> str:
+        """The names of the methods used."""
+        return ", ".join(sorted({part.name for _, part in self._parts})) or "nothing to solve"
+
+    @property
+    def how(self) -> str:
+        """By the solution; its rounding by the inverse itself where that is at hand."""
+        ways = {part.how for _, part in self._parts}
+        return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
+
+    @property
+    def iterations(self) -> int:
+        """Of all linear solvers together."""
+        return sum(part.iterations for _, part in self._parts)
+
+    @property
+    def amplification(self) -> float:
+        """By the largest entry of the diagonal."""
+        return self._amplification
+
+    def _table(self, planes: Floats) -> Floats:
+        """(unknown,) of planes."""
+        return planes.reshape(len(planes), -1)[:, self._place].T.ravel()
+
+    def _planes(self, table: Floats) -> Floats:
+        """Planes of (unknown,)."""
+        planes = np.zeros(self._shape)
+        planes.reshape(len(planes), -1)[:, self._place] = table.reshape(-1, len(planes)).T
+        return planes
+
+    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+        """Part by part."""
+        r = self._table(moves)
+        x = np.zeros_like(r)
+        for some, part in self._parts:
+            try:
+                x[some] = part.solve(r[some])
+            except DriftingError:
+                raise ExperimentError(
+                    f"there is no equilibrium: neither leaders nor obstacles hold a part of "
+                    f"{self._named(some)}, and it is pushed on for ever; {REMEDY}",
+                    ("obstacles",),
+                ) from None
+        return self._planes(x)
+
+    def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
+        """Nothing is linear where particles come to rest on obstacles."""
+        return math.inf
+
+    def distance(self, moves: Floats, rounding: float) -> float:
+        """Solves once more for what is left of the moves, and adds what rounding may make of it."""
+        r = self._table(moves)
+        far = (part.farthest(r[some], rounding) for some, part in self._parts)
+        return math.sqrt(2.0) * max(far, default=0.0)
+
+    def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
+        """Looks at each part by itself."""
+        r = self._table(moves)
+        for some in self._floats:
+            if np.abs(r[some]).max(initial=0.0) > 8 * rounding:
+                raise self._not_unique(some)
+
+    def refuse_floats(self) -> None:
+        """Raises ExperimentError where anything floats."""
+        for some in self._floats:
+            raise self._not_unique(some)
+
+    def is_loose(self, moves: Floats, rounding: float) -> bool:
+        """Whether a part that nothing holds yet has moves left."""
+        r = self._table(moves)
+        return any(np.abs(r[some]).max(initial=0.0) > 8 * rounding for some in self._floats)
+
+    def solve_loose(self, moves: Floats, most: float) -> Floats:
+        """A correction, as far as `most`, where weak springs hold what nothing else does: it leads
+        to where obstacles may."""
+        matrix = self._matrix + WEAK * _one(self._matrix)
+        ground = Ground(2, self._X, self._led)
+        found = Held(matrix, "lu", ground, self._watch).solve(self._table(moves))
+        found *= min(1.0, most / np.abs(found).max())
+        return self._planes(found)
+
+    @property
+    def _floats(self) -> list[Indices]:
+        return [some for some, part in self._parts if isinstance(part, Floating)]
+
+    def _not_unique(self, some: Indices) -> ExperimentError:
+        return ExperimentError(
+            "there is no unique equilibrium: leaders and obstacles leave a part of "
+            f"{self._named(some)} free to slide or turn; {REMEDY}",
+            ("obstacles",),
+        )
+
+    def is_stable(self) -> bool:
+        """Part by part."""
+        return all(part.is_stable() for _, part in self._parts)
+
+    def _named(self, unknowns: Indices) -> str:
+        numbers = np.unique(self._followers[unknowns // 2]) + 1
+        return f"{len(numbers)} particles (with number {numbers[0]})"
+
+
+def _turned(
+    scene: Scene, u: Floats, place: Indices, moment: float, gives: Floats | None
+) -> tuple[NDArray[np.bool_], Floats]:
+    """Who of some followers is inside an obstacle at displacements u, (follower,), or on its
+    outline, and T of each, (follower, axis, axis), through one obstacle after the other."""
+    X = scene.raster.reference_planes(Places(scene.raster.shape, place))
+    at = np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
+    on = DIGITS * float(np.abs(at).max(initial=1.0))
+    held, turned = np.zeros(len(place), bool), np.tile(np.eye(2), (len(place), 1, 1))
+    for _, outline in outlines_at(scene.barriers, moment):
+        gap, nx, ny, spread = outline.facing(*at)
+        inside, n = gap <= on, np.stack([nx, ny])
+        if gives is not None:
+            own = gives.reshape(3, -1)[:, place]
+            turned = _along(inside, np.stack(slide(1.0, nx, ny, *own)), n, 1.0) @ turned
+            at = at - np.where(inside, np.stack(slide(gap, nx, ny, *own)), 0.0)
+            gap, nx, ny, spread = outline.facing(*at)
+            n = np.stack([nx, ny])
+        turned = _along(inside, n, n, spread[:, None, None]) @ turned
+        at = at - np.where(inside, gap * n, 0.0)
+        held |= inside
+    return held, turned
+
+
+def _along(inside: NDArray[np.bool_], way: Floats, n: Floats, spread: Any) -> Floats:
+    """(follower, axis, axis): spread · (1 - way nᵀ) for who is inside, 1 for others."""
+    turned = spread * (np.eye(2) - way.T[:, :, None] * n.T[:, None, :])
+    found: Floats = np.where(inside[:, None, None], turned, np.eye(2))
+    return found
+
+
+def _contacting(free: Any, turned: Floats) -> Any:
+    """1 - T (1 - A)."""
+    from scipy.sparse import bsr_array
+
+    rows = np.arange(len(turned) + 1)
+    T, one = bsr_array((turned, rows[:-1], rows), shape=free.shape).tocsr(), _one(free)
+    return one - T @ (one - free)
+
+
+def _one(like: Any) -> Any:
+    """The identity as a matrix of the same kind and size."""
+    from scipy.sparse import eye_array
+
+    size = like.shape[0]
+    return np.eye(size) if isinstance(like, np.ndarray) else eye_array(size, format="csr")

@@ -1,0 +1,32 @@
+"""Contact against the solutions of contact mechanics and of beams.
+
+    python tests/reliability/contact.py [--cells N]...
+
+Hertz's half-width at so many cells across the contact (40 and 20), and three-point bending.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent.parent)]
+from test_obstacles import bending, half_widths
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", type=int, action="append")
+    for cells in parser.parse_args().cells or (20, 40):
+        fitted, hertz = half_widths(cells)
+        off = fitted / hertz - 1
+        print(f"Hertz, {cells} cells: half-width {fitted:.4f}, {hertz:.4f} in theory, {off:+.2%}")
+    found, beam, shear = bending()
+    print(
+        f"bending: {found:.2f}, Timoshenko {beam:.2f}, {found / beam - 1:+.2%}; shear {shear:.1%}"
+    )
+
+
+if __name__ == "__main__":
+    main()
