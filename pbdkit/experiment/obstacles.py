@@ -9,8 +9,11 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo, mod
 
 from pbdkit.experiment.body import Body, Disc, Polygon, Rectangle, Ring
 from pbdkit.experiment.leaders import Driven
+from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.motions import AnyMotion, Hold
+from pbdkit.experiment.newton import Newton
 from pbdkit.experiment.parts import closed_part, fault
+from pbdkit.interfaces import Pair
 from pbdkit.interfaces.component import Strict
 from pbdkit.interfaces.units import Place
 
@@ -27,7 +30,7 @@ class HalfPlane(Strict):
     """All behind the line through `point`, seen along `normal`, which points into free space."""
 
     point: Place
-    normal: Place
+    normal: Pair
 
     @model_validator(mode="after")
     def _has_direction(self) -> Self:
