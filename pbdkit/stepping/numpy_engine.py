@@ -69,7 +69,7 @@ class Stepper(Engine):
             self._followers.move(u, new, state)
         for values, prescribed in kept:
             values[clamped] = prescribed
-            self._guidance.correct(new, u, step)
+        self._guidance.correct(new, u, step)
         place(new, led)
         place(u, before)
         if self._scene.frame:
