@@ -89,7 +89,9 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
         return ("first_cos", "first_sin"), ("second_cos", "second_sin")
 
     @staticmethod
-    def gather(d: Any, r: Any, w: Any, p: Any, own: Any, there: Any) -> tuple[Any, ...]:
+    def gather(  # type: ignore[override]  # SharesParticles: it is given more
+        d: Any, r: Any, w: Any, p: Any, own: Any, there: Any
+    ) -> tuple[Any, ...]:
         """Force; stiffness xx, xy, yy; by family the moment, and the stiffness that goes with it;
         half the energy."""
         v, is_beam = r + d, w.one + w.other
