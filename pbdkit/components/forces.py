@@ -92,8 +92,8 @@ class LoadDisplacement(Diagnostic):
     """
 
     type: Literal["load-displacement"] = "load-displacement"
-    youngs_modulus: Modulus
-    thickness: Thickness = 1.0
+    youngs_modulus: Modulus = Field(default_factory=unset)
+    thickness: Thickness = Field(default_factory=unset)
 
     needs: ClassVar[frozenset[Need]] = frozenset({"loads"})
 
@@ -102,7 +102,7 @@ class LoadDisplacement(Diagnostic):
         dims, mean = ("load", "axis"), "mean displacement of the load's particles"
         return (
             Variable("load_resultant", dims, "resultant of the load", FORCE.lattice),
-            Variable("load_displacement", dims, mean, "lattice unit"),
+            Variable("load_displacement", dims, mean, LENGTH.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
