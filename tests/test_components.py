@@ -24,6 +24,7 @@ from pbdkit.components.rules import (
 from pbdkit.components.strain_fracture import StrainFracture
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.interfaces import Setting
+from pbdkit.interfaces.units import is_needed
 from pbdkit.scene.cells import tiling_of
 from pbdkit.scene.neighbourhood import build_neighbourhood
 
@@ -37,6 +38,7 @@ REQUIRED = {
     "radius": 1.5,
     "failure": 0.6,
     "onset": 0.2,
+    "energy": 0.05,
     "poisson_ratio": 0.3,
     "modulus_ratio": 0.5,
     "shear_ratio": 0.4,
@@ -49,7 +51,7 @@ REQUIRED = {
 def an_instance(component):
     """One of it, with the parameters that it cannot do without."""
     fields = component.model_fields.items()
-    given = {f.alias or name: REQUIRED[name] for name, f in fields if f.is_required()}
+    given = {f.alias or name: REQUIRED[name] for name, f in fields if is_needed(f)}
     return component.model_validate(given)
 
 

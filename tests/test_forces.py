@@ -254,7 +254,7 @@ class Loose(pbdkit.Calibrated, pbdkit.FollowerRule):
 
     type: Literal["loose"] = "loose"
 
-    def stiffness(self):
+    def elasticity(self):
         return Stiffness(1.0, 1.0, 0.0, 0.5)
 
     @staticmethod
@@ -285,7 +285,7 @@ class Forceless(pbdkit.Calibrated, pbdkit.FollowerRule):
     """A calibrated rule that does not say what its forces are."""
 
     type: Literal["forceless"] = "forceless"
-    stiffness, gather, apply = Loose.stiffness, Loose.gather, Loose.apply
+    elasticity, gather, apply = Loose.elasticity, Loose.gather, Loose.apply
 
 
 def test_a_calibrated_rule_without_forces_is_named():

@@ -77,6 +77,18 @@ def test_a_bar_has_the_stress_the_force_and_the_energy_of_the_textbook(bar: Any)
     assert [*units.values()] == ["MPa", "N", "mJ", "mm"]
 
 
+def test_a_load_and_its_way_are_those_of_the_textbook() -> None:
+    load = {"select": {"edge": "right"}, "force": [1.0e-3, 0.0]}
+    held = BAR["leaders"][:1]
+    ds = run(BAR, leaders=held, loads=[load], diagnostics=[{"type": "load-displacement"}])
+    last, force = ds.isel(time=-1), 1.0e-3 * 206e3 * 3.05 * 0.25
+    assert last.load_resultant.values[0, 0] == pytest.approx(force, rel=1e-12)
+    assert last.load_displacement_mm.values[0, 0] == pytest.approx(
+        force * 4.0 / (206e3 * 2.0 * 3.05), rel=1e-9
+    )
+    assert (ds.load_resultant.units, ds.load_displacement_mm.units) == ("N", "mm")
+
+
 def test_the_shipped_strip_gives_back_its_modulus_and_its_force() -> None:
     ds = run(json.loads(pbdkit.load("modelling/strip").model_dump_json())).isel(time=-1)
     stress = ds.nominal_stress.item()

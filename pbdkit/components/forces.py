@@ -102,7 +102,7 @@ class LoadDisplacement(Diagnostic):
         dims, mean = ("load", "axis"), "mean displacement of the load's particles"
         return (
             Variable("load_resultant", dims, "resultant of the load", FORCE.lattice),
-            Variable("load_displacement", dims, mean, "lattice unit"),
+            Variable("load_displacement", dims, mean, LENGTH.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:

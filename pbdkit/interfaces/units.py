@@ -9,6 +9,7 @@ from functools import cache
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, Strict
@@ -170,6 +171,12 @@ class FromUnits:
 def unset() -> Any:
     """The default of what `units` may give."""
     return None
+
+
+def is_needed(field: FieldInfo) -> bool:
+    """Whether a parameter must be given where there are no `units`."""
+    given = (m for m in field.metadata if isinstance(m, FromUnits))
+    return field.is_required() or any(m.otherwise is None for m in given)
 
 
 def given_by_units(part: Component) -> list[str]:

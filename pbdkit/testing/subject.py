@@ -25,6 +25,7 @@ from pbdkit.interfaces import (
     NeighbourMetric,
 )
 from pbdkit.interfaces.rule import shares_particles
+from pbdkit.interfaces.units import is_needed
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.testing.question import Question, questions_of
@@ -209,7 +210,7 @@ def examples_of(component: type[Component]) -> list[Component]:
     others: list[dict[str, Any]] = [{}]
     for name, field in component.model_fields.items():
         key, examples = field.alias or name, list(field.examples or [])
-        if field.is_required():
+        if is_needed(field):
             if not examples:
                 fault = f"{component.__name__}.{name} has neither default nor example"
                 remedy = f"write `{name}: ... = Field(description=..., examples=[...])`"
