@@ -206,3 +206,31 @@ def _uniform(given: dict[str, Any]) -> dict[str, Any]:
         for part in ("rule", "fracture")
         if part in given
     }
+
+
+EVERYWHERE = {"all": {"type": "disc", "radius": 40.0, "centre": [3.0, 2.0]}}
+
+
+@pytest.mark.parametrize("parts", FIELDS.values(), ids=FIELDS)
+def test_a_region_that_holds_all_is_as_one_number(parts):
+    """Whatever stands for `otherwise`."""
+    given: dict[str, Any] = {
+        "name": "composite",
+        "regions": EVERYWHERE,
+        "body": {"type": "rectangle", "width": 6.0, "height": 4.0},
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+        "steps": 3,
+        "initial": {"type": "noise", "amplitude": 0.05},
+        "solver": {"type": "stepping", "engine": "numpy", "relaxation": 0.5},
+    } | parts
+    uniform = given | _uniform(given)
+    for field in ("rule", "fracture"):
+        if field in parts:
+            given[field] = {
+                name: {"otherwise": value["otherwise"] * 1.1, "all": value["otherwise"]}
+                if isinstance(value, dict) and "otherwise" in value
+                else uniform[field][name]
+                for name, value in parts[field].items()
+            }
+    found, expected = (pbdkit.run(one, progress=False)["position"] for one in (given, uniform))
+    np.testing.assert_allclose(found.values, expected.values, rtol=0.0, atol=1e-12)

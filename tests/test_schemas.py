@@ -33,7 +33,8 @@ def test_committed_schema_is_current(name, schema):
 @pytest.mark.parametrize("name", shipped_names())
 def test_shipped_experiments_and_their_datasets_are_described(name):
     of_experiment.validate(read_experiment(name).data)
-    experiment = pbdkit.load(name, settings=["steps=4", "record={every: 1}"])
+    uncut = ["cuts=[]"] if "cuts" in read_experiment(name).data else []  # they come later
+    experiment = pbdkit.load(name, settings=["steps=4", "record={every: 1}", *uncut])
     of_experiment.validate(json.loads(experiment.model_dump_json()))
     made = pbdkit.run(experiment, progress=False).to_dict(data=False)
     of_dataset.validate(json.loads(json.dumps(made, default=lambda a: a.tolist())))

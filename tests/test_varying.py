@@ -12,6 +12,7 @@ from jsonschema import Draft202012Validator
 
 import pbdkit
 from pbdkit.interfaces.varying import Gridded, as_varying
+from pbdkit.scene.scene import build_scene
 
 DISC = {"type": "disc", "radius": 2.0, "centre": [4.0, 2.0]}
 GIVEN: dict[str, Any] = {
@@ -150,3 +151,38 @@ def test_each_material_is_identified():
 @pytest.mark.parametrize("given", [1.0, 3, None, "0.3", [1.0]])
 def test_what_is_no_field_is_left_to_the_parameter(given):
     assert as_varying(given) is None
+
+
+@pytest.mark.parametrize(
+    ("parts", "text"),
+    [
+        (
+            {"fracture": {"type": "strain", "failure": {"otherwise": 0.1}, "scatter": 0.2}},
+            r"fracture\.failure: 'strain' draws a number for each bond from it",
+        ),
+        (
+            {"rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": {"otherwise": 1}}},
+            r"rule\.length: 'strain-gradient' applies a rule to the moves of another",
+        ),
+        (
+            {
+                "fracture": {
+                    "type": "strain",
+                    "failure": 0.1,
+                    "placement": {"otherwise": 1.0, "disc": 1.2},
+                }
+            },
+            r"fracture\.placement: 'placement' of 'strain' is no limit of a bond",
+        ),
+        (
+            {
+                "rule": {"type": "elastic", "poisson_ratio": {"otherwise": 0.3, "disc": 0.2}},
+                "frame": {"type": "traction-free"},
+            },
+            r"frame: 'traction-free' needs a rule that is calibrated to one material",
+        ),
+    ],
+)
+def test_what_no_field_goes_with_is_refused(parts, text):
+    with pytest.raises(pbdkit.ExperimentError, match=text):
+        build_scene(pbdkit.Experiment(**GIVEN | parts))

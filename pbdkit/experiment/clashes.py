@@ -24,43 +24,68 @@ def clashes_of(asked: Any) -> Iterator[tuple[Key, str]]:
             yield ("regions", name), "counts sites, and a region is a place: take a rectangle"
 
 
-def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
-    last, settles = max(asked.record.at or (0,)), asked.stepping.settle is not None
+def _looked_at(asked: Any) -> Iterator[tuple[Key, bool, str]]:
+    yield from _of_neighbours(asked)
+    yield from _of_events(asked)
+    yield from _of_forces(asked)
+
+
+def _of_neighbours(asked: Any) -> list[tuple[Key, bool, str]]:
+    """What needs bonds that last."""
     anew, jumps = asked.neighbours.nearness() is not None, not asked.solver.makes_steps
-    remembers = isinstance(asked.rule, RenewsParticles)
-    softens = isinstance(asked.fracture, Softens)
-    guided = any(group.axes is not None for group in asked.leaders)
-    late = max((cut.at for cut in asked.cuts), default=0)
-    masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
-    knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
+    settles = asked.stepping.settle is not None
     return [
-        ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
         ("fracture", anew and asked.fracture.can_break,
          "bonds cannot break where neighbours are re-evaluated: there are no lasting bonds; "
          "set neighbours.reevaluate: false or fracture: {type: none}"),
         ("cuts", anew and bool(asked.cuts),
          "bonds cannot be cut where neighbours are re-evaluated: there are no lasting bonds; "
          "set neighbours.reevaluate: false, or leave cuts out"),
-        ("cuts", late > asked.steps, f"step {late} is beyond the run's {asked.steps}"),
         ("solver", anew and jumps,
          "where neighbours are re-evaluated nothing tells where the steps lead; "
          "set neighbours.reevaluate: false or solver: {type: stepping}"),
         ("solver", anew and settles,
          "where neighbours are re-evaluated no distance from equilibrium is known; "
          "set neighbours.reevaluate: false, or leave solver.settle out"),
+        ("loads", anew and bool(asked.loads),
+         "need neighbours that stay; set neighbours.reevaluate: false"),
+    ]  # fmt: skip
+
+
+def _of_events(asked: Any) -> list[tuple[Key, bool, str]]:
+    """What comes after the run's last step, and where steps do not tell their end."""
+    last, late = max(asked.record.at or (0,)), max((cut.at for cut in asked.cuts), default=0)
+    jumps, settles = not asked.solver.makes_steps, asked.stepping.settle is not None
+    remembers, softens = (
+        isinstance(asked.rule, RenewsParticles),
+        isinstance(asked.fracture, Softens),
+    )
+    return [
+        ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
+        ("cuts", late > asked.steps, f"step {late} is beyond the run's {asked.steps}"),
         ("solver", settles and (remembers or softens),
          f"'{(asked.rule if remembers else asked.fracture).type}' remembers, so that no distance "
          "from equilibrium is known; leave solver.settle out"),
         ("solver", jumps and remembers,
          f"the rule '{asked.rule.type}' remembers, so that where the steps lead depends on "
          "all of them; take solver: {type: stepping}"),
-        ("solver", masses and (jumps or settles),
+    ]  # fmt: skip
+
+
+def _of_forces(asked: Any) -> list[tuple[Key, bool, str]]:
+    """What masses, obstacles and loads ask for."""
+    rests = not asked.solver.makes_steps or asked.stepping.settle is not None
+    masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
+    guided = any(group.axes is not None for group in asked.leaders)
+    knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
+    return [
+        ("solver", masses and rests,
          "leaders that move by Newton's law have no place at which they rest beforehand; take "
          "solver: {type: stepping} without settle, or a load on followers"),
         ("rule", masses and not isinstance(asked.rule, Calibrated),
          f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none; "
          "take a calibrated rule: elastic, springs"),
-        ("obstacles", bool(asked.obstacles) and (jumps or settles) and guided,
+        ("obstacles", bool(asked.obstacles) and guided and rests,
          "with leaders along one axis the equilibrium before obstacles is not known; take solver: "
          "{type: stepping} without settle, or lead along both axes"),
         ("loads", bool(asked.loads) and not knows_forces,
@@ -68,6 +93,4 @@ def _looked_at(asked: Any) -> list[tuple[Key, bool, str]]:
          "particle goes, and of no material how far a force would move it; take a calibrated "
          "rule ('elastic' or 'strain-gradient' with poisson_ratio above -1, 'orthotropic', "
          "'springs')"),
-        ("loads", bool(asked.loads) and anew,
-         "need neighbours that stay; set neighbours.reevaluate: false"),
     ]  # fmt: skip

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pbdkit.experiment.leaders import Selection
-from pbdkit.interfaces import Pair
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.units import BodyForce, Force
 
 
 class Load(Strict):
@@ -23,8 +23,8 @@ class Load(Strict):
     """
 
     select: Selection
-    force: Pair | None = None
-    body_force: Pair | None = None
+    force: Force | None = None
+    body_force: BodyForce | None = None
     from_: Annotated[int, Field(ge=1, alias="from")] = 1
     until: Annotated[int, Field(ge=1)] | None = None
 

@@ -8,9 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.experiment.motion import Floats, Motion
-from pbdkit.interfaces.units import FORCE, Place
-
-Force = Annotated[tuple[Annotated[float, FORCE], Annotated[float, FORCE]], Field(strict=False)]
+from pbdkit.interfaces.units import Force, Place
 
 
 class Newton(Motion):

@@ -11,7 +11,6 @@ from pydantic.json_schema import models_json_schema
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import INTERFACES
-from pbdkit.interfaces.fields import DEFINITION, SCHEMA
 from pbdkit.registry.registry import Registry
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -25,7 +24,7 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
     }
     models: chain[type[BaseModel]] = chain([Experiment], *offered.values())
     names, together = models_json_schema([(model, "validation") for model in models])
-    definitions = together["$defs"] | {DEFINITION: SCHEMA}
+    definitions = together["$defs"]
     top = definitions.pop(names[Experiment, "validation"]["$ref"].split("/")[-1])
     for field, components in offered.items():
         for component, spellings in components.items():

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pydantic import PrivateAttr, ValidationError, ValidationInfo, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    ConfigDict,
+    PrivateAttr,
+    RootModel,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, did_you_mean
 from pbdkit.interfaces.varying import ByRegion, Varying, as_varying
 
 RESERVED = ("otherwise", "file", "steps")
 """What no region is called, so that a map tells what it is."""
-DEFINITION = "Field"
 ABOUT = ("title", "description", "examples", "default")
 """What a schema says of a parameter whatever stands in it."""
-SCHEMA = {
-    "title": "Field",
-    "description": "A value for each place: by region, from a netCDF file, or over a grid.",
+ALTERNATIVES: dict[str, Any] = {
     "oneOf": [
         {
             "type": "object",
@@ -44,6 +48,12 @@ SCHEMA = {
     ],
 }
 """The JSON Schema of what a file writes in place of a number."""
+
+
+class Field(RootModel[Any]):
+    """A value for each place: by region, from a netCDF file, or over a grid."""
+
+    model_config = ConfigDict(json_schema_extra=ALTERNATIVES)
 
 
 class TakesFields(Component):
@@ -87,14 +97,15 @@ class TakesFields(Component):
         return part
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(cls, own: Any, handler: Any) -> dict[str, Any]:
         """Numbers, or fields in their place."""
-        schema: dict[str, Any] = handler(core_schema)
+        schema: dict[str, Any] = handler(own)
+        field = handler(core_schema.union_schema([Field.__pydantic_core_schema__]))
         known = handler.resolve_ref_schema(schema).get("properties", {})
         for name in cls.numbers() & known.keys():
             about = {k: v for k, v in known[name].items() if k in ABOUT}
             number = {k: v for k, v in known[name].items() if k not in ABOUT}
-            known[name] = about | {"anyOf": [number, {"$ref": f"#/$defs/{DEFINITION}"}]}
+            known[name] = about | {"anyOf": [number, field]}
         return schema
 
     @classmethod

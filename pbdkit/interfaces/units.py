@@ -64,11 +64,21 @@ ENERGY = Quantity(
     "energy", "unit of youngs_modulus * unit of thickness * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
+BODY_FORCE = Quantity(
+    "force per area", "unit of youngs_modulus * unit of thickness / lattice unit", "N/mm^2",
+    length=-1, youngs_modulus=1, thickness=1,
+)  # fmt: skip
 QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, FORCE, ENERGY)}
 """By what they are counted in."""
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
 """Two lengths, (x, y); an experiment file writes them as a list of two."""
+Force = Annotated[tuple[Annotated[float, FORCE], Annotated[float, FORCE]], Field(strict=False)]
+"""Two forces, along x and y."""
+BodyForce = Annotated[
+    tuple[Annotated[float, BODY_FORCE], Annotated[float, BODY_FORCE]], Field(strict=False)
+]
+"""Two forces on a unit of area, along x and y."""
 
 
 def _positive(unit: str, meaning: str) -> BeforeValidator:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -13,10 +14,20 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, FollowerRule, FractureModel, Remembers, Setting, Slot
+from pbdkit.interfaces import (
+    AppliesTwice,
+    Draws,
+    FollowerRule,
+    FractureModel,
+    Setting,
+    Slot,
+    Softens,
+)
 from pbdkit.interfaces.fields import TakesFields
+from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import bonds_in, plane_block
+from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.field_values import Values, kinds_of, values_at
 from pbdkit.scene.homes import SceneConstants, of_material
 from pbdkit.scene.neighbourhood import Neighbourhood
@@ -25,6 +36,8 @@ from pbdkit.scene.raster import Raster
 
 FEW = 3
 """So many places are looked at to see whether a part answers for whole arrays."""
+PROBE = 0.7
+"""So far, in bond lengths, ends are put to see what a fracture model's functions look at."""
 
 
 def with_fields(
@@ -56,26 +69,25 @@ def with_fields(
 def _refuse(experiment: Experiment) -> None:
     rule, fracture = experiment.rule, experiment.fracture
     unfit = (
-        (rule.varying and isinstance(rule, AppliesTwice), "rule", rule,
+        (isinstance(rule, AppliesTwice), "rule",
          "applies a rule to the moves of another: what its energy would be is not told"),
-        (rule.varying and experiment.neighbours.nearness(), "rule", rule,
+        (experiment.neighbours.nearness(), "rule",
          "is asked for neighbours that are found anew; set neighbours.reevaluate: false"),
-        (isinstance(fracture, Remembers) and fracture.varying and _hidden(fracture), "fracture",
-         fracture, "draws each bond's own number from it: scatter goes with one number for all"),
+        (_draws(rule), "rule", "draws a number for each particle from it"),
+        (_draws(fracture), "fracture", "draws a number for each bond from it"),
     )  # fmt: skip
-    for clash, field, part, text in unfit:
-        if clash:
+    for clash, field, text in unfit:
+        part: TakesFields = getattr(experiment, field)
+        if clash and part.varying:
             name = min(part.varying)
             raise ExperimentError(
                 f"'{part.type}' {text}; '{name}' must be one number here", (field, name)
             )
 
 
-def _hidden(fracture: Any) -> bool:
-    """Whether what varies is remembered instead of being a constant."""
-    return any(name in fracture.varying for name in ("scatter",)) or bool(
-        getattr(fracture, "scatter", 0.0)
-    )
+def _draws(part: TakesFields) -> bool:
+    """Whether numbers that stay come from the part's parameters."""
+    return isinstance(part, Draws) and any(not number.changes for number in part.remembered())
 
 
 def _by_particle(
@@ -89,9 +101,11 @@ def _by_particle(
     _refuse_weights(rule, values, setting)
     place, found = raster.place_of(rows), {}
     for name, own in _asked(rule, values, lambda part: part.parameters(setting)).items():
-        planes = np.full(raster.shape, getattr(constants.rule, name))
-        planes.reshape(-1)[place] = own
-        found[name] = planes
+        base = getattr(constants.rule, name)
+        if (own != base).any():
+            planes = np.full(raster.shape, base)
+            planes.reshape(-1)[place] = own
+            found[name] = planes
     return found
 
 
@@ -118,8 +132,10 @@ def _by_bond(
 ) -> dict[str, Floats]:
     """(plane, cell, cell) by name, of the fracture model's limits; bonds take the values at their
     middle, and what the functions see besides must be the same everywhere."""
-    fracture, found = experiment.fracture, dict[str, Floats]()
-    shape, origin = (len(around.planes), *raster.shape[1:]), raster.lattice.origin
+    fracture, slots = experiment.fracture, [plane.slot for plane in around.planes]
+    base = [constants.limits[slot]._asdict() for slot in slots]
+    shape, origin = raster.shape[1:], raster.lattice.origin
+    found = {name: np.stack([np.full(shape, b[name]) for b in base]) for name in base[0]}
     for n, plane in enumerate(around.planes):
         if not (block := plane_block(raster, plane)):
             continue
@@ -128,19 +144,14 @@ def _by_bond(
         x, y = np.broadcast_arrays(*middle)
         needed = bonds_in(raster, block, plane, frame_too=False)
         values = values_at(experiment, "fracture", x, y, needed)
-        own = _asked(fracture, values, partial(_limits, plane.slot, experiment.rule, setting))
-        for name, limits in own.items():
-            planes = found.setdefault(name, np.zeros(shape))
-            block.within(planes[n])[...] = limits
-        parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
-        if any(part.parameters() != fracture.parameters() for part in parts) and not own:
-            _refuse_parameter(fracture)
-    for name, planes in found.items():
-        for n, plane in enumerate(around.planes):
-            if not planes[n].any():
-                planes[n] = getattr(constants.limits[plane.slot], name)
+        ask = partial(_limits, plane.slot, experiment.rule, setting)
+        for name, limits in _asked(fracture, values, ask).items():
+            block.within(found[name][n])[...] = limits
+        _refuse_parameters(experiment, constants, plane.slot, values)
     return {
-        name: found[name] for name in constants.limits[around.every[0]]._fields if name in found
+        name: planes
+        for name, planes in found.items()
+        if any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
     }
 
 
@@ -149,12 +160,35 @@ def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: Fracture
     return {**fracture.constants(slot), **of_material(fracture, rule, setting).get(slot, {})}
 
 
-def _refuse_parameter(fracture: TakesFields) -> None:
-    name = min(fracture.varying)
-    raise ExperimentError(
-        f"'{name}' of '{fracture.type}' is no limit of a bond: it must be one number",
-        ("fracture", name),
-    )
+def _refuse_parameters(
+    experiment: Experiment, constants: SceneConstants, slot: Slot, values: Values
+) -> None:
+    """Limits are of bonds, the model's parameters of all: what its functions make of these must be
+    the same everywhere."""
+    fracture = experiment.fracture
+    parts, _ = kinds_of(fracture, {name: _ends(value) for name, value in values.items()})
+    alone = [_probed(experiment, constants, slot, part.parameters()) for part in parts]
+    if any(not np.array_equal(answers, alone[0], equal_nan=True) for answers in alone):
+        name = min(fracture.varying)
+        raise ExperimentError(
+            f"'{name}' of '{fracture.type}' is no limit of a bond: it must be one number",
+            ("fracture", name),
+        )
+
+
+def _probed(
+    experiment: Experiment, constants: SceneConstants, slot: Slot, parameters: Mapping[str, float]
+) -> Floats:
+    """What the model's functions make of some differences."""
+    fracture, p = experiment.fracture, type(constants.fracture)(**parameters)
+    initial = (number.initial for number in bond_numbers(experiment))
+    c = constants.of_bond(*constants.limits[slot], *initial)
+    u = vector(np.linspace(-PROBE, PROBE, 2 * FEW) * math.hypot(*slot.rest) for _ in slot.rest)
+    lost = fracture.fictitious(u, slot.rest, p)
+    answers = [*lost, fracture.breaks(u, slot.rest, c, p)]
+    if isinstance(fracture, Softens):
+        answers += fracture.seen(u, lost, slot.rest, c, p)
+    return np.array([np.broadcast_to(np.asarray(a, float), (2 * FEW,)) for a in answers])
 
 
 def _ends(value: Floats) -> Floats:
@@ -165,7 +199,7 @@ def _ends(value: Floats) -> Floats:
 def _asked(
     part: Any, values: Values, ask: Callable[[Any], Mapping[str, Any]]
 ) -> dict[str, NDArray[Any]]:
-    """What a part answers, by name, for numbers at places; what is the same everywhere is left out.
+    """What a part answers, by name, for numbers at places.
 
     It is asked for whole arrays first. Where it does not take them, or answers otherwise for the
     first places than for each by itself, it is asked once for each kind of place.
@@ -176,8 +210,7 @@ def _asked(
         parts, kind = kinds_of(part, values)
         answers = [ask(one) for one in parts]
         found = {name: np.array([float(a[name]) for a in answers])[kind] for name in names}
-    whole = {name: np.broadcast_to(value, shape) for name, value in found.items()}
-    return {name: value for name, value in whole.items() if (value != value.flat[0]).any()}
+    return {name: np.broadcast_to(value, shape) for name, value in found.items()}
 
 
 def _of_arrays(
