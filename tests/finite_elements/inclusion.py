@@ -147,6 +147,14 @@ class Plate:
         return float(found / wanted)
 
     @property
+    def rim(self) -> tuple[float, float]:
+        """The smallest and the largest σ_x of the inclusion's particles over the exact one, which is
+        the same everywhere in it."""
+        within = np.hypot(*(self.places - CENTRE).T) <= RADIUS + 1e-9
+        exact_one = goodier()[1].stress(1e-3 + 0j)[0]
+        return tuple(float(end(self.stress[within]) / exact_one) for end in (np.min, np.max))
+
+    @property
     def pole(self) -> tuple[float, float, float]:
         """σ_x at the first particle of the matrix on the axis beyond the pole, over the exact one
         there; where it lies, in radii from the centre; the same over the exact one at the pole."""
