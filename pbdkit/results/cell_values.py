@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,27 @@ def _around(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
     return signed_area(r), slopes
 
 
+def _known_beside(
+    gradient: Floats, alike: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
+) -> Floats:
+    """A gradient found from some cells alone, (4, ...): where none of these is, the mean of the
+    particles that share any cell with the place; NaN where they have none either."""
+    shape = gradient.shape[1:]
+    met, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
+    for patch, share in alike:
+        for corner in patch.corners:
+            corner.of(met)[...] += share
+    known = met > 0.0
+    for patch, share in cells:
+        there_is = share > 0.0
+        for here, there in product(patch.corners, repeat=2):
+            here.of(count)[...] += there.of(known) & there_is
+            for plane, value in zip(total, gradient * known, strict=True):
+                here.of(plane)[...] += there.of(value) * there_is
+    mean = np.where(count > 0.0, total, np.nan) / np.where(count > 0.0, count, 1.0)
+    return np.where(known, gradient, mean)
+
+
 TURNED = -1e-6
 """A share of the area at rest; nearer to zero it is rounding, of single precision too."""
 
@@ -124,16 +146,17 @@ class StateCells(CellValues):
     def _by_phase(
         self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
     ) -> Floats:
-        """The gradient from the cells of a particle's own material alone, where there is any: at a
-        border it jumps."""
+        """The gradient from the cells of a particle's own material alone: at a border it jumps.
+        Who has no such cell takes the mean of those beside it that have, if there is any."""
         found, own = whole.copy(), self._tables.phase
         for number in np.unique(own).tolist():
             alike = [
                 (patch, share * (patch.corners[0].of(phase[patch.polygon.kind]) == number))
                 for patch, share in cells
             ]
-            within = self._tables.of_body(displacement_gradient(u, alike))
-            some = (own == number) & within.any(axis=1)
+            planes = _known_beside(displacement_gradient(u, alike), alike, cells)
+            within = self._tables.of_body(planes)
+            some = (own == number) & np.isfinite(within).all(axis=1)
             found[some] = within[some]
         return found
 

@@ -16,6 +16,7 @@ from pairing import Ratio, of_times, ratio, wait_for_quiet
 from recording import recording
 from sheets import (
     CELLS,
+    COMPOSITE,
     DAMAGE,
     DISTANCE,
     ELASTIC,
@@ -96,6 +97,7 @@ def against_plain() -> Iterator[Goal]:
     for name, goal, parts, plain, changed in (
         ("elastic under the natural frame against elastic", 1.7, NATURAL, CELLS, None),
         ("elastic, every cell with its own stiffness", 1.5, NATURAL, CELLS, stiffened),
+        ("elastic, stiffness by region against one number", 1.5, COMPOSITE, NATURAL, None),
         ("strain with scatter against threshold", 2.0, SCATTERED, FRACTURE, None),
         ("damage against threshold", 2.5, DAMAGE, FRACTURE, None),
     ):

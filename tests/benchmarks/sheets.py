@@ -68,6 +68,17 @@ CELLS = {
     "neighbours": {"type": "chebyshev", "shells": 1},
 }
 NATURAL = CELLS | {"frame": {"type": "natural"}}
+COMPOSITE = {
+    "regions": {"inclusion": {"type": "disc", "radius": 300.0, "centre": [499.5, 499.5]}},
+    "rule": {
+        "type": "elastic",
+        "poisson_ratio": 0.3,
+        "stiffness": {"otherwise": 1.0, "inclusion": 10.0},
+    },
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "frame": {"type": "natural"},
+}
+"""Stiffer in a disc, laminates along its border."""
 SCATTERED = {"fracture": {"type": "strain", "failure": 2.0, "scatter": 0.1}}
 DAMAGE = {"fracture": {"type": "damage", "onset": 0.5, "failure": 2.0}}
 FRACTURE = {"fracture": {"type": "threshold", "thresholds": [3.0]}}
