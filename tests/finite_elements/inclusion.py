@@ -193,7 +193,9 @@ def plate(cells: int) -> Plate:
             },
         },
         "frame": {"type": "natural"},
-        "leaders": [{"select": {"edge": edge}, "motion": {"type": "measured", **known}} for edge in edges],
+        "leaders": [
+            {"select": {"edge": edge}, "motion": {"type": "measured", **known}} for edge in edges
+        ],
         "steps": 1,
         "solver": {"type": "equilibrium", "tolerance": 1e-9},
         "diagnostics": [{"type": "displacement"}, {"type": "stress", "youngs_modulus": 1.0}],
