@@ -148,8 +148,8 @@ class Plate:
 
     @property
     def rim(self) -> tuple[float, float]:
-        """The smallest and the largest σ_x of the inclusion's particles over the exact one, which is
-        the same everywhere in it."""
+        """The smallest and the largest σ_x of the inclusion's particles over the exact one, which
+        is the same everywhere in it."""
         within = np.hypot(*(self.places - CENTRE).T) <= RADIUS + 1e-9
         exact_one = goodier()[1].stress(1e-3 + 0j)[0]
         return tuple(float(end(self.stress[within]) / exact_one) for end in (np.min, np.max))
