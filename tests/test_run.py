@@ -32,7 +32,7 @@ SOLVERS = {
 }
 
 
-ROLES = "stepping until the roles change"
+ROLES = "stepping until roles and loads change no more"
 
 
 def scene_of(given: dict[str, Any], **parts: Any) -> Scene:
