@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from finite_elements.inclusion import jumps, plate
 from interpreted_kernels import interpreting
 from test_engines import assert_bitwise_equal
 
@@ -234,3 +235,30 @@ def test_a_region_that_holds_all_is_as_one_number(parts):
             }
     found, expected = (pbdkit.run(one, progress=False)["position"] for one in (given, uniform))
     np.testing.assert_allclose(found.values, expected.values, rtol=0.0, atol=1e-12)
+
+
+def test_a_crack_takes_its_energy_whatever_the_material():
+    """A bond n times as stiff breaks at an nth of the strain: ½ k l² onset · failure is one."""
+    given = bar(8.0, 4.0, stiffness={"otherwise": 1.0, "stiff": 3.0}) | {
+        "regions": {"stiff": {"type": "rectangle", "width": 9.0, "height": 6.0, "origin": [4, -1]}},
+        "fracture": {"type": "cohesive", "energy": 1e-5, "onset": 1e-3},
+        "diagnostics": [],
+    }
+    found = np.unique(build_scene(pbdkit.Experiment(**given)).constants.by_bond["failure_strain"])
+    wanted = []
+    for stiffness in (1.0, 3.0):
+        rule = given["rule"] | {"stiffness": stiffness}
+        limits = build_scene(pbdkit.Experiment(**given | {"rule": rule})).constants.limits
+        wanted += [limit.failure_strain for limit in limits.values()]
+    np.testing.assert_allclose(found, np.unique(wanted), rtol=1e-12)
+
+
+def test_a_round_inclusion_is_that_of_the_exact_solution():
+    """Goodier's: the strain of the inclusion, and the stress of the plate beside its pole."""
+    assert max(jumps()) < 1e-12
+    rough, fine = plate(10), plate(20)
+    assert fine.error < rough.error / 1.6 < 0.03
+    assert abs(fine.stretch - 1.0) < 0.6 * abs(rough.stretch - 1.0) < 0.04
+    for found, within in ((rough, 0.06), (fine, 0.03)):
+        there, _, at_pole = found.pole
+        assert max(abs(there - 1.0), abs(at_pole - 1.0)) < within

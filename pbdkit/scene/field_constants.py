@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from operator import add
@@ -19,6 +19,7 @@ from pbdkit.interfaces import (
     Draws,
     FollowerRule,
     FractureModel,
+    KnowsStiffness,
     Setting,
     Slot,
     Softens,
@@ -31,7 +32,7 @@ from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.field_values import Values, kinds_of, values_at
 from pbdkit.scene.homes import SceneConstants, of_material
 from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.places import Floats
+from pbdkit.scene.places import Floats, Mask
 from pbdkit.scene.raster import Raster
 
 FEW = 3
@@ -59,7 +60,7 @@ def with_fields(
         with blaming(rule, "when asked for its constants", "rule"):
             found = _by_particle(experiment, raster, setting, constants)
         constants = replace(constants, by_particle=found)
-    if fracture.varying and fracture.can_break:
+    if fracture.can_break and (fracture.varying or _knows_varying(fracture, rule)):
         with blaming(fracture, "when asked for its constants", "fracture"):
             found = _by_bond(experiment, raster, neighbourhood, constants, setting)
         constants = replace(constants, by_bond=found)
@@ -85,6 +86,11 @@ def _refuse(experiment: Experiment) -> None:
             )
 
 
+def _knows_varying(fracture: FractureModel, rule: FollowerRule) -> bool:
+    """Whether bonds break by a stiffness that differs from place to place."""
+    return isinstance(fracture, KnowsStiffness) and bool(rule.varying)
+
+
 def _draws(part: TakesFields) -> bool:
     """Whether numbers that stay come from the part's parameters."""
     return isinstance(part, Draws) and any(not number.changes for number in part.remembered())
@@ -93,8 +99,7 @@ def _draws(part: TakesFields) -> bool:
 def _by_particle(
     experiment: Experiment, raster: Raster, setting: Setting, constants: SceneConstants
 ) -> dict[str, Floats]:
-    """(sublattice, cell, cell) by name, of the rule's parameters; frame points have those that
-    serve for all."""
+    """(sublattice, cell, cell) by name; frame points have the parameters that serve for all."""
     rule, rows = experiment.rule, raster.body_rows
     x, y = raster.reference(rows).T
     values = values_at(experiment, "rule", x, y, np.ones(len(rows), bool))
@@ -144,15 +149,29 @@ def _by_bond(
         x, y = np.broadcast_arrays(*middle)
         needed = bonds_in(raster, block, plane, frame_too=False)
         values = values_at(experiment, "fracture", x, y, needed)
-        ask = partial(_limits, plane.slot, experiment.rule, setting)
-        for name, limits in _asked(fracture, values, ask).items():
-            block.within(found[name][n])[...] = limits
-        _refuse_parameters(experiment, constants, plane.slot, values)
+        for rule, some in _rules_at(experiment, x, y, needed):
+            ask = partial(_limits, plane.slot, rule, setting)
+            own = {name: value[some] for name, value in values.items()}
+            for name, limits in (_asked(fracture, own, ask) if own else ask(fracture)).items():
+                block.within(found[name][n])[some] = limits
+        if values:
+            _refuse_parameters(experiment, constants, plane.slot, values)
     return {
         name: planes
         for name, planes in found.items()
         if any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
     }
+
+
+def _rules_at(
+    experiment: Experiment, x: Floats, y: Floats, needed: Mask
+) -> Iterator[tuple[FollowerRule, Mask]]:
+    """The rule as the fracture model knows it, and where: of each kind of place, if it does."""
+    rule = experiment.rule
+    parts, kind = [rule], np.zeros(x.shape, np.intp)
+    if _knows_varying(experiment.fracture, rule):
+        parts, kind = kinds_of(rule, values_at(experiment, "rule", x, y, needed))
+    yield from ((part, kind == n) for n, part in enumerate(parts))
 
 
 def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: FractureModel) -> Any:
