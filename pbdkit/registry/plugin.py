@@ -14,7 +14,6 @@ from typing import Any
 
 import pluggy
 from pydantic import ValidationError
-from pydantic.json_schema import models_json_schema
 
 from pbdkit.interfaces import INTERFACES, Component, SharesParticles
 from pbdkit.registry import BUILTIN, GROUP
@@ -120,7 +119,7 @@ def checked(component: Any) -> Offer:
         raise TypeError(f"{own} lacks {missing}")
     _check_functions(component)
     try:
-        models_json_schema([(component, "validation")])
+        component.model_json_schema()
     except Exception as error:
         why = f"cannot be described in a JSON Schema: {worded(error)}"
         raise TypeError(f"the parameters of {own} {why}") from None
