@@ -40,7 +40,7 @@ def constant_arrays(plan: Plan) -> Arrays:
     }
     if scene.cells:
         arrays["share"] = np.array(scene.cells.weight, real)
-        if mixed := scene.cells.mixed:  # of a cell one beside the other: they are few, and far apart
+        if mixed := scene.cells.mixed:  # those of a cell side by side
             arrays["mixed"] = np.stack(mixed, axis=-1).astype(real)
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
