@@ -40,7 +40,8 @@ def constant_arrays(plan: Plan) -> Arrays:
     }
     if scene.cells:
         arrays["share"] = np.array(scene.cells.weight, real)
-        arrays |= {f"mixed{m}": np.array(v, real) for m, v in enumerate(scene.cells.mixed)}
+        if mixed := scene.cells.mixed:  # those of a cell side by side
+            arrays["mixed"] = np.stack(mixed, axis=-1).astype(real)
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
     if frame := scene.frame:

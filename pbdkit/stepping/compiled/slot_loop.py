@@ -82,9 +82,10 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
+            if plan.mixed:
+                out.add(depth, f"cell = {plan.mixed} * (at_j + cells_away[s, k, {side}])")
             for m in range(plan.mixed):
-                shares = f"flat_mixed{m}[at_j + cells_away[s, k, {side}]]"
-                out.add(depth, f"mixed{m}_{side} = {shares}")
+                out.add(depth, f"mixed{m}_{side} = flat_mixed[cell + {m}]")
     shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
     fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
