@@ -95,7 +95,7 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     recorded = np.dtype(experiment.record.dtype).itemsize
     each_time, every_step = 2 * recorded + 1.0, 0
     each_bond = 17 + 12 * experiment.parts_bonds
-    once: float = (2 + bool(experiment.units)) * 2 * 8 + 2 * 4 + 2 * 8
+    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 4 + 2 * 8
     once += experiment.shows_bonds * planes * each_bond
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
     of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
