@@ -219,7 +219,7 @@ class BearsTwice(pbdkit.Loadable, Sound):
 
     type: Literal["bears-twice"] = "bears-twice"
 
-    def stiffness(self):
+    def elasticity(self):
         return pbdkit.Stiffness(1.0, 1.0, 0.0, 0.5)
 
     @staticmethod
