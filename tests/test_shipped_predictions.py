@@ -20,9 +20,11 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
-BARE = [n for n in shipped_names() if not pbdkit.load(n).obstacles]
-"""Of obstacles `check` says nothing."""
-TORN = [n for n in shipped_names() if pbdkit.load(n).fracture.type != "none"]
+MASSES = {"modelling/mass-on-a-bar"}
+BARE = [n for n in shipped_names() if not pbdkit.load(n).obstacles and n not in MASSES]
+"""Of obstacles `check` says nothing, and masses have no place at which they rest beforehand."""
+TORN = [n for n in BARE if pbdkit.load(n).fracture.type != "none"]
+STEPS = [n for n in TORN if pbdkit.load(n).solver.makes_steps]
 STEPPED = "solver={type: stepping, relaxation: 0.2}"
 SWINGING = "solver={type: stepping, memory: 0.9}"
 SMALLER = {
@@ -43,6 +45,8 @@ SMALLER = {
 stable steps where they are not those of the file, which goes straight to equilibrium."""
 LONG = ["steps=100000", "record={at: [100000]}"]
 STRAIGHT = ["solver={type: equilibrium, tolerance: 1.0e-10}"]
+NEAREST = {"paper/a-weighted": ["solver.tolerance=1.0e-13"]}
+"""Newton's iteration stops within the tolerance, and not to rounding, as one solution does."""
 SHAKEN = 0.1
 HANGING = 1e-5
 """So near to 1 are the modes of what hangs by a line of springs, in tension or compression."""
@@ -83,7 +87,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
     window = min(window, steps)  # near critical damping nothing is left of a swing
 
     scene = scene_with(name, *whole)
-    straight = scene_with(name, *whole, *STRAIGHT)
+    straight = scene_with(name, *whole, *STRAIGHT, *NEAREST.get(name, []))
     settled = body_of(straight, equilibrium_state(straight)[0])
     stepper = Stepper(scene)
     state = shaken(scene, stepper.advance(initial_state(scene), at_rest(scene)))
@@ -96,7 +100,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
     assert abs(math.log(excess)) < 0.05 * math.log(1e3)
 
 
-@pytest.mark.parametrize("name", TORN)
+@pytest.mark.parametrize("name", STEPS)
 def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
     """check speaks of the whole body, and says so; the operator of the torn one has the rate.
 

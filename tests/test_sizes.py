@@ -115,7 +115,7 @@ for name in json.load(sys.stdin):
 from pbdkit.runs.course import peak_memory
 print(peak_memory())
 """
-EQUILIBRIA = {"factors": (80, CALIBRATED), "grids": (800, [])}
+EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (800, [])}
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")

@@ -69,7 +69,8 @@ def check_diagnostics(
             if diagnostic.needs & {"material", "forces"}:
                 _refuse_without_material(diagnostic, experiment)
             for variable in diagnostic.variables():
-                if "obstacle" in variable.dims and not experiment.obstacles:
+                ours = diagnostic.own_dimension != "obstacle" and not diagnostic.coordinates()
+                if "obstacle" in variable.dims and ours and not experiment.obstacles:
                     raise ExperimentError(f"'{diagnostic.type}' is of obstacles, and there is none")
                 if variable.name in taken:
                     other = f"{taken[variable.name]} does too"
