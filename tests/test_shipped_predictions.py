@@ -34,6 +34,9 @@ SMALLER = {
     "material/hole": ["lattice.a=0.2"],
     "modelling/cantilever-weight": ["lattice.a=0.5", SWINGING],
     "modelling/hanging-bar": ["lattice.a=0.5", SWINGING],
+    "modelling/inclusion": ["lattice.a=1.0", SWINGING],
+    "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
+    "modelling/composite-plate": ["lattice.a=4.0", SWINGING],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],
     "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
     + [
