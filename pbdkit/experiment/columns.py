@@ -26,6 +26,19 @@ def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
     return either
 
 
+def in_place_of(
+    given: Any, info: ValidationInfo, columns: Sequence[str], names: Sequence[str]
+) -> tuple[dict[str, Any], list[list[float]]] | None:
+    """What is given besides `file`, and the rows of these columns in it, which take the place of
+    the fields of these names; None where no file is given."""
+    if not isinstance(given, dict) or given.get("file") is None:
+        return None
+    if given.keys() & {*names}:
+        raise fault(f"give either a file, or {' and '.join(names)}", key="file")
+    rest = {key: value for key, value in given.items() if key != "file"}
+    return rest, read_columns(given["file"], info, columns)
+
+
 def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:
     """The rows of a file, relative to the experiment's, numbers in the order of the names.
 

@@ -9,9 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationInfo, model_validator
 
-from pbdkit.experiment.columns import MOST_ROWS, or_a_file, read_columns
+from pbdkit.experiment.columns import MOST_ROWS, in_place_of, or_a_file
 from pbdkit.experiment.motion import Floats, Motion, Steps
-from pbdkit.experiment.parts import fault
 from pbdkit.interfaces.units import Place
 
 Pairs = Annotated[tuple[Place, ...], Field(strict=False, min_length=2, max_length=MOST_ROWS)]
@@ -38,13 +37,11 @@ class Measured(Motion):
     @model_validator(mode="before")
     @classmethod
     def _read(cls, given: Any, info: ValidationInfo) -> Any:
-        if not isinstance(given, dict) or given.get("file") is None:
+        read = in_place_of(given, info, ("x", "y", "ux", "uy"), ("points", "displacements"))
+        if read is None:
             return given
-        if "points" in given or "displacements" in given:
-            raise fault("give either a file, or points and displacements", key="file")
-        rows = read_columns(given["file"], info, ("x", "y", "ux", "uy"))
+        rest, rows = read
         points, displacements = ([tuple(row[n : n + 2]) for row in rows] for n in (0, 2))
-        rest = {key: value for key, value in given.items() if key != "file"}
         return rest | {"points": points, "displacements": displacements}
 
     @model_validator(mode="after")

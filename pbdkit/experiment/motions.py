@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Field, SerializeAsAny, ValidationInfo, model_validator
 
-from pbdkit.experiment.columns import MOST_ROWS, or_a_file, read_columns
+from pbdkit.experiment.columns import MOST_ROWS, in_place_of, or_a_file
 from pbdkit.experiment.measured_motion import Measured
 from pbdkit.experiment.motion import Floats, Motion, Steps
 from pbdkit.experiment.newton import Newton
@@ -107,18 +107,16 @@ class Table(Tabulated):
     @model_validator(mode="before")
     @classmethod
     def _read(cls, given: Any, info: ValidationInfo) -> Any:
-        if not isinstance(given, dict) or given.get("file") is None:
+        read = in_place_of(given, info, ("step", "ux", "uy"), ("steps", "displacements"))
+        if read is None:
             return given
-        if "steps" in given or "displacements" in given:
-            raise fault("give either a file, or steps and displacements", key="file")
-        rows = read_columns(given["file"], info, ("step", "ux", "uy"))
+        rest, rows = read
         if rows[0] == [0.0, 0.0, 0.0]:  # where every motion starts
             del rows[0]
         if wrong := [row[0] for row in rows if row[0] < 1 or row[0] % 1]:
             text = f"{given['file']}: steps are whole numbers from 1 on, got {wrong[0]:g}"
             raise fault(f"{text}; at step 0 nothing is displaced yet", key="file")
         steps, displacements = [int(row[0]) for row in rows], [tuple(row[1:]) for row in rows]
-        rest = {key: value for key, value in given.items() if key != "file"}
         return rest | {"steps": steps, "displacements": displacements}
 
 

@@ -93,8 +93,6 @@ class Gridded(Varying):
             for name in ("x", "y", "values")
         )
 
-    __hash__ = None  # type: ignore[assignment]  # arrays can be long, and nobody asks
-
     @property
     def samples(self) -> dict[str, float]:
         """The median, the smallest and the largest."""

@@ -40,8 +40,8 @@ class Physical:
             quantity = QUANTITIES.get(variable.units)
             if quantity and quantity.youngs_modulus and self._gave(diagnostic, quantity):
                 assert self._units is not None
-                own = {"lattice_units": quantity.lattice.replace("unit of ", "")}
-                own["lattice_factor"] = 1.0 / self._units.scale(quantity)  # type: ignore[assignment]
+                own: dict[str, Any] = {"lattice_units": quantity.lattice.replace("unit of ", "")}
+                own["lattice_factor"] = 1.0 / self._units.scale(quantity)
                 attributes = variable.attributes | own
                 factor = (self._units.value("length") or 1.0) ** quantity.length
                 yield replace(variable, units=quantity.unit, attributes=attributes), factor

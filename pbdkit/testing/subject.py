@@ -76,10 +76,10 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
     field = next(f for f, i in INTERFACES.items() if i is interface_of(type(component)))
     neighbours = list(NEIGHBOURS.values())
     given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 6, **parts}
-    if field == "diagnostics":
+    if isinstance(component, Diagnostic):
         given |= {"leaders": PULLED, "fracture": parts.get("fracture", TEARING)}
         with suppress(Exception):  # what fails is asked about directly, and named there
-            if any("obstacle" in v.dims for v in component.variables()):  # type: ignore[attr-defined]
+            if any("obstacle" in v.dims for v in component.variables()):
                 given |= {"obstacles": [PRESSING]}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # the model has one threshold
         given |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
