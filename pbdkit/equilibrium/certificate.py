@@ -16,6 +16,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.guard import way_of
+from pbdkit.stepping.prescription import bends_of
 from pbdkit.stepping.state import Floats, State
 
 WAYS = {
@@ -96,7 +97,8 @@ def _way_under_loads(scene: Scene, rest: State) -> float:
     nothing holds the body against them."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
-    pushes = [moves.at(rest, c) for c in (scene.loads.changes(steps) if scene.loads else ())]
+    moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
+    pushes = [moves.at(rest, moment) for moment in sorted(moments)]
     if any(push.any() for push in pushes):
         with suppress(ExperimentError, StuckError), one_thread():
             system = linearised(scene, rest, steps, "auto", Watch())

@@ -160,7 +160,7 @@ def _settle_bonds_at(
 ) -> Certificate:
     """Until no bond changes any more, `most` times at most; what breaks does so in a `step`, by
     default that of the moment."""
-    fracturing = Fracturing.of(scene)
+    fracturing = Fracturing.of(scene.at(moment))
     for _ in range(most):
         if finder.linear:
             certificate = _settle_at(scene, state, finder, moment)
@@ -202,7 +202,7 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
 
 def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certificate:
     if finder.scene.barriers:
-        return follow_contact(finder, state, moment)
+        return follow_contact(finder.at(moment), state, moment)
     return finder.follow(state, moment, before)
 
 
@@ -215,7 +215,7 @@ def _stepped(
     place(state.u, led)
     for _ in range(MOST_ROUNDS):
         for _ in range(STEPS_A_ROUND):
-            state.u += finder.moves.at(state, moment)
+            state.u += finder.at(moment).moves.at(state, moment)
         if not np.isfinite(state.u).all():
             break
         found = state.copy()

@@ -10,7 +10,7 @@ import numpy as np
 from pbdkit.equilibrium.certificate import spacing_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.guard import way_of
-from pbdkit.stepping.prescription import last_event
+from pbdkit.stepping.prescription import bends_of, last_event
 
 SAMPLES = 16
 """Parts of an interval in which the way of a leader counts as straight."""
@@ -18,10 +18,10 @@ SAMPLES = 16
 
 def events(scene: Scene) -> list[int]:
     """The moments, from 0 on, between which each leader moves by one formula, all keep their roles
-    and bonds that are not torn, and loads come and go evenly: the ends of steps, up to the last of
-    the load."""
+    and bonds that are not torn, and loads and numbers change evenly: the ends of steps, up to the
+    last of the load."""
     steps, last = scene.experiment.steps, last_event(scene)
-    found = {0, last, *(cut.at - 1 for cut in scene.experiment.cuts)}
+    found = {0, last, *bends_of(scene), *(cut.at - 1 for cut in scene.experiment.cuts)}
     for change in scene.loads.changes(steps) if scene.loads else ():
         found |= {change - 1, change}
     for leading in scene.driven:
@@ -34,13 +34,14 @@ def events(scene: Scene) -> list[int]:
 
 def moments(scene: Scene, count: int) -> list[float]:
     """The ends of about `count` increments, equal parts of the way that the leaders go, as many of
-    what the loads do, and every event. An increment is some whole steps, or a step some whole
-    increments; where nobody moves there is one."""
+    what loads and numbers do, and every event. An increment is some whole steps, or a step some
+    whole increments; where nobody moves there is one."""
     ends = events(scene)
     intervals = list(pairwise(ends)) or [(0, ends[-1])]
     shares, found = _in_parts(count, [_way(scene, *i) for i in intervals]), list[float]()
-    if scene.loads:
-        shares = list(map(max, shares, _in_parts(count, [scene.loads.way(*i) for i in intervals])))
+    ways = [course.way for course in scene.experiment.courses.values()]
+    for way in [*ways, *([scene.loads.way] if scene.loads else [])]:
+        shares = list(map(max, shares, _in_parts(count, [way(*i) for i in intervals])))
     for (begin, end), parts in zip(intervals, shares, strict=True):
         a_step = round(parts / (end - begin))
         if a_step > 0:

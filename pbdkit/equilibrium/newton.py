@@ -35,8 +35,8 @@ UNSTABLE = "what is found is not stable"
 
 @dataclass(frozen=True)
 class Finder:
-    """Looks for equilibria of a scene, to within a length, by one of the solver's methods. `scale`
-    is the length that shares are of."""
+    """Looks for equilibria of a scene, to within a length, by one of the solver's methods; shares
+    are of the length `scale`."""
 
     scene: Scene
     tolerance: float
@@ -65,24 +65,25 @@ class Finder:
             moves = [self.moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
             return system.mismatch(put, *moves) <= LINEAR
 
-    def find(self, state: State, moment: float) -> Certificate:
-        """Moves the followers of `state`, in place, to where they rest, with the roles of the step
-        of a moment and the loads of that moment, by the linearisation of the scene at rest, exact
-        for linear rules.
+    def at(self, moment: float) -> Finder:
+        """The same with the numbers of a moment."""
+        now = self.scene.at(moment)
+        return self if now is self.scene else replace(self, scene=now)
 
-        Raises ExperimentError where a part of the body has no equilibrium, UnconvergedError and
-        StoppedError.
-        """
+    def find(self, state: State, moment: float) -> Certificate:
+        """Moves the followers of `state`, in place, to where they rest with the roles, loads and
+        numbers of a moment, by the linearisation at rest, exact for linear rules. Raises
+        ExperimentError where a part has no equilibrium, UnconvergedError and StoppedError."""
         with one_thread():
-            return _Linear(self, state, moment).run()
+            return _Linear(self.at(moment), state, moment).run()
 
     def follow(self, state: State, moment: float, before: State) -> Certificate:
-        """The same for rules that are not linear, from the equilibrium `before` leaders and loads
-        went on a little: by Newton's iteration, as long as each correction is much smaller than
-        the last, so that no other equilibrium is nearer. What is found is stable."""
+        """The same for rules that are not linear, from the equilibrium `before` all went on a
+        little: by Newton's iteration, as long as each correction is much smaller than the last,
+        so that no other equilibrium is nearer. What is found is stable."""
         with one_thread():
             try:
-                return _Newton(self, state, moment, before).run()
+                return _Newton(self.at(moment), state, moment, before).run()
             except IndefiniteError:
                 raise UnconvergedError(UNSTABLE) from None
 

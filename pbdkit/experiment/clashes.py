@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pbdkit.experiment.newton import Newton
-from pbdkit.interfaces import Calibrated, Loadable, RenewsParticles, Softens
+from pbdkit.interfaces import Calibrated, Draws, Loadable, RenewsParticles, Softens
 from pbdkit.interfaces.fields import unknown_regions
 from pbdkit.interfaces.rule import material_of
 
@@ -19,9 +19,20 @@ def clashes_of(asked: Any) -> Iterator[tuple[Key, str]]:
     for field in ("rule", "fracture"):
         for name, text in unknown_regions(getattr(asked, field), asked.regions):
             yield (field, name), text
+        yield from _drawn_from(field, getattr(asked, field))
     for name, region in asked.regions.items():
         if any(box.in_sites for box in region.boxes()):
             yield ("regions", name), "counts sites, and a region is a place: take a rectangle"
+
+
+def _drawn_from(field: str, part: Any) -> Iterator[tuple[Key, str]]:
+    draws = isinstance(part, Draws) and any(not number.changes for number in part.remembered())
+    for name in part.courses if draws else ():
+        yield (
+            (field, name),
+            f"'{part.type}' draws numbers from it before the first step, so that it cannot change; "
+            "give one number, or draw none",
+        )
 
 
 def _looked_at(asked: Any) -> Iterator[tuple[Key, bool, str]]:

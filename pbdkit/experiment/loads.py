@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.course import Course, at
 from pbdkit.interfaces.units import BodyForce, Force
 
 
@@ -19,7 +20,7 @@ class Load(Strict):
     `force` is what acts on all of them together, in units of Young's modulus, thickness and lattice
     unit. Particles on a line share it by the length that falls to each, others equally.
     `body_force` acts on a unit of area, in units of Young's modulus and thickness over lattice
-    unit. Followers are moved by it; leaders carry it.
+    unit. Each of the two may be a course in time. Followers are moved by it; leaders carry it.
     """
 
     select: Selection
@@ -42,7 +43,14 @@ class Load(Strict):
 
     def force_at(self, moment: float) -> NDArray[np.float64]:
         """(axis,): the force at a moment, in all or of a unit of area."""
-        return 0.0 + self.amplitude(moment) * np.array(self.force or self.body_force)
+        forces = [at(each, moment) for each in self.force or self.body_force or ()]
+        return 0.0 + self.amplitude(moment) * np.array(forces)
+
+    @property
+    def courses(self) -> list[Course[float]]:
+        """Of the forces that change while it acts."""
+        forces = self.force or self.body_force or ()
+        return [each for each in forces if isinstance(each, Course)]
 
     def amplitude(self, moment: float) -> float:
         """The share of the force that acts at the end of a step, or at a moment within it, where it
@@ -52,5 +60,5 @@ class Load(Strict):
         return come - gone
 
     def changes(self) -> tuple[int, ...]:
-        """The steps in which another force acts than in the step before."""
+        """The steps in which it begins and ceases to act."""
         return (self.from_,) if self.until is None else (self.from_, self.until + 1)

@@ -43,6 +43,7 @@ from pbdkit.interfaces import (
     NeighbourMetric,
 )
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.course import Course
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.units import Scales, Units, given_by_units, of_one_material
 from pbdkit.registry.registry import Registry
@@ -136,6 +137,7 @@ class Experiment(Strict):
             dumped["type"] = self._registry.name_of(part)
             if isinstance(part, TakesFields):
                 dumped |= {name: field.written() for name, field in part.varying.items()}
+                dumped |= {name: c.model_dump(mode="json") for name, c in part.courses.items()}
             for name in given_by_units(part):
                 if self.units and self.units.value(name):
                     del dumped[name]  # there it is said
@@ -183,6 +185,18 @@ class Experiment(Strict):
             rule = self.rule.with_values(**values)
             found[label] = self.model_copy(update={"rule": rule})
         return found or {"": self}
+
+    @property
+    def courses(self) -> dict[tuple[str, str], Course[float]]:
+        """What changes in the course of the steps, by part and parameter; loads say it themselves.
+        In its field each parameter stands as it is in the end."""
+        parts = {"rule": self.rule, "fracture": self.fracture, "solver": self.solver}
+        return {(f, n): course for f, part in parts.items() for n, course in part.courses.items()}
+
+    def at(self, moment: float) -> Experiment:
+        """The experiment with its numbers as they are at the end of a step, or within it."""
+        parts = {field: getattr(self, field).at(moment) for field, _ in self.courses}
+        return self.model_copy(update=parts)
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.experiment.motion import Floats, Motion
+from pbdkit.interfaces.course import at
 from pbdkit.interfaces.units import Force, Place
 
 
@@ -31,10 +32,11 @@ class Newton(Motion):
         """Nothing is known beforehand."""
         return np.zeros(start.shape[1])
 
-    def faster(self, velocity: Floats, pull: Floats, share: Floats) -> Floats:
-        """The velocities (particle, axis) a step on, with what neighbours exert and each one's
-        share of the force."""
-        force = share[:, None] * np.array(self.force) + pull - self.damping * velocity
+    def faster(self, step: int, velocity: Floats, pull: Floats, share: Floats) -> Floats:
+        """The velocities (particle, axis) at the end of a step, with what neighbours exert and each
+        one's share of the force."""
+        force = share[:, None] * np.array([at(each, step) for each in self.force])
+        force += pull - self.damping * velocity
         return np.asarray(velocity + force / self.mass)
 
     def lightest(self, stiffness: float) -> float:

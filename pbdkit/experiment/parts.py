@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -17,6 +17,7 @@ from pbdkit.experiment.field_file import read_field
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
 from pbdkit.interfaces.component import did_you_mean
+from pbdkit.interfaces.course import FORMS, WORD
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.units import TEXT
 from pbdkit.registry.blame import blame
@@ -37,7 +38,7 @@ _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20}
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """The error to raise instead: a line a fault, the first few of them."""
-    found = list(_told_once(error.errors(include_url=False)))
+    found = [_plainly(fault) for fault in error.errors(include_url=False)]
     faults = [f for f in found if f["type"] != "too_short" or not _follows(f, found)]
     lines = [source.message(*_described(fault)) for fault in faults[:SHOWN]]
     if len(faults) > SHOWN:
@@ -45,22 +46,11 @@ def report(error: ValidationError, source: Source) -> ExperimentError:
     return ExperimentError("\n".join(lines), _described(faults[0])[0])
 
 
-AUTO = "literal['auto']"
-"""What pydantic calls the word among what may also be a number."""
-
-
-def _told_once(found: Iterable[Any]) -> Iterator[Any]:
-    """Of what is neither that word nor such a number, one fault instead of two."""
-    found = list(found)
-    either = {fault["loc"][:-1] for fault in found if fault["loc"][-1:] == (AUTO,)}
-    for fault in found:
-        where, is_word = fault["loc"][:-1], fault["loc"][-1:] == (AUTO,)
-        if where not in either:
-            yield fault
-        elif is_word and isinstance(fault["input"], str):
-            yield fault | {"loc": where, "msg": "should be a number or 'auto'"}
-        elif not is_word and not isinstance(fault["input"], str):
-            yield fault | {"loc": where}
+def _plainly(fault: Any) -> Any:
+    """The fault without the names of forms, and with all that a word could also be."""
+    where = tuple(word for word in fault["loc"] if word not in FORMS)
+    said = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
+    return fault | {"loc": where} | said
 
 
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:

@@ -4,14 +4,32 @@ family."""
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar
 
-from pydantic import Field, SerializeAsAny
+from pydantic import Discriminator, Field, SerializeAsAny, Tag
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.course import COURSE, NUMBER, WORD, Course, form_of, last
+
+Value = TypeVar("Value")
+
+
+def _form_of(value: object) -> str:
+    """Which form is meant where a word is taken too."""
+    return WORD if isinstance(value, str) else form_of(value)
+
+
+Word = Annotated[Literal["auto"], Tag(WORD)]
+Auto = Annotated[Word | Annotated[Value, Tag(NUMBER)], Discriminator(_form_of)]
+"""A number, or the word for the best that there is."""
+AutoInTime = Annotated[
+    Word | Annotated[Value, Tag(NUMBER)] | Annotated[Course[Value], Tag(COURSE)],
+    Discriminator(_form_of),
+]
+"""The same, or the course of the number."""
 
 
 class Settle(Strict):
@@ -39,6 +57,11 @@ class Solver(Component):
         more."""
         return _sought()
 
+    @property
+    def courses(self) -> dict[str, Course[float]]:
+        """The parameters that change in the course of the steps."""
+        return {}
+
 
 @cache
 def _stepping() -> Stepping:
@@ -54,8 +77,9 @@ class Stepping(Solver):
     """One step after the other.
 
     `relaxation` w and `memory` b apply to any rule's move, for followers only:
-    x(t+1) = m + w · move + b · (x(t) - x(t-1)). `engine`: numpy, compiled, or what serves the scene
-    best; `precision` is that of the run's own numbers; `threads` for the compiled engine. With
+    x(t+1) = m + w · move + b · (x(t) - x(t-1)); each may be a course in time. `engine`: numpy,
+    compiled, or what serves the scene best; `precision` is that of the run's own numbers; `threads`
+    for the compiled engine. With
     `settle` the run ends where it has settled, after `steps` at the latest. `auto` for `relaxation`
     or `memory` takes what lets the slowest mode of the scene shrink fastest; results hold numbers.
     """
@@ -63,11 +87,11 @@ class Stepping(Solver):
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
-    threads: Literal["auto"] | Annotated[int, Field(ge=1, le=1024)] = "auto"
-    asked_relaxation: Literal["auto"] | Annotated[float, Field(gt=0.0, le=1e6)] = Field(
+    threads: Auto[Annotated[int, Field(ge=1, le=1024)]] = "auto"
+    asked_relaxation: AutoInTime[Annotated[float, Field(gt=0.0, le=1e6)]] = Field(
         default=1.0, alias="relaxation"
     )
-    asked_memory: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = Field(
+    asked_memory: AutoInTime[Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(
         default=0.0, alias="memory"
     )
     settle: Settle | None = None
@@ -83,13 +107,24 @@ class Stepping(Solver):
         return "auto" in (self.asked_relaxation, self.asked_memory)
 
     @property
+    def courses(self) -> dict[str, Course[float]]:
+        """The course of relaxation and memory, where they have one."""
+        both = {"relaxation": self.asked_relaxation, "memory": self.asked_memory}
+        return {name: asked for name, asked in both.items() if isinstance(asked, Course)}
+
+    def at(self, moment: float) -> Stepping:
+        """The same with the numbers of a moment."""
+        now = {f"asked_{name}": course.at(moment) for name, course in self.courses.items()}
+        return self.model_copy(update=now)
+
+    @property
     def relaxation(self) -> float:
-        """w. Raises ExperimentError where it is yet to be chosen."""
+        """w, in the end. Raises ExperimentError where it is yet to be chosen."""
         return _number(self.asked_relaxation, "relaxation")
 
     @property
     def memory(self) -> float:
-        """b. Raises ExperimentError where it is yet to be chosen."""
+        """b, in the end. Raises ExperimentError where it is yet to be chosen."""
         return _number(self.asked_memory, "memory")
 
     def with_weights(self, relaxation: float, memory: float) -> Stepping:
@@ -98,11 +133,11 @@ class Stepping(Solver):
         return self.model_copy(update=chosen)
 
 
-def _number(asked: Literal["auto"] | float, name: str) -> float:
+def _number(asked: Literal["auto"] | float | Course[float], name: str) -> float:
     if asked == "auto":
         text = "'auto' is a number only once it is chosen for a scene: pbdkit.runs.tuning.tuned"
         raise ExperimentError(text, ("solver", name))
-    return asked
+    return last(asked)
 
 
 class Equilibrium(Solver):

@@ -1,4 +1,4 @@
-"""Components whose numbers may be fields: a value for each place."""
+"""Components whose numbers may be fields, a value for each place, or courses in time."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, did_you_mean
+from pbdkit.interfaces.course import Course, as_course
 from pbdkit.interfaces.varying import ByRegion, Varying, as_varying
 
 RESERVED = ("otherwise", "file", "steps")
@@ -45,34 +46,56 @@ ALTERNATIVES: dict[str, Any] = {
             },
             "additionalProperties": False,
         },
+        {
+            "type": "object",
+            "required": ["steps", "values"],
+            "properties": {
+                "steps": {"type": "array", "items": {"type": "integer", "minimum": 0}},
+                "values": {"type": "array", "items": {"type": "number"}},
+            },
+            "additionalProperties": False,
+        },
     ],
 }
 """The JSON Schema of what a file writes in place of a number."""
 
 
 class Field(RootModel[Any]):
-    """A value for each place: by region, from a netCDF file, or over a grid."""
+    """A value for each place: by region, from a netCDF file, or over a grid; or for each step."""
 
     model_config = ConfigDict(json_schema_extra=ALTERNATIVES)
 
 
 class TakesFields(Component):
-    """A component whose numbers may differ from place to place.
+    """A component whose numbers may differ from place to place, or change in time.
 
-    Each stands in its field with the value that serves where one number is asked for; what it is
-    elsewhere, `varying` tells.
+    Each stands in its field with the value that serves where one number is asked for: of a course
+    the last. What it is elsewhere and before, `varying` and `courses` tell.
     """
 
     _varying: dict[str, Varying] = PrivateAttr(default_factory=dict)
+    _courses: dict[str, Course[float]] = PrivateAttr(default_factory=dict)
 
     @property
     def varying(self) -> Mapping[str, Varying]:
         """The parameters that differ from place to place."""
         return self._varying
 
+    @property
+    def courses(self) -> Mapping[str, Course[float]]:
+        """The parameters that change in time."""
+        return self._courses
+
+    def at(self, moment: float) -> Any:
+        """The component with the numbers that its parameters are at a moment."""
+        return self.with_values(
+            **self._varying, **{name: course.at(moment) for name, course in self._courses.items()}
+        )
+
     def with_values(self, **values: Any) -> Any:
-        """The component with other numbers, or fields, in place of its own; what is not given is
-        the same everywhere. Raises ValidationError where they do not go together."""
+        """The component with other numbers, fields or courses in place of its own; what is not
+        given is the same everywhere and always. Raises ValidationError where they do not go
+        together."""
         fields = type(self).model_fields.items()
         given = {field.alias or name: getattr(self, name) for name, field in fields}
         return type(self).model_validate(given | values)
@@ -82,23 +105,25 @@ class TakesFields(Component):
     def _with_fields(cls, data: Any, handler: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return handler(data)
-        varying = {}
+        varying, courses = dict[str, Varying](), dict[str, Course[float]]()
         for name in cls.numbers() & data.keys():
             try:
-                found = as_varying(data[name])
+                if course := as_course(data[name]):
+                    courses[name] = course
+                elif field := as_varying(data[name]):
+                    varying[name] = field
             except ValueError as error:
                 raise _fault(name, str(error)) from None
-            if found:
-                varying[name] = found
-        if varying:
-            cls._refuse_wrong(data, varying, info.context)
-        part = handler(data | {name: _first(field) for name, field in varying.items()})
-        part._varying = varying
+        no_numbers: dict[str, Varying | Course[float]] = {**varying, **courses}
+        if no_numbers:
+            cls._refuse_wrong(data, no_numbers, info.context)
+        part = handler(data | {name: _first(each) for name, each in no_numbers.items()})
+        part._varying, part._courses = varying, courses
         return part
 
     @classmethod
     def __get_pydantic_json_schema__(cls, own: Any, handler: Any) -> dict[str, Any]:
-        """Numbers, or fields in their place."""
+        """Numbers, or what may stand in their place."""
         schema: dict[str, Any] = handler(own)
         field = handler(core_schema.union_schema([Field.__pydantic_core_schema__]))
         known = handler.resolve_ref_schema(schema).get("properties", {})
@@ -110,12 +135,12 @@ class TakesFields(Component):
 
     @classmethod
     def numbers(cls) -> set[str]:
-        """The parameters that can differ from place to place."""
+        """The parameters that can differ from place to place, and change."""
         return {name for name, field in cls.model_fields.items() if field.annotation is float}
 
     @classmethod
-    def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Varying], context: Any) -> None:
-        """Validates with the values of each place that is told apart."""
+    def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Any], context: Any) -> None:
+        """Validates with the values of each place, or time, that is told apart."""
         for label in dict.fromkeys(label for field in varying.values() for label in field.samples):
             here = {n: field.samples.get(label, _first(field)) for n, field in varying.items()}
             try:
@@ -130,7 +155,7 @@ class TakesFields(Component):
                         raise _fault(str(name or min(here)), f"{label}: {text}{got}") from None
 
 
-def _first(field: Varying) -> float:
+def _first(field: Varying | Course[float]) -> float:
     return next(iter(field.samples.values()))
 
 

@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, Strict
+from pbdkit.interfaces.course import InTime
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
 WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"
@@ -74,11 +75,11 @@ QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, 
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
 """Two lengths, (x, y); an experiment file writes them as a list of two."""
-Force = Annotated[tuple[Annotated[float, FORCE], Annotated[float, FORCE]], Field(strict=False)]
-"""Two forces, along x and y."""
-BodyForce = Annotated[
-    tuple[Annotated[float, BODY_FORCE], Annotated[float, BODY_FORCE]], Field(strict=False)
-]
+Forces = InTime[Annotated[float, FORCE]]
+Force = Annotated[tuple[Forces, Forces], Field(strict=False)]
+"""Two forces, along x and y, each of which may change in time."""
+BodyForces = InTime[Annotated[float, BODY_FORCE]]
+BodyForce = Annotated[tuple[BodyForces, BodyForces], Field(strict=False)]
 """Two forces on a unit of area, along x and y."""
 
 

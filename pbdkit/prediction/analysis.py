@@ -45,11 +45,12 @@ class Analysis:
 
     @property
     def exact(self) -> bool:
-        """Whether the numbers hold for the whole run, and not near its start alone: the rule
-        declares itself linear, and neither bonds nor neighbours nor contacts change."""
+        """Whether the numbers hold for the whole run, and not near its start or end alone: the rule
+        declares itself linear, and neither bonds nor neighbours, contacts nor numbers change."""
         experiment = self.scene.experiment
         lasting = not self.scene.has_fracture and experiment.neighbours.nearness() is None
-        return experiment.rule.linear and lasting and not self.scene.barriers
+        lasting = lasting and not (self.scene.barriers or experiment.courses)
+        return experiment.rule.linear and lasting
 
     @cached_property
     def spectra(self) -> Spectra:

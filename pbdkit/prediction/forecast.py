@@ -60,6 +60,8 @@ class Forecast:
         return asdict(self)
 
 
+MOST_MOMENTS = 16
+"""Of those at which numbers turn, to be looked at."""
 ANALYSED = (
     *("spectral_radius", "smallest_eigenvalue", "largest_stable_relaxation", "stable", "steps_to"),
     *("exact", "estimated", "lag"),
@@ -91,7 +93,13 @@ def forecast(scene: Scene) -> Forecast:
         decay=swing.decay if swing else None,
         lag_reached=analysis.trailing.reached if analysis.trailing else None,
         size_mm=_size_mm(scene),
-        warnings=[*_doubts(scene), *WITHOUT[: len(scene.barriers)], *analysis.warnings(), *waves],
+        warnings=[
+            *_doubts(scene),
+            *WITHOUT[: len(scene.barriers)],
+            *analysis.warnings(),
+            *_on_the_way(scene),
+            *waves,
+        ],
         **{name: getattr(analysis, name) for name in ANALYSED},
     )
 
@@ -128,6 +136,22 @@ def prediction(scene: Scene) -> dict[str, Any]:
         "largest_stable_relaxation": bound.largest_stable_relaxation(memory),
         "smallest_eigenvalue": bound.smallest,
     }
+
+
+def _on_the_way(scene: Scene) -> list[str]:
+    """Where steps diverge with the numbers that they have before the last."""
+    courses = scene.experiment.courses
+    moments = sorted({bend for course in courses.values() for bend in course.bends})[:-1]
+    found = list[str]()
+    for moment in moments[:MOST_MOMENTS] if scene.experiment.solver.makes_steps else ():
+        if Analysis(scene.at(moment)).stable is False:
+            now = (f"{'.'.join(at)} {course.at(moment):g}" for at, course in courses.items())
+            found.append(
+                f"{min(courses)[0]}: at step {moment} steps diverge, with {', '.join(now)}"
+            )
+    if len(moments) > MOST_MOMENTS:
+        found.append(f"analysis: of {len(moments)} moments the first {MOST_MOMENTS} were looked at")
+    return found
 
 
 def _doubts(scene: Scene) -> list[str]:

@@ -87,7 +87,8 @@ class Explained:
     @cached_property
     def limits(self) -> Floats:
         """(bond,): the strain above which each breaks, NaN where the model does not say."""
-        limits, constants = np.full(len(self.bonds), np.nan), self._scene.constants
+        limits = np.full(len(self.bonds), np.nan)
+        constants = self._scene.at(int(self._dataset["time"][-1])).constants
         known = all(name in self._dataset for name in self._remembered)
         model = self.model
         if not (known and model.can_break and isinstance(model, BreaksAtStrain)):

@@ -40,7 +40,7 @@ class StateMoment(Moment):
     def __init__(self, state: State, tables: Tables, no_later_than: int | None = None) -> None:
         self.step = state.step
         self._no_later_than = state.step if no_later_than is None else no_later_than
-        self._state, self._tables = state, tables
+        self._state, self._tables = state, tables.at(state.step)
         self._scene, self._raster = tables.scene, tables.scene.raster
 
     @property

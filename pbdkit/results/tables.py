@@ -32,6 +32,14 @@ class Tables:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
 
+    def at(self, moment: float) -> Tables:
+        """The same with the numbers of a moment."""
+        if (now := self.scene.at(moment)) is self.scene:
+            return self
+        found = Tables(now)
+        vars(found).update(reference=self.reference, body=self.body)
+        return found
+
     def add_reference(self, u: Floats) -> Floats:
         """X + u, (particle, axis), in place; X is kept where it is wanted more than twice."""
         experiment = self.scene.experiment

@@ -56,10 +56,8 @@ def chosen_weights(scene: Scene) -> Weights:
     """What stands for `auto`, beside what is given."""
     _refuse(scene)
     asked = scene.experiment.stepping
-    given = [
-        None if number == "auto" else number
-        for number in (asked.asked_relaxation, asked.asked_memory)
-    ]
+    both = ("relaxation", asked.asked_relaxation), ("memory", asked.asked_memory)
+    given = [None if number == "auto" else getattr(asked, name) for name, number in both]
     plain = _with(scene.bare, Stepping())
     rest = initial_state(scene)
     rest.u[...] = 0.0
@@ -74,6 +72,8 @@ def chosen_weights(scene: Scene) -> Weights:
 
 
 def _refuse(scene: Scene) -> None:
+    if scene.experiment.courses:
+        raise _refusal(f"'auto' needs numbers that stay, and some change in time; {REMEDY}")
     if scene.experiment.neighbours.nearness():
         raise _refusal(
             "'auto' needs a spectrum, and neighbours that are found anew have none; set "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.loads import Load
 from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces.course import Course
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.polygons import Tiling, signed_area
 from pbdkit.scene.cells import WeighedCells, patches
@@ -48,7 +50,8 @@ class Loads:
     def at(self, moment: float, dtype: Any) -> Planes:
         """What acts at the end of a step, or at a moment within it; nobody writes to it."""
         moment = moment if self.held_at is None else self.held_at
-        key = (*(loading.load.amplitude(moment) for loading in self.each), np.dtype(dtype))
+        forces = [loading.load.force_at(moment).tolist() for loading in self.each]
+        key = forces, np.dtype(dtype)
         if self._last is None or self._last[0] != key:
             self._last = key, self._sum(moment).astype(dtype, copy=False)
         return self._last[1]
@@ -61,14 +64,26 @@ class Loads:
         return planes
 
     def changes(self, steps: int) -> list[int]:
-        """The steps of a run in which others act than in the step before."""
+        """The steps of a run in which loads begin and cease to act."""
         every = {step for loading in self.each for step in loading.load.changes()}
         return sorted(step for step in every if step <= steps)
+
+    @property
+    def courses(self) -> list[Course[float]]:
+        """Of forces that change while they act."""
+        return [course for loading in self.each for course in loading.load.courses]
+
+    def next_change(self, step: int) -> float:
+        """The first step after `step` in which others act; infinite where there is none."""
+        every = [change for loading in self.each for change in loading.load.changes()]
+        every = [change for change in every if change > step]
+        return min([*every, *(c.next_change(step) for c in self.courses)], default=math.inf)
 
     def way(self, begin: float, end: float) -> float:
         """By what share the load that changes most does between two moments."""
         loads = (loading.load for loading in self.each)
-        return max(abs(load.amplitude(end) - load.amplitude(begin)) for load in loads)
+        come = [abs(load.amplitude(end) - load.amplitude(begin)) for load in loads]
+        return max([*come, *(course.way(begin, end) for course in self.courses)])
 
 
 def build_loads(
@@ -84,7 +99,9 @@ def build_loads(
         share = shares(at) if load.force else _areas(raster, tiling, cells).ravel()[place]
         found.append(Loading(load, rows, place, share))
         with np.errstate(all="ignore"):
-            finite = np.isfinite(load.force_at(load.from_) * share.sum()).all()
+            moments = [load.from_, *(bend for course in load.courses for bend in course.bends)]
+            forces = [load.force_at(moment) * share.sum() for moment in moments]
+            finite = np.isfinite(forces).all()
         if not finite:
             raise ExperimentError("leaves the finite numbers", ("loads", n))
     return Loads(tuple(found), raster.shape) if found else None

@@ -10,7 +10,6 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Components, Remembers
-from pbdkit.interfaces.rule import material_of
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
@@ -18,21 +17,19 @@ from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
+from pbdkit.scene.doubts import doubts_of
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
 from pbdkit.scene.leader_groups import Leading, build_leading, doubts
 from pbdkit.scene.loads import Loads, build_loads
-from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell, flatness
+from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
 from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
-from pbdkit.scene.places import Mask, distinct
+from pbdkit.scene.places import distinct
 from pbdkit.scene.raster import Raster
 from pbdkit.scene.setting import body_box, setting_of
-from pbdkit.scene.sites import Filling, build_raster, fill, has_narrow_slot, window
+from pbdkit.scene.sites import Filling, build_raster, fill, window
 from pbdkit.scene.sizes import refuse_too_large
-
-FLAT = 0.05
-"""Cells flatter than this are warned of."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +57,23 @@ class Scene:
     def driven(self) -> tuple[Leading | Barrier, ...]:
         """All that motions drive."""
         return (*self.leading, *self.barriers)
+
+    def at(self, moment: float) -> Scene:
+        """The scene with its numbers as they are at the end of a step, or at a moment within it; in
+        itself they are as in the end."""
+        courses = self.experiment.courses.values()
+        if all(course.at(moment) == course.last for course in courses):
+            return self
+        now = tuple(course.at(moment) for course in courses)
+        if now not in self._known:
+            self._known.clear()
+            self._known[now] = _renumbered(self, self.experiment.at(moment))
+        return self._known[now]
+
+    @cached_property
+    def _known(self) -> dict[tuple[float, ...], Scene]:
+        """The scene of the last moment, by its numbers."""
+        return {}
 
     @cached_property
     def bare(self) -> Scene:
@@ -126,7 +140,7 @@ def _build(experiment: Experiment) -> Scene:
     extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
     refuse_too_large(experiment, neighbourhood, extent, layers)
     filling = _filling(experiment, neighbourhood)
-    warnings += _doubts(experiment, neighbourhood, filling.body, layers)
+    warnings += doubts_of(experiment, neighbourhood, filling.body, layers)
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += doubts(raster, experiment.leaders)
@@ -153,6 +167,16 @@ def _build(experiment: Experiment) -> Scene:
     return with_inner(Scene(experiment, *parts, tuple(warnings), barriers))
 
 
+def _renumbered(scene: Scene, experiment: Experiment) -> Scene:
+    """The scene with the numbers of an experiment that is like its own but for them."""
+    raster, around = scene.raster, scene.neighbourhood
+    setting = setting_of(raster, around)
+    constants = ask_for_constants(experiment, setting)
+    constants = with_fields(constants, experiment, raster, around, setting)
+    cells = weighed(experiment, raster, setting, scene.cells)
+    return with_inner(replace(scene, experiment=experiment, constants=constants, cells=cells))
+
+
 def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
     frame, rule = experiment.frame, experiment.rule
     if not frame.weighs_cells:
@@ -172,36 +196,6 @@ def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
             ("neighbours",),
         )
     return fill_with_cells(experiment.body, experiment.lattice, neighbourhood.tiling)
-
-
-def _doubts(
-    experiment: Experiment, neighbourhood: Neighbourhood, body: Mask, layers: int
-) -> list[str]:
-    doubts, frame, rule = [], experiment.frame, experiment.rule
-    if (flat := flatness(neighbourhood.cell)) < FLAT:
-        doubts.append(
-            f"lattice: nearly degenerate, sites lie {1 / flat:.3g} times closer along one line "
-            "than its longer cell vector is long, so that neighbours by distance lie along that "
-            "line; take chebyshev neighbours, or open the angle between the vectors"
-        )
-    if not neighbourhood.spans_space():
-        doubts.append(
-            "neighbours: they lie along one line only, so that rows do not feel each other; "
-            "more shells, or chebyshev neighbours, connect them"
-        )
-    if layers and has_narrow_slot(body, layers):
-        doubts.append(
-            f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
-            "belong to both faces; widen it, or take fewer layers"
-        )
-    if not frame.edges_are_free and material_of(rule) is not None:
-        doubts.append(
-            f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated "
-            f"rule '{rule.type}' the result does not converge to elasticity, however fine the "
-            "lattice (copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); "
-            "take {type: natural} or {type: traction-free}"
-        )
-    return doubts
 
 
 def with_inner(scene: Scene) -> Scene:

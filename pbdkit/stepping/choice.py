@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.experiment.newton import Newton
+from pbdkit.scene.guides import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.prescription import last_event
@@ -36,7 +38,7 @@ def choose(scene: Scene) -> Choice:
     Raises ExperimentError where the compiled engine is asked for and cannot be had.
     """
     solver = scene.experiment.stepping
-    hindrance = obstacle()
+    hindrance = obstacle() or what_kernels_lack(scene)
     if solver.engine == "compiled" and hindrance:
         refusal = f"the compiled engine cannot be had: {hindrance}"
         raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
@@ -72,6 +74,27 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
 def obstacle() -> str:
     """Why the compiled engine cannot be had; empty where it can."""
     return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"
+
+
+def what_kernels_lack(scene: Scene) -> str:
+    """Why no kernel can follow the courses of a scene's numbers; empty where one can, and where
+    there are none."""
+    experiment, constants = scene.experiment, scene.constants
+    changing = {field for field, _ in experiment.courses}
+    if changing and experiment.neighbours.nearness():
+        return "numbers change in time, and neighbours are found anew"
+    if changing <= {"solver"}:
+        return ""
+    masses = any(isinstance(leading.group.motion, Newton) for leading in scene.leading)
+    if masses or scene.barriers or has_guides(scene.leading):
+        return "numbers change in time by which masses, obstacles or leaders along an axis push"
+    if constants.by_particle or constants.by_bond or (scene.cells and scene.cells.mixed):
+        return "numbers differ from place to place and others change in time"
+    for moment in sorted({bend for course in experiment.courses.values() for bend in course.bends}):
+        now = scene.at(moment).constants
+        if (now.weights, now.fracture) != (constants.weights, constants.fracture):
+            return "numbers change in time that are written into kernels"
+    return ""
 
 
 def _numpy_seconds(scene: Scene) -> float:

@@ -47,11 +47,16 @@ class Stepper(Engine):
         kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
         self._followers = followers or kind(scene)
         self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
+        self._now = self
+        """With the numbers of the last step."""
 
     def advance(self, state: State, steps: int = 1) -> State:
-        """One step after the other."""
+        """One step after the other, each with the numbers that hold at its end."""
         for _ in range(steps):
-            state = self._step(state)
+            now = self._scene.at(state.step + 1)
+            if now is not self._scene and now is not self._now._scene:
+                self._now = Stepper(now)
+            state = (self if now is self._scene else self._now)._step(state)
         return state
 
     def _step(self, state: State) -> State:

@@ -64,7 +64,7 @@ def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[F
     assert isinstance(motion, Newton)
     if velocity is None:
         velocity = np.outer(motion.velocity, np.ones(len(leading.place)))
-    faster = motion.faster(velocity.T, forces.on(n, state), forces.share(n)).T
+    faster = motion.faster(state.step + 1, velocity.T, forces.on(n, state), forces.share(n)).T
     reached = np.zeros_like(faster)
     reached[axes] = faster[axes]
     here = state.u.reshape(scene.axes, -1)[:, leading.place]
@@ -92,7 +92,8 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
 
 def steady_steps(scene: Scene, step: int, most: int) -> int:
     """How many steps from `step` on have the same leaders and obstacles at the same places, the
-    same loads and no cut but those that the first begins with, at most `most`, at least 1."""
+    same loads and numbers and no cut but those that the first begins with, at most `most`, at least
+    1."""
     most = min([most, *(cut.at - step for cut in scene.experiment.cuts if cut.at > step)])
     for leading in scene.driven:
         group = leading.group
@@ -104,21 +105,30 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
                 return 1
         elif step < begins:
             most = min(most, begins - step)
-    changes = scene.loads.changes(step + most) if scene.loads else []
-    return min([most, *(change - step for change in changes if change > step)])
+    changes = [scene.loads.next_change(step)] if scene.loads else []
+    changes += [course.next_change(step) for course in scene.experiment.courses.values()]
+    return int(min([most, *(change - step for change in changes)]))
 
 
 def last_event(scene: Scene) -> int:
-    """The last step within the run at which leaders or obstacles move, roles or loads change or
-    bonds are cut, at least 1."""
+    """The last step within the run at which leaders or obstacles move, roles, loads or numbers
+    change or bonds are cut, at least 1."""
     steps, events = scene.experiment.steps, [1, *(cut.at for cut in scene.experiment.cuts)]
     events += scene.loads.changes(steps) if scene.loads else []
+    events += bends_of(scene)
     for leading in scene.driven:
         first, last = leading.group.from_, leading.group.last(steps)
         rests = leading.group.motion.rests_after() or 0
         moments = (first, last + 1, min(last, first - 1 + rests))
         events += [step for step in moments if step <= steps]
     return max(events)
+
+
+def bends_of(scene: Scene) -> list[int]:
+    """The moments within the run between which numbers and forces change evenly."""
+    courses = [*scene.experiment.courses.values(), *(scene.loads.courses if scene.loads else ())]
+    steps = scene.experiment.steps
+    return [min(bend, steps) for course in courses for bend in course.bends]
 
 
 def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:

@@ -40,10 +40,10 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
 
 
 def _is_plain(scene: Scene) -> bool:
-    """Whether the kernel knows all that such a scene has: loads, cuts, fields and leaders along one
-    axis it does not."""
+    """Whether the kernel knows all that such a scene has: loads, cuts, fields, courses and leaders
+    along one axis it does not."""
     asked, constants = scene.experiment, scene.constants
-    more = asked.cuts or asked.loads or constants.by_bond or constants.by_particle
+    more = any((asked.cuts, asked.loads, asked.courses, constants.by_bond, constants.by_particle))
     mixed = scene.cells is not None and bool(scene.cells.mixed)
     guided = any(leading.group.axes for leading in scene.leading)
     flat = scene.axes == 2 and scene.inner is None

@@ -26,15 +26,13 @@ def constant_arrays(plan: Plan) -> Arrays:
     scene, slots = plan.scene, plan.scene.neighbourhood.slots
     constants = scene.constants
     most, real = max(map(len, slots)), np.dtype(scene.experiment.stepping.precision)
-    # Sublattices with fewer neighbours than others have the first once more, which nobody reads.
-    padded = [slot for own in slots for slot in (*own, *own[:1] * (most - len(own)))]
-    by_slot = _stacked([_of_slot(plan, slot) for slot in padded], real)
+    by_slot = _stacked([_of_slot(plan, slot) for slot in padded(slots)], real)
     arrays = {
         "kind": scene.raster.kind,
         "first": np.array(scene.raster.first, np.int64),
         "at": np.array([site.at for site in scene.raster.lattice.cell().sites]),
         "counts": np.array([len(own) for own in slots]),
-        **rule_arrays(plan),
+        **changing_arrays(plan),
         **{name: v.reshape(len(slots), most, *v.shape[1:]) for name, v in by_slot.items()},
         **_stacked([_of_plane(scene, plane) for plane in scene.neighbourhood.planes], real),
     }
@@ -63,6 +61,26 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
     }
 
 
+def changing_arrays(plan: Plan) -> Arrays:
+    """What may change in the course of the steps: parameters, and limits of bonds."""
+    scene, real = plan.scene, plan.scene.experiment.stepping.precision
+    slots = scene.neighbourhood.slots
+    limits = np.array([scene.constants.limits_of(slot) for slot in padded(slots)], real)
+    ends = [scene.constants.limits_of(plane.slot) for plane in scene.neighbourhood.planes]
+    return {
+        **rule_arrays(plan),
+        "limits": limits.reshape(len(slots), max(map(len, slots)), limits.shape[-1]),
+        "end_limits": np.array(ends, real),
+    }
+
+
+def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:
+    """Sublattice after sublattice; those with fewer neighbours than others have the first once
+    more, which nobody reads."""
+    most = max(map(len, slots))
+    return [slot for own in slots for slot in (*own, *own[:1] * (most - len(own)))]
+
+
 def rule_arrays(plan: Plan) -> Arrays:
     """The parameters of rules and solver."""
     solver = plan.scene.experiment.stepping
@@ -79,7 +97,7 @@ def _stacked(rows: Sequence[dict[str, Any]], real: np.dtype[Any]) -> Arrays:
 
 
 def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
-    """Rest offset, limits, weights, the sign of d at the home of its bonds, and from a particle's
+    """Rest offset, weights, the sign of d at the home of its bonds, and from a particle's
     place in flat arrays the way to the neighbour, to the home of the bond in planes of bonds, and
     to the shares of the cells beside it."""
     scene, shape = plan.scene, plan.scene.raster.shape
@@ -90,7 +108,6 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
     cells = [(side.kind, slot_step(shape, side.first) if side.first else 0) for side in beside]
     return {
         "rests": slot.rest,
-        "limits": scene.constants.limits_of(slot),
         "signs": 1.0 if here else -1.0,
         "away": away,
         "bonds_away": home * math.prod(shape[1:]) + (0 if here else away),
@@ -101,13 +118,12 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
 
 
 def _of_plane(scene: Scene, plane: BondPlane) -> dict[str, Any]:
-    """Of a plane of bonds source, target and step, rest offset, limits, block."""
+    """Of a plane of bonds source, target and step, rest offset, block."""
     slot, block = plane.slot, plane_block(scene.raster, plane)
     spans = zip(block.start, block.stop, strict=True) if block else [(0, 0)] * scene.axes
     return {
         "ends": (slot.source, slot.target, *slot.cell),
         "end_rests": slot.rest,
-        "end_limits": scene.constants.limits_of(slot),
         "end_blocks": list(chain(*spans)),
     }
 

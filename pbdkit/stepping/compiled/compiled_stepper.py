@@ -15,6 +15,7 @@ from pbdkit.stepping.clamps import Clamps
 from pbdkit.stepping.compiled.arguments import (
     Arrays,
     bits_for,
+    changing_arrays,
     constant_arrays,
     lost_bits,
     state_arrays,
@@ -58,6 +59,8 @@ class CompiledStepper(Engine):
             self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
             return
         self._last: State | None = None
+        self._numbered = scene
+        """With the numbers that the arrays hold."""
         self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
         self._contact = contact = Contact(scene) if scene.barriers else None
         levels = levels_of(scene)
@@ -103,6 +106,7 @@ class CompiledStepper(Engine):
         step = state.step + 1
         if cut_bonds(self._scene, state.broken_step, step):
             self._begin(state)
+        self._renumber(self._scene.at(step))
         led, starts = prescribe(self._scene, state, step, self._newton)
         self._clamped = self._clamps.turn(state, step)
         load = self._load(state)
@@ -115,6 +119,11 @@ class CompiledStepper(Engine):
         now, before = (new, u) if count % 2 else (u, new)
         self._reach.after(now, before)
         return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
+
+    def _renumber(self, scene: Scene) -> None:
+        if scene is not self._numbered:
+            self._arrays |= changing_arrays(self._plan.renumbered(scene))
+            self._numbered = scene
 
     def _named(self, state: State, led: Led) -> Arrays:
         """The arrays of a kernel that steps in those of the state, by name."""

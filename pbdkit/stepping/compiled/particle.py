@@ -138,8 +138,12 @@ def target_lines(
     if level is not plan.levels[-1]:
         lines += plan.each(f"o@[j] = {_chosen('move.@', movable, plan.number(0.0))}")
     else:
-        relaxed = "solver[0] * move.@" if solver.relaxation != 1.0 else "move.@"
-        swing = ["new_@ = new_@ + solver[1] * (u.@ - o@[j])"] if solver.memory != 0.0 else []
+        plain = solver.relaxation == 1.0 and "relaxation" not in solver.courses
+        relaxed = "move.@" if plain else "solver[0] * move.@"
+        swung = "new_@ = new_@ + solver[1] * (u.@ - o@[j])"
+        swing = [swung] if solver.memory != 0.0 else []
+        if "memory" in solver.courses:
+            swing = [f"{swung} if solver[1] != 0.0 else new_@"]
         out = f"o@[j] = {_chosen('new_@', movable, 'u.@')}"
         for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
             lines += plan.each(pattern)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from typing import Any
@@ -150,6 +150,14 @@ class Plan:
     def real(self) -> str:
         """The kind of the scene's numbers."""
         return "real" if self.scene.experiment.stepping.precision == "float32" else "double"
+
+    def renumbered(self, scene: Scene) -> Plan:
+        """The same with other numbers."""
+        levels, below = list[Level](), scene
+        for level in reversed(self.levels):
+            levels.insert(0, replace(level, scene=below))
+            below = below.inner or below
+        return replace(self, scene=scene, levels=tuple(levels))
 
     def number(self, value: float) -> str:
         """A literal in the scene's precision."""

@@ -43,6 +43,8 @@ class Reach:
         self._renews = isinstance(experiment.rule, RenewsParticles) or (
             scene.has_fracture and isinstance(experiment.fracture, RenewsBonds)
         )
+        # What rests with some numbers may not with others.
+        self._renews |= any(field != "solver" for field, _ in experiment.courses)
         self._rests = not self._renews and _rests_by_construction(levels)
         self._bond = len(levels) * _growth(scene)
         self._leaders = [np.unravel_index(led.place, self._shape)[1:] for led in scene.leading]
