@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
@@ -19,11 +19,15 @@ from pbdkit.interfaces import (
     squared_length,
     where,
 )
+from pbdkit.interfaces.course import COURSE, PLAIN, Course, at, form_of, last
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.units import LENGTH
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
-Thresholds = Annotated[tuple[Limit, ...], Field(strict=False)]
+LimitInTime = Annotated[
+    Annotated[Limit, Tag(PLAIN)] | Annotated[Course[Limit], Tag(COURSE)], Discriminator(form_of)
+]
+Thresholds = Annotated[tuple[LimitInTime, ...], Field(strict=False)]
 
 Cracks = Annotated[tuple[Annotated[Segment, Field(strict=False)], ...], Field(strict=False)]
 
@@ -106,10 +110,28 @@ class Threshold(Parting):
     """
 
     type: Literal["threshold"] = "threshold"
-    thresholds: Thresholds = Field(
+    asked_thresholds: Thresholds = Field(
+        alias="thresholds",
         description="The length at which bonds break, one a shell (lattice units).",
         examples=[[1.6], [1.6, 2.4]],
     )
+
+    @property
+    def thresholds(self) -> tuple[float, ...]:
+        """One a shell, in the end."""
+        return tuple(map(last, self.asked_thresholds))
+
+    @property
+    def courses(self) -> Mapping[str, Course[float]]:
+        """Those of thresholds by the number of the shell, from 0 as a file's places are."""
+        limits = enumerate(self.asked_thresholds)
+        own = {f"thresholds.{n}": limit for n, limit in limits if isinstance(limit, Course)}
+        return {**super().courses, **own}
+
+    def at(self, moment: float) -> Any:
+        """With the thresholds of a moment."""
+        now = [at(limit, moment) for limit in self.asked_thresholds]
+        return super().at(moment).with_more(thresholds=now)
 
     def constants(self, slot: Slot) -> dict[str, float]:
         """The squared threshold of the slot's shell, `limit`.

@@ -136,8 +136,7 @@ class Experiment(Strict):
         for part, dumped in zip(self.components(), [*single, *many], strict=True):
             dumped["type"] = self._registry.name_of(part)
             if isinstance(part, TakesFields):
-                dumped |= {name: field.written() for name, field in part.varying.items()}
-                dumped |= {name: c.model_dump(mode="json") for name, c in part.courses.items()}
+                dumped |= part.in_place_of_numbers()
             for name in given_by_units(part):
                 if self.units and self.units.value(name):
                     del dumped[name]  # there it is said

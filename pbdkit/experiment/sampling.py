@@ -29,7 +29,7 @@ def sampled(part: TakesFields, lattice: Lattice, body: Body) -> Any:
         return part
     places = _grid(lattice, body)
     found: dict[str, Varying] = {n: field.sampled(*places) for n, field in functions.items()}
-    return part.with_values(**{**part.courses, **part.varying, **found})
+    return part.with_more(**found)
 
 
 def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:

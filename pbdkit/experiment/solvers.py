@@ -4,7 +4,7 @@ family."""
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Discriminator, Field, SerializeAsAny, Tag
 
@@ -12,9 +12,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.parts import closed_part
 from pbdkit.interfaces import Component
 from pbdkit.interfaces.component import Strict
-from pbdkit.interfaces.course import COURSE, NUMBER, WORD, Course, form_of, last
-
-Value = TypeVar("Value")
+from pbdkit.interfaces.course import COURSE, PLAIN, WORD, Course, form_of, last
 
 
 def _form_of(value: object) -> str:
@@ -23,13 +21,19 @@ def _form_of(value: object) -> str:
 
 
 Word = Annotated[Literal["auto"], Tag(WORD)]
-Auto = Annotated[Word | Annotated[Value, Tag(NUMBER)], Discriminator(_form_of)]
-"""A number, or the word for the best that there is."""
-AutoInTime = Annotated[
-    Word | Annotated[Value, Tag(NUMBER)] | Annotated[Course[Value], Tag(COURSE)],
+Threads = Annotated[
+    Word | Annotated[int, Field(ge=1, le=1024), Tag(PLAIN)], Discriminator(_form_of)
+]
+_Relaxation = Annotated[float, Field(gt=0.0, le=1e6)]
+Relaxation = Annotated[
+    Word | Annotated[_Relaxation, Tag(PLAIN)] | Annotated[Course[_Relaxation], Tag(COURSE)],
     Discriminator(_form_of),
 ]
-"""The same, or the course of the number."""
+_Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
+Memory = Annotated[
+    Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[Course[_Memory], Tag(COURSE)],
+    Discriminator(_form_of),
+]
 
 
 class Settle(Strict):
@@ -87,13 +91,9 @@ class Stepping(Solver):
     type: Literal["stepping"] = "stepping"
     engine: Literal["auto", "numpy", "compiled"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
-    threads: Auto[Annotated[int, Field(ge=1, le=1024)]] = "auto"
-    asked_relaxation: AutoInTime[Annotated[float, Field(gt=0.0, le=1e6)]] = Field(
-        default=1.0, alias="relaxation"
-    )
-    asked_memory: AutoInTime[Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(
-        default=0.0, alias="memory"
-    )
+    threads: Threads = "auto"
+    asked_relaxation: Relaxation = Field(default=1.0, alias="relaxation")
+    asked_memory: Memory = Field(default=0.0, alias="memory")
     settle: Settle | None = None
 
     @property

@@ -8,13 +8,13 @@ from itertools import pairwise
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from pbdkit.interfaces.component import Strict
 
 Value = TypeVar("Value")
 MOST_KNOTS = 100_000
-NUMBER, COURSE, WORD = FORMS = ("number", "course", "a number or 'auto'")
+PLAIN, COURSE, WORD = FORMS = ("number", "course", "a number or 'auto'")
 """What faults call the forms of a number that may change, or be chosen."""
 
 
@@ -81,13 +81,7 @@ class Course(Strict, Generic[Value]):
 
 def form_of(value: Any) -> str:
     """Which of two forms is meant."""
-    return COURSE if isinstance(value, (dict, Course)) else NUMBER
-
-
-InTime = Annotated[
-    Annotated[Value, Tag(NUMBER)] | Annotated[Course[Value], Tag(COURSE)], Discriminator(form_of)
-]
-"""A number, or its course."""
+    return COURSE if isinstance(value, (dict, Course)) else PLAIN
 
 
 def as_course(given: Any) -> Course[float] | None:

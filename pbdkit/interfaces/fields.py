@@ -88,9 +88,18 @@ class TakesFields(Component):
 
     def at(self, moment: float) -> Any:
         """The component with the numbers that its parameters are at a moment."""
-        return self.with_values(
-            **self._varying, **{name: course.at(moment) for name, course in self._courses.items()}
-        )
+        return self.with_more(**{name: c.at(moment) for name, c in self._courses.items()})
+
+    def with_more(self, **values: Any) -> Any:
+        """The component with other numbers, fields or courses besides those that it has. Raises
+        ValidationError where they do not go together."""
+        return self.with_values(**{**self._varying, **self._courses, **values})
+
+    def in_place_of_numbers(self) -> dict[str, Any]:
+        """What stands there, as an experiment file writes it."""
+        fields = {name: field.written() for name, field in self._varying.items()}
+        courses = {name: course.model_dump(mode="json") for name, course in self._courses.items()}
+        return fields | courses
 
     def with_values(self, **values: Any) -> Any:
         """The component with other numbers, fields or courses in place of its own; what is not

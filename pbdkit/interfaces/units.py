@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, Strict
-from pbdkit.interfaces.course import InTime
+from pbdkit.interfaces.course import COURSE, PLAIN, Course, form_of
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
 WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"
@@ -75,11 +75,18 @@ QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, 
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
 """Two lengths, (x, y); an experiment file writes them as a list of two."""
-Forces = InTime[Annotated[float, FORCE]]
-Force = Annotated[tuple[Forces, Forces], Field(strict=False)]
+OneForce = Annotated[
+    Annotated[float, FORCE, Tag(PLAIN)] | Annotated[Course[Annotated[float, FORCE]], Tag(COURSE)],
+    Discriminator(form_of),
+]
+Force = Annotated[tuple[OneForce, OneForce], Field(strict=False)]
 """Two forces, along x and y, each of which may change in time."""
-BodyForces = InTime[Annotated[float, BODY_FORCE]]
-BodyForce = Annotated[tuple[BodyForces, BodyForces], Field(strict=False)]
+OneBodyForce = Annotated[
+    Annotated[float, BODY_FORCE, Tag(PLAIN)]
+    | Annotated[Course[Annotated[float, BODY_FORCE]], Tag(COURSE)],
+    Discriminator(form_of),
+]
+BodyForce = Annotated[tuple[OneBodyForce, OneBodyForce], Field(strict=False)]
 """Two forces on a unit of area, along x and y."""
 
 

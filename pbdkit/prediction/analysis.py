@@ -45,12 +45,11 @@ class Analysis:
 
     @property
     def exact(self) -> bool:
-        """Whether the numbers hold for the whole run, and not near its start or end alone: the rule
-        declares itself linear, and neither bonds nor neighbours, contacts nor numbers change."""
+        """Whether the numbers hold for the whole run: the rule declares itself linear, and neither
+        bonds nor neighbours, contacts nor numbers change."""
         experiment = self.scene.experiment
-        lasting = not self.scene.has_fracture and experiment.neighbours.nearness() is None
-        lasting = lasting and not (self.scene.barriers or experiment.courses)
-        return experiment.rule.linear and lasting
+        changes = self.scene.has_fracture or self.scene.barriers or experiment.courses
+        return experiment.rule.linear and not changes and not experiment.neighbours.nearness()
 
     @cached_property
     def spectra(self) -> Spectra:

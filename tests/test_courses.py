@@ -1,0 +1,331 @@
+"""Numbers that change in the course of the steps: what they are when, and what goes with them."""
+
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from test_calibrated_rules import NATURAL
+
+import pbdkit
+from pbdkit.equilibrium.load_path import moments
+from pbdkit.interfaces.course import Course
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.choice import choose
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.prescription import last_event
+from pbdkit.stepping.state import initial_state
+
+pytestmark = pytest.mark.filterwarnings("ignore:frame. under 'mean'")
+
+
+def course(steps, values):
+    return {"steps": steps, "values": values}
+
+
+HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+PULLED = {
+    "select": {"edge": "right"},
+    "motion": {"type": "velocity", "velocity": [0.05, 0.0], "steps": 12},
+}
+SHEET = {
+    "name": "sheet",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 9, "rows": 6},
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "rule": {"type": "springs"},
+    "leaders": [HELD, PULLED],
+    "steps": 30,
+    "record": {"every": 3},
+}
+FORCE = [{"select": {"edge": "top"}, "force": [0.0, course([2, 20], [0.0, 0.02])]}]
+BREAKING = {"type": "strain", "failure": course([3, 25], [0.3, 0.02])}
+CHANGING = {
+    "relaxation": {"solver": {"relaxation": course([4, 20], [0.3, 1.0])}},
+    "memory": {"solver": {"memory": course([0, 9, 20], [0.5, 0.9, 0.0])}},
+    "limits": {"fracture": BREAKING},
+    "thresholds": {
+        "fracture": {"type": "threshold", "thresholds": [course([3, 25], [1.6, 1.43])]},
+    },
+    "both": {"fracture": BREAKING, "solver": {"relaxation": course([9, 10], [1.0, 0.4])}},
+    "parameter": {"rule": {"type": "mixed-coordinate", "K": course([1, 9], [0.0, 0.01])}},
+    "weights": {
+        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])},
+        "solver": {"relaxation": 0.5},
+    },
+    "force": {"loads": FORCE, "frame": NATURAL},
+    "with a field": {
+        "regions": {"soft": {"type": "rectangle", "width": 4.0, "height": 9.0}},
+        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4]),
+                 "stiffness": {"otherwise": 1.0, "soft": 0.3}},
+        "solver": {"relaxation": 0.5},
+        "frame": NATURAL,
+    },
+}  # fmt: skip
+COMPILED = ("relaxation", "memory", "limits", "thresholds", "both", "parameter", "force")
+
+
+def sheet(*, engine="numpy", precision="float64", threads=1, **parts):
+    solver = {"type": "stepping", "engine": engine, "precision": precision, "threads": threads}
+    found = SHEET | parts
+    if engine:
+        found["solver"] = solver | parts.get("solver", {})
+    return found
+
+
+def same(one, other):
+    return all(np.array_equal(one[n], other[n], equal_nan=True) for n in one.data_vars)
+
+
+def now(part, step):
+    """Parts of an experiment with numbers in place of courses: by hand, as documented."""
+    if isinstance(part, list):
+        return [now(each, step) for each in part]
+    if not isinstance(part, dict):
+        return part
+    if part.keys() == {"steps", "values"}:
+        return float(np.interp(step, part["steps"], part["values"]))
+    return {key: now(each, step) for key, each in part.items()}
+
+
+knots = st.lists(
+    st.tuples(st.integers(0, 60), st.floats(-5, 5)),
+    min_size=1,
+    max_size=6,
+    unique_by=lambda k: k[0],
+).map(sorted)
+
+
+@given(knots)
+def test_a_course_is_linear_between_its_steps_and_kept_beyond(known):
+    steps, values = zip(*known, strict=True)
+    course = Course[float](steps=steps, values=values)
+    assert [course.at(step) for step in steps] == list(values)
+    assert course.at(0) == values[0] or steps[0] == 0
+    assert course.at(1000) == course.last == values[-1]
+    for a, b in pairwise(steps):
+        middle = (course.at(a) + course.at(b)) / 2
+        assert course.at((a + b) / 2) == pytest.approx(middle, abs=1e-12)
+
+
+@given(knots, st.integers(0, 70))
+def test_the_next_change_is_the_next_step_with_another_value(known, step):
+    steps, values = zip(*known, strict=True)
+    course = Course[float](steps=steps, values=values)
+    later = [n for n in range(step + 1, 100) if course.at(n) != course.at(step)]
+    assert course.next_change(step) <= (later[0] if later else math.inf)
+    if course.next_change(step) < math.inf and later:
+        stays = [course.at(n) for n in range(step, int(course.next_change(step)))]
+        assert set(stays) == {course.at(step)}
+    assert max(course.bends, default=0) >= max(
+        (n for n in range(1, 100) if course.at(n) != course.at(n - 1)), default=0
+    )
+
+
+@pytest.mark.parametrize("name", CHANGING)
+def test_each_step_is_that_of_a_scene_with_the_numbers_at_its_end(name):
+    parts = CHANGING[name]
+    given_ = sheet(**parts)
+    scene = build_scene(pbdkit.Experiment(**given_))
+    stepper = Stepper(scene)
+    state, plain = initial_state(scene), initial_state(scene)
+    for step in range(1, 25):
+        state = stepper.advance(state)
+        plain = Stepper(build_scene(pbdkit.Experiment(**now(given_, step)))).advance(plain)
+        np.testing.assert_array_equal(state.u, plain.u)
+    assert state.broken_step is None or (state.broken_step > 0).any()
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_kernels_follow_courses_to_the_bit(name):
+    parts = CHANGING[name]
+    one = pbdkit.run(sheet(**parts), progress=False)
+    other = pbdkit.run(sheet(engine="compiled", threads=2, **parts), progress=False)
+    assert same(one, other)
+
+
+def test_kernels_follow_courses_in_single_precision():
+    parts = CHANGING["both"] | {"rule": {"type": "mean-displacement"}}
+    one, other = (
+        pbdkit.run(sheet(engine=engine, precision="float32", **parts), progress=False)
+        for engine in ("numpy", "compiled")
+    )
+    assert same(one, other)
+
+
+@pytest.mark.parametrize("name", sorted(set(CHANGING) - set(COMPILED)))
+def test_where_kernels_cannot_numpy_steps_and_says_why(name):
+    given_ = sheet(engine="auto", **CHANGING[name]) | {"steps": 10**9}
+    choice = choose(build_scene(pbdkit.Experiment(**given_)))
+    assert choice.engine == "numpy"
+    assert "change in time" in choice.reason
+    with pytest.raises(pbdkit.ExperimentError, match=r"^solver\.engine: the compiled"):
+        pbdkit.run(sheet(engine="compiled", **CHANGING[name]), progress=False)
+
+
+@pytest.mark.parametrize("name", CHANGING)
+def test_results_repeat_from_the_dataset_alone(name, tmp_path):
+    ds = pbdkit.run(sheet(**CHANGING[name]), progress=False)
+    ds.to_netcdf(tmp_path / "out.nc")
+    with xr.open_dataset(tmp_path / "out.nc") as kept:
+        assert same(ds, pbdkit.rerun(kept.load(), progress=False))
+
+
+@pytest.mark.parametrize("name", ["both", "force", "weights"])
+def test_continued_runs_are_those_of_one_go(name, call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for file, steps in (("half", 14), ("whole", 30)):
+        (tmp_path / f"{file}.yaml").write_text(
+            json.dumps(sheet(**CHANGING[name]) | {"steps": steps})
+        )
+        assert call("run", f"{file}.yaml", "-o", f"{file}.nc").code == 0
+    assert call("resume", "half.nc", "--steps", "30").code == 0
+    with pbdkit.open("half.nc") as half, pbdkit.open("whole.nc") as whole:
+        np.testing.assert_array_equal(half.position[-1], whole.position[-1])
+
+
+def test_a_bar_that_ages_breaks_when_its_strength_has_come_down_to_its_strain():
+    """Held at a strain of 4.05 %, while the strain at failure falls from 20 % to 2 %."""
+    ds = pbdkit.run("modelling/ageing", progress=False)
+    experiment = json.loads(ds.experiment)
+    falls = experiment["fracture"]["failure"]
+    at = np.interp(0.0405, falls["values"][::-1], falls["steps"][::-1])
+    first = ds.broken_step.values[ds.broken_step.values > 0].min()
+    assert first == math.floor(at) + 1
+
+
+def test_equilibria_are_those_of_the_last_numbers():
+    bar = SHEET | {
+        "rule": {"type": "elastic", "poisson_ratio": 0.0,
+                 "stiffness": course([0, 20], [1.0, 0.5])},
+        "frame": NATURAL,
+        "leaders": [HELD],
+        "loads": [{"select": {"edge": "right"}, "force": [course([0, 30], [0, 0.1]), 0]}],
+        "solver": {"type": "equilibrium", "tolerance": 1e-11},
+        "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0}],
+    }  # fmt: skip
+    ds = pbdkit.run(bar, progress=False)
+    u = ds.position[-1, -1, 0] - ds.reference[-1, 0]
+    assert float(u) == pytest.approx(0.1 * 8.0 / (0.5 * 5.0), abs=1e-11)
+    assert ds.reaction.values[-1, 0] == pytest.approx([-0.1, 0.0], abs=1e-11)
+
+
+def test_increments_of_an_equilibrium_follow_courses():
+    """What ages under a steady strain breaks at the increment at which its strength is reached;
+    then nothing holds its parts."""
+    given_ = pbdkit.load("modelling/ageing", settings=["solver={type: equilibrium}"])
+    with pytest.raises(pbdkit.DivergedError, match="at step 901 ") as error:
+        pbdkit.run(given_, progress=False)
+    steps = error.value.dataset.broken_step.values
+    assert steps[steps > 0].min() == 901
+    assert {100, 1000} <= set(moments(build_scene(given_), 10))
+
+
+def test_loads_that_grow_lead_along_the_way_that_they_grow():
+    """Springs under a pull that comes in one go and over the steps end where one way leads."""
+    given_ = SHEET | {"frame": NATURAL, "leaders": [HELD], "solver": {"type": "equilibrium"}}
+    ends = [
+        pbdkit.run(
+            given_ | {"loads": [{"select": {"edge": "right"}, "force": [force, 0.01]}]},
+            progress=False,
+        )
+        for force in (0.4, course([0, 10, 20], [0.0, 0.1, 0.4]))
+    ]
+    np.testing.assert_allclose(ends[0].position[-1], ends[1].position[-1], atol=1e-7)
+
+
+def test_what_is_measured_of_a_step_is_measured_with_its_numbers():
+    """The same displacements press half as hard once the stiffness has come down to half."""
+    stretched = SHEET | {
+        "rule": {"type": "elastic", "poisson_ratio": 0.0,
+                 "stiffness": course([0, 30], [1.0, 0.5])},
+        "frame": NATURAL,
+        "leaders": [HELD, {"select": {"edge": "right"}, "motion": {"type": "hold"}}],
+        "initial": {"type": "affine", "gradient": [[0.01, 0.0], [0.0, 0.0]]},
+        "diagnostics": [{"type": "stress", "youngs_modulus": 1.0},
+                        {"type": "strain-energy", "youngs_modulus": 1.0}],
+    }  # fmt: skip
+    ds = pbdkit.run(stretched, progress=False)
+    share = 1.0 - 0.5 * ds.time.values / 30
+    np.testing.assert_allclose(ds.stress_xx.mean("particle"), 0.01 * share, atol=1e-12)
+    energy = ds.strain_energy.values
+    np.testing.assert_allclose(energy, energy[0] * share, rtol=1e-9)
+
+
+def test_a_mass_is_pushed_by_the_force_of_each_step():
+    """So heavy that what neighbours exert counts for nothing: u = Σ Σ F / m."""
+    force = course([1, 9], [0.0, 0.8])
+    mass = {"type": "newton", "mass": 1e9, "force": [force, 0.0]}
+    moved = {"select": {"edge": "right"}, "motion": mass}
+    ds = pbdkit.run(SHEET | {"frame": NATURAL, "leaders": [HELD, moved]}, progress=False)
+    pushes = np.interp(np.arange(1, 31), force["steps"], force["values"]) / 1e9
+    u = (ds.position[-1] - ds.reference).values[-6:, 0]
+    assert u.sum() == pytest.approx(np.cumsum(np.cumsum(pushes))[-1], rel=1e-6)
+
+
+def test_check_warns_of_numbers_on_the_way_that_diverge(call, tmp_path):
+    bad = SHEET | {
+        "solver": {
+            "type": "stepping",
+            "relaxation": course([0, 10, 20], [1.0, 5.0, 1.0]),
+        }
+    }
+    (tmp_path / "bad.yaml").write_text(json.dumps(bad))
+    said = json.loads(call("check", str(tmp_path / "bad.yaml"), "--json").out)
+    assert said["stable"]
+    assert any("at step 10 steps diverge, with solver.relaxation 5" in w for w in said["warnings"])
+
+
+def test_runs_do_not_settle_before_the_last_change():
+    settling = {"type": "stepping", "settle": {"tolerance": 1e-3}}
+    late = {"select": {"edge": "right"}, "force": [course([0, 400], [0, 0.1]), 0]}
+    given_ = SHEET | {"frame": NATURAL, "leaders": [HELD], "loads": [late], "solver": settling}
+    scene = build_scene(pbdkit.Experiment(**(given_ | {"steps": 5000})))
+    assert last_event(scene) == 400
+    ds = pbdkit.run(given_ | {"steps": 5000}, progress=False)
+    assert ds.status == "settled"
+    assert ds.time[-1] > 400
+
+
+def test_members_of_a_sweep_are_told_apart_by_their_courses():
+    rises = [course([0, 10], [0.5, last]) for last in (0.8, 0.9)]
+    vary = {"solver.relaxation": rises}
+    found = pbdkit.sweep(sheet(solver={"relaxation": 1.0}), vary=vary, workers=1, progress=False)
+    ends = [found.position.isel(relaxation=n, time=-1) for n in (0, 1)]
+    assert abs(ends[0] - ends[1]).max() > 0
+
+
+WRONG = {
+    "order": ({"fracture": {"type": "strain", "failure": course([5, 5], [1, 2])}},
+              r"fracture\.failure: steps should increase, and 5 comes after 5"),
+    "count": ({"fracture": {"type": "strain", "failure": course([5], [1, 2])}},
+              r"fracture\.failure: 1 steps have 2 values"),
+    "value": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, -2])}},
+              r"fracture\.failure: the last value: should be greater than 0, got -2"),
+    "text": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, "x"])}},
+             r"fracture\.failure: values: 1: should be a valid number"),
+    "no values": ({"fracture": {"type": "strain", "failure": {"steps": [1, 5]}}},
+                  r"fracture\.failure: values: Field required"),
+    "drawn": ({"fracture": BREAKING | {"scatter": 0.1}}, r"fracture\.failure: 'strain' draws"),
+    "relaxation": ({"solver": {"type": "stepping", "relaxation": course([1, 2], [1, 0])}},
+                   r"solver\.relaxation\.values\.1: should be greater than 0"),
+    "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
+                         "memory": course([1, 2], [0.1, 0.2])}},
+             r"'auto' needs numbers that stay"),
+    "force": ({"loads": [{"select": {"edge": "top"}, "force": [0, course([1, 2], [0])]}],
+               "frame": NATURAL}, r"loads\.0\.force\.1: 2 steps have 1 values"),
+    "a motion": ({"leaders": [{"select": {"edge": "left"}, "motion":
+                               {"type": "rotation", "angle": course([0], [1]),
+                                "centre": [0, 0], "steps": 5}}]}, r"leaders\.0\.motion\.angle"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_courses_are_told_with_their_place(name):
+    parts, said = WRONG[name]
+    with pytest.raises(pbdkit.ExperimentError, match=said):
+        pbdkit.run(SHEET | parts, progress=False)
