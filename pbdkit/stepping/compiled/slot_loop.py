@@ -82,10 +82,6 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
-            if plan.mixed:
-                out.add(depth, f"cell = {plan.mixed} * (at_j + cells_away[s, k, {side}])")
-            for m in range(plan.mixed):
-                out.add(depth, f"mixed{m}_{side} = flat_mixed[cell + {m}]")
     shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
     bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
     fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
@@ -104,13 +100,22 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
     out.add(2, contributions(plan, level, "r", values(level.seen.weights, named), shown))
-    mixed = [
-        values(
-            level.seen.weights, {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"mixed{m}_{{n}}"}
-        )
-        for m in range(plan.mixed)
-    ]
-    out.add(2, *more_contributions(plan, level, "r", mixed, shown))
+    if plan.mixed:
+        _write_mixed(out, plan, level, shown)
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")
+
+
+def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
+    """What cells of a stiffness of their own add. Of the others' stiffness they have no share, and
+    few particles are beside one."""
+    nothing = plan.number(0.0)
+    out.add(2, f"if share_0 == {nothing} or share_1 == {nothing}:")
+    weights = []
+    for side in (0, 1):
+        out.add(3, f"cell_{side} = {plan.mixed} * (at_j + cells_away[s, k, {side}])")
+    for m in range(plan.mixed):
+        homes = {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"flat_mixed[cell_{{n}} + {m}]"}
+        weights.append(values(level.seen.weights, homes))
+    out.add(3, *more_contributions(plan, level, "r", weights, shown))
