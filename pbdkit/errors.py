@@ -50,6 +50,8 @@ class ExperimentError(PbdkitError):
     """The experiment or the call is wrong."""
 
     exit_status = 2
+    located: bool = False
+    """Whether the message already begins with the place in the experiment's file."""
 
 
 class PluginError(PbdkitError):

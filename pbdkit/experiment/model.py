@@ -216,8 +216,12 @@ class Experiment(Strict):
         return self.model_dump(mode="json", by_alias=True)
 
     def located(self, error: ExperimentError) -> ExperimentError:
-        """The error with the place of its field in the file."""
-        return ExperimentError(self._source.message(error.where, str(error)), error.where)
+        """The error with the place of its field in the file, once."""
+        if error.located:
+            return error
+        found = ExperimentError(self._source.message(error.where, str(error)), error.where)
+        found.located = True
+        return found
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:

@@ -41,7 +41,7 @@ def choose(scene: Scene) -> Choice:
     hindrance = obstacle() or what_kernels_lack(scene)
     if solver.engine == "compiled" and hindrance:
         refusal = f"the compiled engine cannot be had: {hindrance}"
-        raise ExperimentError(refusal, ("solver", "engine"))
+        raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
     if solver.engine == "numpy":
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
