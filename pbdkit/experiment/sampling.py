@@ -1,4 +1,5 @@
-"""Functions of the place, as values over a grid: so an experiment says all in its file."""
+"""Functions of the place and random fields, as values over a grid: so an experiment says all in its
+file."""
 
 from __future__ import annotations
 
@@ -9,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.experiment.body import Body, Box
+from pbdkit.experiment.parts import fault
 from pbdkit.interfaces import Lattice
 from pbdkit.interfaces.fields import TakesFields
+from pbdkit.interfaces.random_field import RandomField
 from pbdkit.interfaces.varying import OfPlace, Varying
 
 Floats = NDArray[np.float64]
@@ -18,18 +21,24 @@ SLACK = 1e-9
 """Of spacings: so far a body reaches beyond a place by rounding."""
 
 
-def sampled(part: TakesFields, lattice: Lattice, body: Body) -> Any:
-    """The part with values in place of functions, half a spacing apart: on the square and the
-    rectangular lattice particles, middles of bonds and of cells are places of the grid.
+def sampled(part: TakesFields, lattice: Lattice, body: Body, seed: int, field: str) -> Any:
+    """The part at a field of the experiment with values in place of functions, and of random fields
+    from the seed, half a spacing apart: on the square and the rectangular lattice particles,
+    middles of bonds and of cells are places of the grid.
 
-    Raises ValidationError where the part does not take a value.
+    Raises ValidationError where the part does not take a value, PydanticCustomError where none can
+    be drawn.
     """
-    functions = {n: f for n, f in part.varying.items() if isinstance(f, OfPlace)}
-    if not functions:
-        return part
-    places = _grid(lattice, body)
-    found: dict[str, Varying] = {n: field.sampled(*places) for n, field in functions.items()}
-    return part.with_values(**{**part.varying, **found})
+    found: dict[str, Varying] = {}
+    for name, varying in part.varying.items():
+        if isinstance(varying, OfPlace):
+            found[name] = varying.sampled(*_grid(lattice, body))
+        elif isinstance(varying, RandomField):
+            try:
+                found[name] = varying.drawn_at(*_grid(lattice, body), seed, field)
+            except ValueError as error:
+                raise fault(str(error), key=(field, name)) from None
+    return part.with_values(**{**part.varying, **found}) if found else part
 
 
 def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:

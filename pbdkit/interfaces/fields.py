@@ -16,6 +16,8 @@ from pydantic import (
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, did_you_mean
+from pbdkit.interfaces.random_field import random_fields
+from pbdkit.interfaces.units import PATTERN
 from pbdkit.interfaces.varying import ByRegion, Varying, as_varying
 
 RESERVED = ("otherwise", "file", "steps")
@@ -45,13 +47,29 @@ ALTERNATIVES: dict[str, Any] = {
             },
             "additionalProperties": False,
         },
+        {
+            "type": "object",
+            "required": ["mean", "scatter", "correlation_length"],
+            "properties": {
+                "mean": {"type": "number", "exclusiveMinimum": 0},
+                "scatter": {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1},
+                "correlation_length": {
+                    "anyOf": [
+                        {"type": "number", "exclusiveMinimum": 0},
+                        {"type": "string", "pattern": PATTERN},
+                    ]
+                },
+                "drawn": {"type": "object"},
+            },
+            "additionalProperties": False,
+        },
     ],
 }
 """The JSON Schema of what a file writes in place of a number."""
 
 
 class Field(RootModel[Any]):
-    """A value for each place: by region, from a netCDF file, or over a grid."""
+    """A value for each place: by region, from a netCDF file, over a grid, or by chance."""
 
     model_config = ConfigDict(json_schema_extra=ALTERNATIVES)
 
@@ -82,8 +100,8 @@ class TakesFields(Component):
     def _with_fields(cls, data: Any, handler: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return handler(data)
-        varying = {}
-        for name in cls.numbers() & data.keys():
+        varying: dict[str, Varying] = {**random_fields(data, cls.numbers(), info.context)}
+        for name in (cls.numbers() & data.keys()) - varying.keys():
             try:
                 found = as_varying(data[name])
             except ValueError as error:

@@ -176,6 +176,7 @@ def as_varying(given: Any) -> Varying | None:
         return Gridded(given["x"], given["y"], _unpacked(given))
     raise ValueError(
         "should be a number, {otherwise: number, REGION: number}, {file: NAME.nc, variable: NAME}, "
+        "{mean: number, scatter: number, correlation_length: number}, "
         f"or {{x: [...], y: [...], values: [[...]]}}; got a map of {', '.join(map(str, given))}"
     )
 
