@@ -14,7 +14,7 @@ from pbdkit.experiment.parts import fault
 from pbdkit.interfaces import Lattice
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.random_field import RandomField
-from pbdkit.interfaces.varying import OfPlace, Varying
+from pbdkit.interfaces.varying import MOST_VALUES, OfPlace, Varying
 
 Floats = NDArray[np.float64]
 SLACK = 1e-9
@@ -31,24 +31,27 @@ def sampled(part: TakesFields, lattice: Lattice, body: Body, seed: int, field: s
     """
     found: dict[str, Varying] = {}
     for name, varying in part.varying.items():
-        if isinstance(varying, OfPlace):
-            found[name] = varying.sampled(*_grid(lattice, body))
-        elif isinstance(varying, RandomField):
-            try:
+        try:
+            if isinstance(varying, OfPlace):
+                found[name] = varying.sampled(*_grid(lattice, body))
+            elif isinstance(varying, RandomField):
                 found[name] = varying.drawn_at(*_grid(lattice, body), seed, field)
-            except ValueError as error:
-                raise fault(str(error), key=(field, name)) from None
+        except ValueError as error:
+            raise fault(str(error), key=(field, name)) from None
     return part.with_values(**{**part.varying, **found}) if found else part
 
 
 def _grid(lattice: Lattice, body: Body) -> tuple[Floats, Floats]:
+    """Raises ValueError for more places than a field takes, before they are made."""
     cell = lattice.cell()
     steps = np.array(cell.vectors) / np.array(cell.period)[:, None]
     spacing = np.abs(np.diag(steps))
     corners = np.concatenate([_corners(box, steps, lattice) for box in body.boxes()])
     origin = np.array(lattice.origin)
-    low = np.floor((corners.min(axis=0) - origin) / spacing + SLACK).astype(int)
-    high = np.ceil((corners.max(axis=0) - origin) / spacing - SLACK).astype(int)
+    low = np.floor((corners.min(axis=0) - origin) / spacing + SLACK)
+    high = np.ceil((corners.max(axis=0) - origin) / spacing - SLACK)
+    if not (count := np.prod(2 * (high - low) + 1)) <= MOST_VALUES:
+        raise ValueError(f"{count:.3g} values are more than {MOST_VALUES}; make the body smaller")
     x, y = (
         o + s / 2 * np.arange(2 * a, 2 * b + 1)
         for o, s, a, b in zip(origin, spacing, low, high, strict=True)

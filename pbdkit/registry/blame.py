@@ -51,7 +51,9 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
         if not field:
             raise blame(type(component), when, error) from error
         named = error.where[: len(field)] == field
-        raise ExperimentError(str(error), error.where if named else (*field, *error.where)) from None
+        raise ExperimentError(
+            str(error), error.where if named else (*field, *error.where)
+        ) from None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
     except (Exception, SystemExit) as error:

@@ -83,7 +83,7 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        further = of_material(fracture, rule, setting)
+        further = of_material(fracture, rule, setting, slots)
         limits = {
             s: _named("Constants", fracture.constants(s), **further.get(s, {})) for s in slots
         }
@@ -105,9 +105,9 @@ def named_weights(values: Any, rule: FollowerRule) -> Any:
 
 
 def of_material(
-    fracture: FractureModel, rule: FollowerRule, setting: Setting
+    fracture: FractureModel, rule: FollowerRule, setting: Setting, wanted: Iterable[Slot]
 ) -> dict[Slot, dict[str, float]]:
-    """Further constants by slot of a model that knows how stiff bonds are."""
+    """Further constants, by slot, of a model that knows how stiff bonds are."""
     if not isinstance(fracture, KnowsStiffness):
         return {}
     if not isinstance(rule, HasStiffBonds) or rule.elasticity() is None:
@@ -118,7 +118,7 @@ def of_material(
         )
     slots = [slot for own in setting.slots for slot in own]
     stiffness = {slot: rule.stiffness_along(slot, setting) for slot in slots}
-    return {slot: fracture.of_material(slot, stiffness, setting) for slot in slots}
+    return {slot: fracture.of_material(slot, stiffness, setting) for slot in wanted}
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:
