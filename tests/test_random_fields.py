@@ -38,7 +38,7 @@ GIVEN = {
         {"select": {"edge": "left"}, "motion": {"type": "hold"}},
         {"select": {"edge": "right"}, "motion": PULL},
     ],
-    "steps": 40,
+    "steps": 25,
     "solver": {"type": "stepping", "engine": "numpy"},
     "diagnostics": [{"type": "displacement"}, {"type": "stress", "youngs_modulus": 1.0}],
 }

@@ -66,7 +66,7 @@ class RandomField(Strict, Varying):
 
     mean: Annotated[float, Field(gt=0.0, le=1e100)]
     scatter: Annotated[float, Field(gt=0.0, lt=1.0)]
-    correlation_length: Annotated[float, Field(gt=0.0, le=1e100), LENGTH]
+    correlation_length: Annotated[float, Field(gt=1e-100, le=1e100), LENGTH]
     drawn: Drawn | None = None
     """What came of it; drawn anew where it is no answer to what is asked now."""
 
