@@ -60,7 +60,7 @@ def same(one, other):
     return all(one[name].values.tobytes() == other[name].values.tobytes() for name in one.variables)
 
 
-SEEDS = 400
+SEEDS = 300
 FAR = 4.0 * LENGTH
 """So far apart two places know as good as nothing of one another: exp(-16)."""
 DISTANCES = np.array([0.0, 0.5, 1.0, 2.0, 3.0])
