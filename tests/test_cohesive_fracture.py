@@ -162,3 +162,31 @@ def test_a_beam_tears_as_griffith_says():
 
     share = fracture_energy.beam(15, far=1.3, count=16)
     assert share.mean() == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("last", [0, 5])
+def test_a_condensed_body_carries_what_a_whole_one_does(last):
+    """A cracked beam of `fracture_energy.py`, of which the bonds across the columns up to `last`
+    are torn, and the same by pbdkit: both linear, so that they differ by rounding alone."""
+    import fracture_energy
+
+    h, columns, rows, lead, opening = 0.25, 13, 4, 2, 1e-3
+    half, middle = fracture_energy.Half.of(h, columns, rows, [lead]), (rows - 0.5) * h
+    force, _ = half.force(half.torn(0, last), opening)
+    leaders = [
+        {
+            "select": {"nearest": [[0.0, middle + side * (lead + 0.5) * h]]},
+            "motion": {"type": "displace", "displacement": [0.0, side * opening / 2]},
+        }
+        for side in (-1, 1)
+    ]
+    whole = body(h, {"type": "elastic", "poisson_ratio": 1 / 3}) | {
+        "body": {"type": "grid", "columns": columns, "rows": 2 * rows},
+        "fracture": {"type": "none"},
+        "cuts": [{"from": [-1.0, middle], "to": [(last + 0.25) * h, middle]}],
+        "leaders": leaders,
+        "solver": {"type": "equilibrium", "tolerance": 1e-10},
+        "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0}],
+    }
+    carried = pbdkit.run(whole, progress=False).reaction.sel(axis="y").values[-1]
+    np.testing.assert_allclose(carried, [-force, force], rtol=1e-8)

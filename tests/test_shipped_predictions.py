@@ -43,6 +43,7 @@ SMALLER = {
     "modelling/inclusion": ["lattice.a=1.0", SWINGING],
     "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
     "modelling/composite-plate": ["lattice.a=4.0", SWINGING],
+    "modelling/weakest-place": ["body.columns=8", SWINGING],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],
     "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
     + [

@@ -181,6 +181,16 @@ def test_what_is_no_field_is_left_to_the_parameter(given):
             },
             r"frame: 'traction-free' needs a rule that is calibrated to one material",
         ),
+        (
+            {
+                "fracture": {
+                    "type": "damage",
+                    "onset": {"x": [0, 8], "y": [0], "values": [[0.05], [0.3]]},
+                    "failure": {"x": [0, 8], "y": [0], "values": [[0.4], [0.1]]},
+                }
+            },
+            r"^fracture\.onset: at \(7\.5, 0\): onset 0\.284375 is not below failure 0\.11875",
+        ),
     ],
 )
 def test_what_no_field_goes_with_is_refused(parts, text):

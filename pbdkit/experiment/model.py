@@ -94,7 +94,8 @@ class Experiment(Strict):
             raise fault(text, key=key)
         for field in ("rule", "fracture"):
             try:
-                self.__dict__[field] = sampled(getattr(self, field), self.lattice, self.body)
+                part = getattr(self, field)
+                self.__dict__[field] = sampled(part, self.lattice, self.body, self.seed, field)
             except ValidationError as error:
                 first = error.errors()[0]
                 raise fault(first["msg"], key=(field, first["ctx"]["key"])) from None

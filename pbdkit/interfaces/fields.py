@@ -17,6 +17,8 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, did_you_mean
 from pbdkit.interfaces.course import Course, as_course
+from pbdkit.interfaces.random_field import random_fields
+from pbdkit.interfaces.units import PATTERN
 from pbdkit.interfaces.varying import ByRegion, Varying, as_varying
 
 RESERVED = ("otherwise", "file", "steps")
@@ -55,13 +57,30 @@ ALTERNATIVES: dict[str, Any] = {
             },
             "additionalProperties": False,
         },
+        {
+            "type": "object",
+            "required": ["mean", "scatter", "correlation_length"],
+            "properties": {
+                "mean": {"type": "number", "exclusiveMinimum": 0},
+                "scatter": {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1},
+                "correlation_length": {
+                    "anyOf": [
+                        {"type": "number", "exclusiveMinimum": 0},
+                        {"type": "string", "pattern": PATTERN},
+                    ]
+                },
+                "drawn": {"type": "object"},
+            },
+            "additionalProperties": False,
+        },
     ],
 }
 """The JSON Schema of what a file writes in place of a number."""
 
 
 class Field(RootModel[Any]):
-    """A value for each place: by region, from a netCDF file, or over a grid; or for each step."""
+    """A value for each place: by region, from a netCDF file, over a grid, or by chance; or for each
+    step."""
 
     model_config = ConfigDict(json_schema_extra=ALTERNATIVES)
 
@@ -114,8 +133,9 @@ class TakesFields(Component):
     def _with_fields(cls, data: Any, handler: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return handler(data)
-        varying, courses = dict[str, Varying](), dict[str, Course[float]]()
-        for name in cls.numbers() & data.keys():
+        varying: dict[str, Varying] = {**random_fields(data, cls.numbers(), info.context)}
+        courses = dict[str, Course[float]]()
+        for name in (cls.numbers() & data.keys()) - varying.keys():
             try:
                 if course := as_course(data[name]):
                     courses[name] = course

@@ -177,6 +177,7 @@ def as_varying(given: Any) -> Varying | None:
     raise ValueError(
         "should be a number, {otherwise: number, REGION: number}, {file: NAME.nc, variable: NAME}, "
         "{steps: [...], values: [...]}, "
+        "{mean: number, scatter: number, correlation_length: number}, "
         f"or {{x: [...], y: [...], values: [[...]]}}; got a map of {', '.join(map(str, given))}"
     )
 

@@ -50,7 +50,10 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
     except ExperimentError as error:
         if not field:
             raise blame(type(component), when, error) from error
-        raise ExperimentError(str(error), (*field, *error.where)) from None
+        named = error.where[: len(field)] == field
+        raise ExperimentError(
+            str(error), error.where if named else (*field, *error.where)
+        ) from None
     except (PbdkitError, MemoryError, FloatingPointError):
         raise
     except (Exception, SystemExit) as error:

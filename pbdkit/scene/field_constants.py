@@ -176,7 +176,7 @@ def _rules_at(
 
 def _limits(slot: Slot, rule: FollowerRule, setting: Setting, fracture: FractureModel) -> Any:
     """What a fracture model gives for a slot, what it makes of the rule's stiffness included."""
-    return {**fracture.constants(slot), **of_material(fracture, rule, setting).get(slot, {})}
+    return {**fracture.constants(slot), **of_material(fracture, rule, setting, slot)}
 
 
 def _refuse_parameters(

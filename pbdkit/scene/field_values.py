@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
@@ -26,7 +28,8 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
     """The parameters of the part at a field of the experiment that differ, at places where they
     are `needed`; elsewhere where there is none the number that serves for all.
 
-    Raises ExperimentError for a place outside of what is known.
+    Raises ExperimentError for a place outside of what is known, and where the values at a place do
+    not go together.
     """
     part: TakesFields = getattr(experiment, field)
     cell, held = experiment.lattice.cell(), dict[str, Mask]()
@@ -47,7 +50,24 @@ def values_at(experiment: Experiment, field: str, x: Floats, y: Floats, needed: 
                 (field, name),
             )
         found[name] = np.where(missing, getattr(part, name), values)
+    if len(found) > 1 and needed.any():
+        _refuse_apart(
+            part, field, {name: own[needed] for name, own in found.items()}, x[needed], y[needed]
+        )
     return found
+
+
+def _refuse_apart(part: TakesFields, field: str, values: Values, x: Floats, y: Floats) -> None:
+    """Numbers that each may be need not go together, as where one must be above another: looked at
+    are the places where two are farthest apart, either way."""
+    for one, other in combinations(values.values(), 2):
+        for place in (int(np.argmin(one - other)), int(np.argmax(one - other))):
+            try:
+                part.with_values(**{name: float(own[place]) for name, own in values.items()})
+            except ValidationError as error:
+                fault = error.errors()[0]
+                text = f"at ({x[place]:.6g}, {y[place]:.6g}): {fault['msg']}"
+                raise ExperimentError(text, (field, fault.get("ctx", {}).get("key", ""))) from None
 
 
 def signed_distance(body: Body, cell: Cell, x: Floats, y: Floats) -> Floats:

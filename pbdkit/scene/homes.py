@@ -83,10 +83,8 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
-        further = of_material(fracture, rule, setting)
-        limits = {
-            s: _named("Constants", fracture.constants(s), **further.get(s, {})) for s in slots
-        }
+        further = {s: of_material(fracture, rule, setting, s) for s in slots}
+        limits = {s: _named("Constants", fracture.constants(s), **further[s]) for s in slots}
         _refuse_other_names(limits, "constants")
         names = (*limits[slots[0]]._fields, *(n.name for n in bond_numbers(experiment)))
         if twice := {name for name in names if names.count(name) > 1}:
@@ -105,9 +103,9 @@ def named_weights(values: Any, rule: FollowerRule) -> Any:
 
 
 def of_material(
-    fracture: FractureModel, rule: FollowerRule, setting: Setting
-) -> dict[Slot, dict[str, float]]:
-    """Further constants by slot of a model that knows how stiff bonds are."""
+    fracture: FractureModel, rule: FollowerRule, setting: Setting, slot: Slot
+) -> dict[str, float]:
+    """Further constants of a slot, of a model that knows how stiff bonds are."""
     if not isinstance(fracture, KnowsStiffness):
         return {}
     if not isinstance(rule, HasStiffBonds) or rule.elasticity() is None:
@@ -116,9 +114,8 @@ def of_material(
             f"bonds are, which '{rule.type}' with these parameters is not; take 'springs' or "
             "'elastic'"
         )
-    slots = [slot for own in setting.slots for slot in own]
-    stiffness = {slot: rule.stiffness_along(slot, setting) for slot in slots}
-    return {slot: fracture.of_material(slot, stiffness, setting) for slot in slots}
+    stiffness = {s: rule.stiffness_along(s, setting) for own in setting.slots for s in own}
+    return fracture.of_material(slot, stiffness, setting)
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import numpy as np
+import xxhash
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
@@ -50,7 +51,7 @@ class Outlook:
 
     def __init__(self, keep: Keep, count: int) -> None:
         self._keep, self._count = keep, count
-        self._seen: set[str] = set()
+        self._seen: set[bytes] = set()
         self._columns: dict[str, Column] = {}
         self._sizes: dict[str, int] = {}
         self._times: set[tuple[Any, ...]] = set()
@@ -61,7 +62,7 @@ class Outlook:
         steps, recording = experiment.steps, experiment.recording
         self._times.add((steps, recording.at, recording.every))
         data = experiment.model_dump(mode="json", by_alias=True)
-        shape = json.dumps([data.get(part) for part in SHAPING])
+        shape = xxhash.xxh3_128_digest(json.dumps([data.get(part) for part in SHAPING]).encode())
         if shape in self._seen:
             return
         self._seen.add(shape)

@@ -7,7 +7,8 @@ a central notch, over spacings.
 The bodies are the net of springs of ν = 1/3, which 'elastic' is for small strains, mirrored at the
 crack's plane. What is not on that plane is linear and condensed once; the bonds across it soften by
 `Cohesive` itself, settled and softened in turn as `solver: equilibrium` does. So finer lattices are
-affordable than whole bodies; `tests/test_cohesive_fracture.py` holds one of these against pbdkit.
+affordable than whole bodies; `tests/test_cohesive_fracture.py` holds one of these, cracked, against
+a whole one by pbdkit.
 """
 
 from __future__ import annotations
