@@ -65,5 +65,12 @@ def plugins(session: nox.Session) -> None:
     session.run("pbdkit", "plugins", "list")
 
 
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation site, in build/docs; a warning is an error."""
+    install(session, "docs")
+    session.run("sphinx-build", "-W", "--keep-going", "-b", "html", "docs", "build/docs")
+
+
 if __name__ == "__main__":
     nox.main()
