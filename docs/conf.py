@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import version as version_of
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from gallery_scripts import write_scripts  # noqa: E402
 
 project = "pbdkit"
 copyright = "the pbdkit developers"
@@ -14,8 +21,9 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
+    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["reproduction/*", "pictures/*"]
+exclude_patterns = ["reproduction/*", "pictures/*", "gallery/**/*.ipynb", "**/sg_execution_times.*"]
 
 # Markdown. Pages with a kernel in their head are notebooks, run when the site is built.
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -23,8 +31,22 @@ myst_heading_anchors = 4
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 120
+suppress_warnings = ["myst-nb.lexer"]  # of notebooks that were not run
 copybutton_prompt_text = r"\$ |>>> "
 copybutton_prompt_is_regexp = True
+
+# A script an experiment, written here, run by the gallery.
+SCRIPTS = HERE.parent / "build" / "gallery"
+write_scripts(SCRIPTS)
+sphinx_gallery_conf = {
+    "examples_dirs": str(SCRIPTS),
+    "gallery_dirs": "gallery",
+    "matplotlib_animations": True,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "write_computation_times": False,
+}
 
 # The reference comes from the docstrings.
 autodoc_member_order = "bysource"
