@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import textwrap
+from itertools import pairwise
 from pathlib import Path
 
 from pbdkit.experiment.shipped import shipped_names, shipped_text
@@ -52,8 +53,8 @@ def write_scripts(folder: Path) -> None:
         (place / "GALLERY_HEADER.rst").write_text(f"{title}\n{'=' * len(title)}\n")
         (place / f"plot_{short.replace('-', '_')}.py").write_text(script_of(name))
     (folder / "GALLERY_HEADER.rst").write_text(
-        "Gallery\n=======\n\nEvery experiment that comes along, with its picture, its movie and its "
-        "file. `pbdkit experiments` lists them.\n"
+        "Gallery\n=======\n\nEvery experiment that comes along: its picture, its movie, its file. "
+        "`pbdkit experiments` lists them.\n"
     )
 
 
@@ -79,6 +80,6 @@ def asked(text: str) -> tuple[str, list[int]]:
     """The colour and the times of the command in a comment."""
     command = re.search(r"`(pbdkit plot[^`]*)`", text)
     words = shlex.split(command[1]) if command else []
-    options = list(zip(words, words[1:]))
+    options = list(pairwise(words))
     color = next((value for key, value in options if key == "--color"), "")
     return color, [int(value) for key, value in options if key == "--time"]
