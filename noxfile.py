@@ -65,5 +65,16 @@ def plugins(session: nox.Session) -> None:
     session.run("pbdkit", "plugins", "list")
 
 
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation site, in build/docs; a warning is an error. `nox -s docs -- unrun` leaves
+    out what notebooks and gallery show: the tests run the one, the other takes a quarter of an
+    hour."""
+    install(session, "docs")
+    unrun = ["-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]
+    options = ["-W", "--keep-going", *(unrun if "unrun" in session.posargs else [])]
+    session.run("sphinx-build", *options, "-b", "html", "docs", "build/docs")
+
+
 if __name__ == "__main__":
     nox.main()

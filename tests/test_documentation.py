@@ -2,7 +2,9 @@
 
 import re
 import shlex
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from click.testing import CliRunner
@@ -13,6 +15,7 @@ from pbdkit.experiment.source import read_text
 
 ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"
+NOTEBOOKS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(EXTENDING.glob("*.md"))]
 
 
@@ -50,6 +53,21 @@ def test_python_runs(page, code, tmp_path, monkeypatch):
         assert abs(names["ds"].position - names["ds"].reference).max() > 0
 
 
+@pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
+def test_notebooks_run(page, tmp_path, monkeypatch):
+    """Cell after cell, as when the site is built."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    module = ModuleType("a_notebook")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # so that its classes can be found
+    cells = re.findall(r"^```\{code-cell\}\n(.*?)^```", page.read_text(), re.M | re.S)
+    for cell in cells:
+        exec(compile(cell, page.name, "exec"), vars(module))
+    report = vars(module).get("report")
+    assert cells
+    assert report is None or report.holds
+
+
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
 def test_experiments_run(page, code):
     if is_sweep(code):
@@ -77,7 +95,7 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
             assert result.exit_code == 0, (line, result.output, result.exception)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         if not target.startswith("http"):

@@ -99,5 +99,5 @@ class LeaderGroup(Driven):
         """Who leads along all axes says nothing of them."""
         found: dict[str, Any] = serialize(self)
         if self.axes is None:
-            del found["axes"]
+            found.pop("axes", None)
         return found

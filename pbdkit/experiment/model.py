@@ -133,6 +133,8 @@ class Experiment(Strict):
     def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Types that several distributions offer keep the name of theirs."""
         found: dict[str, Any] = serialize(self)
+        if not found.keys() >= INTERFACES.keys():
+            return found  # of some fields alone
         *single, many = (found[field] for field in INTERFACES)
         for part, dumped in zip(self.components(), [*single, *many], strict=True):
             dumped["type"] = self._registry.name_of(part)

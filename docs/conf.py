@@ -1,0 +1,67 @@
+"""How the documentation site is built: `nox -s docs`, or `sphinx-build -W docs build/docs`."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from gallery_scripts import write_scripts  # noqa: E402
+
+project = "pbdkit"
+copyright = "the pbdkit developers"
+version = release = version_of("pbdkit")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["reproduction/*", "pictures/*", "gallery/**/*.ipynb", "**/sg_execution_times.*"]
+
+# Markdown. Pages with a kernel in their head are notebooks, run when the site is built.
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+suppress_warnings = ["myst-nb.lexer"]  # of notebooks that were not run
+copybutton_prompt_text = r"\$ |>>> "
+copybutton_prompt_is_regexp = True
+
+# A script an experiment, written here, run by the gallery.
+SCRIPTS = HERE.parent / "build" / "gallery"
+write_scripts(SCRIPTS)
+sphinx_gallery_conf = {
+    "examples_dirs": str(SCRIPTS),
+    "gallery_dirs": "gallery",
+    "matplotlib_animations": True,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "write_computation_times": False,
+}
+
+# The reference comes from the docstrings.
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_format = "short"
+add_module_names = False
+
+html_theme = "pydata_sphinx_theme"
+html_title = "pbdkit"
+html_theme_options = {
+    "navbar_align": "left",
+    "show_toc_level": 2,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": ["page-toc"],
+}
+html_show_sourcelink = False
