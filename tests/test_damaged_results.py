@@ -50,7 +50,7 @@ CRAFTED: dict[str, Callable[[Any], None]] = {
     "no time": rename("time"),
     "positions not finite": value("position", (slice(None), 40), np.nan),
     "a reference not finite": value("reference", 3, np.inf),
-    "bonds of nobody": value("bond", 5, [10**6, -7]),
+    "bonds of nobody": value("bond_ends", 5, [10**6, -7]),
     "kinds unknown": value("kind", slice(None), 77),
     "no JSON": attribute("experiment", "{"),
     "JSON of another kind": attribute("experiment", "[1, 2]"),

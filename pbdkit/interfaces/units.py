@@ -24,6 +24,10 @@ PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*[A-Za-zµμ°Å].*$"
 LONGEST = 60
 
 
+OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
+"""How the units of what is given as a plain number are called."""
+
+
 @dataclass(frozen=True)
 class Quantity:
     """A number that is counted in lattice units, and can be written with a unit where the
@@ -32,6 +36,7 @@ class Quantity:
     It annotates a parameter: ``a: Annotated[float, Field(gt=0.0), LENGTH]``. `lattice` is what it
     is counted in, as variables of the dataset say it: of the lattice's length L, Young's modulus E
     and thickness t, L^length · E^youngs_modulus · t^thickness; `unit` is the same of mm and MPa.
+    A stress unit is the one in which Young's modulus is given, a thickness unit that of thickness.
     """
 
     meaning: str
@@ -40,6 +45,12 @@ class Quantity:
     length: int = 0
     youngs_modulus: int = 0
     thickness: int = 0
+
+    @property
+    def counted(self) -> str:
+        """What the units are that are neither the lattice's nor a step."""
+        given = [name for name in ("youngs_modulus", "thickness") if getattr(self, name)]
+        return "; ".join(f"{OF_GIVEN[name]}: that in which {name} is given" for name in given)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         return core_schema.with_info_before_validator_function(self._number, handler(source))
@@ -56,20 +67,20 @@ class Quantity:
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
 AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
-STRESS = Quantity("stress", "unit of youngs_modulus", "MPa", youngs_modulus=1)
+STRESS = Quantity("stress", "stress unit", "MPa", youngs_modulus=1)
 FORCE = Quantity(
-    "force", "unit of youngs_modulus * unit of thickness * lattice unit", "N",
+    "force", "stress unit * thickness unit * lattice unit", "N",
     length=1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
 ENERGY = Quantity(
-    "energy", "unit of youngs_modulus * unit of thickness * lattice unit^2", "mJ",
+    "energy", "stress unit * thickness unit * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
 BODY_FORCE = Quantity(
-    "force per area", "unit of youngs_modulus * unit of thickness / lattice unit", "N/mm^2",
+    "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, FORCE, ENERGY)}
+QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_FORCE)}
 """By what they are counted in."""
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]

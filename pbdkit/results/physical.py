@@ -11,7 +11,7 @@ import numpy as np
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Diagnostic, Variable
-from pbdkit.interfaces.units import LENGTH, QUANTITIES, Quantity, Units, given_by_units
+from pbdkit.interfaces.units import LENGTH, OF_GIVEN, QUANTITIES, Quantity, Units, given_by_units
 from pbdkit.results.layout import Column, Values
 
 if TYPE_CHECKING:
@@ -40,7 +40,9 @@ class Physical:
             quantity = QUANTITIES.get(variable.units)
             if quantity and quantity.youngs_modulus and self._gave(diagnostic, quantity):
                 assert self._units is not None
-                own: dict[str, Any] = {"lattice_units": quantity.lattice.replace("unit of ", "")}
+                own: dict[str, Any] = {"lattice_units": quantity.lattice}
+                for name, unit in OF_GIVEN.items():
+                    own["lattice_units"] = own["lattice_units"].replace(unit, name)
                 own["lattice_factor"] = 1.0 / self._units.scale(quantity)
                 attributes = variable.attributes | own
                 factor = (self._units.value("length") or 1.0) ** quantity.length
