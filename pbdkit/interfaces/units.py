@@ -24,10 +24,6 @@ PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*[A-Za-zµμ°Å].*$"
 LONGEST = 60
 
 
-OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
-"""How the units of what is given as a plain number are called."""
-
-
 @dataclass(frozen=True)
 class Quantity:
     """A number that is counted in lattice units, and can be written with a unit where the
@@ -45,12 +41,6 @@ class Quantity:
     length: int = 0
     youngs_modulus: int = 0
     thickness: int = 0
-
-    @property
-    def counted(self) -> str:
-        """What the units are that are neither the lattice's nor a step."""
-        given = [name for name in ("youngs_modulus", "thickness") if getattr(self, name)]
-        return "; ".join(f"{OF_GIVEN[name]}: that in which {name} is given" for name in given)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         return core_schema.with_info_before_validator_function(self._number, handler(source))

@@ -162,11 +162,10 @@ def when_measured(diagnostic: Diagnostic | type[Diagnostic]) -> When:
 
 def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnostic]) -> Column:
     """A diagnostic's variable with its leading dimension."""
-    when, quantity = when_measured(diagnostic), QUANTITIES.get(variable.units)
+    when = when_measured(diagnostic)
     dims = (*{When.STEP: ["step"], When.RECORD: ["time"]}.get(when, []), *variable.dims)
     described = variable.long_name, variable.units, False, variable.attributes
-    comment = quantity.counted if quantity else ""
-    return Column(variable.name, dims, variable.dtype, when, *described, comment)
+    return Column(variable.name, dims, variable.dtype, when, *described)
 
 
 def own_coordinate(diagnostic: Diagnostic | type[Diagnostic]) -> Column:

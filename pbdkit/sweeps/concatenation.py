@@ -44,7 +44,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
 
 
 def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, list[Any]]]:
-    """The path of each place where parts differ, as deep as they are alike, with all values."""
+    """The path of each place where parts differ, as deep as they are alike, with all values; the
+    path of a `type` is that of its part."""
     if all(part == parts[0] for part in parts):
         return
     keys: Iterable[Any] = ()
@@ -54,7 +55,7 @@ def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple
         keys = range(len(parts[0]))
     for key in keys:
         inner = [part.get(key) if isinstance(part, dict) else part[key] for part in parts]
-        yield from _differences(inner, (*path, str(key)))
+        yield from _differences(inner, path if key == "type" else (*path, str(key)))
     if not keys:
         yield ".".join(path), parts
 
