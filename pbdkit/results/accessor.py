@@ -50,7 +50,7 @@ def open(path: str | Path) -> xarray.Dataset:
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
         )
     try:
-        dataset = _unfinished(left) if left else _opened(file)
+        dataset = in_this_layout(_unfinished(left) if left else _opened(file))
     except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
@@ -59,7 +59,6 @@ def open(path: str | Path) -> xarray.Dataset:
                 content.check()
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
-    dataset = in_this_layout(dataset)
     if fault := _fault(dataset):
         dataset.close()
         raise StorageError(f"{file}: {fault}")
