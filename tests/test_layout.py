@@ -188,6 +188,8 @@ def test_what_is_no_run_is_not_concatenated(sheet):
     for runs, said in [([], "there is no run"), ([sheet, sheet.drop_attrs()], "carries no exper")]:
         with pytest.raises(pbdkit.ExperimentError, match=said):
             pbdkit.concat(runs)
+    with pytest.raises(pbdkit.ExperimentError, match="have a 'time' already"):
+        pbdkit.concat([sheet], "time")
 
 
 def test_parameters_are_coordinates_of_a_sweep():
@@ -202,6 +204,17 @@ def test_parameters_are_coordinates_of_a_sweep():
     assert whole.relaxation.values.tolist() == [0.5, 1.0]
     for name in ("i", "j", "role"):
         assert found[name].equals(ones[0][name])
+
+
+def test_members_of_a_sweep_are_joined_along_their_cracks():
+    given = experiment(leaders=[HELD, pull_right(0.3, 0.0, 8)], steps=10,
+                       diagnostics=[{"type": "crack-path"}],
+                       fracture={"type": "threshold", "thresholds": [1.4]})  # fmt: skip
+    found = pbdkit.sweep(given, {"fracture.thresholds": [[1.4], [9.0]]}, workers=1, progress=False)
+    assert found.crack_step.dims == ("thresholds", "crack")
+    assert found.crack.values.tolist() == list(range(1, found.sizes["crack"] + 1))
+    assert found.bond_ends.dims == ("bond", "end")
+    assert (found.crack_step.sel(thresholds=1) == found.crack_step.fill_value).all()
 
 
 def test_a_run_that_is_not_finished_shows_the_same_layout(tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ ATTRIBUTES = (
 )  # fmt: skip
 INDICES = "ijk"
 """The names of a site's indices, one for each axis of the lattice."""
-OF_BODY, OF_FRAME = 0, 1
+OF_BODY, OF_FRAME = np.int8(0), np.int8(1)
 """The roles of particles: leaders and followers are body, at every step."""
 STEP, ENDS = "step", "their numbers, the lower one first"
 Values = dict[str, Any]
@@ -107,7 +107,7 @@ def base_columns(axes: int = 2) -> list[Column]:
     ]
 
 
-def _flags(meanings: dict[str, int]) -> dict[str, Any]:
+def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
     """The attributes of a variable whose values stand for words."""
     values = np.array([*meanings.values()], np.int8)
     return {"flag_values": values, "flag_meanings": " ".join(meanings)}

@@ -29,7 +29,7 @@ def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
         new |= {name: found["site"].isel(index=n) for name, n in axes}
     if "particle" in dims.get("kind", ()) and "role" not in found:
         frame = found["kind"].isel(time=0, missing_dims="ignore") == FRAME
-        new["role"] = frame * np.int8(OF_FRAME - OF_BODY) + np.int8(OF_BODY)
+        new["role"] = frame.copy(data=np.where(frame, OF_FRAME, OF_BODY))
     if dims.get("bond") == ("bond", "end"):
         new["bond_ends"] = found["bond"] + 1
         places = {"crack_bond": found["crack_bond"] + 1} if "crack_bond" in found else {}

@@ -23,8 +23,10 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     Every parameter in which their experiments differ is a coordinate along it, named as in a sweep;
     so is every attribute that differs, and ``pbdkit.rerun(whole.isel(run=0))`` works. What no run
     changes, as `reference` mostly, stands there once. All else is joined by its labels, with NaN
-    where a run has nothing. Raises ExperimentError where there is no run, and for a dataset that
-    carries no experiment.
+    where a run has nothing.
+
+    Raises ExperimentError where there is no run, for a dataset that carries no experiment, and for
+    a dimension that is taken.
     """
     import xarray
 
@@ -33,6 +35,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     if not all(experiments) or not each:
         what = "a dataset carries no experiment" if each else "there is no run"
         raise ExperimentError(f"{what}: only runs of pbdkit can be put side by side")
+    if any(dim in run.variables or dim in run.dims for run in each):
+        raise ExperimentError(f"runs have a '{dim}' already; give the new dimension another name")
     how: dict[str, Any] = {"data_vars": "all", "coords": "different", "compat": "equals"}
     whole = xarray.concat(each, dim, join="outer", combine_attrs="drop_conflicts", **how)
     changed = dict(_differences(experiments))
@@ -69,4 +73,4 @@ def _numbers(values: list[Any]) -> tuple[Any, ...]:
 def _attributes(runs: list[xarray.Dataset]) -> list[str]:
     """Those that are not the same in all."""
     names = dict.fromkeys(str(name) for run in runs for name in run.attrs)
-    return [n for n in names if any(run.attrs.get(n) != runs[0].attrs.get(n) for run in runs)]
+    return [name for name in names if len({str(run.attrs.get(name)) for run in runs}) > 1]
