@@ -88,6 +88,7 @@ if TYPE_CHECKING:
     )
     from pbdkit.registry.discovery import hookimpl as hookimpl
     from pbdkit.results.accessor import open as open
+    from pbdkit.sweeps.concatenation import concat as concat
 
 _HOME = {
     "pbdkit.errors": (
@@ -105,6 +106,7 @@ _HOME = {
     ),
     "pbdkit.registry.discovery": "hookimpl",
     "pbdkit.results.accessor": "open",
+    "pbdkit.sweeps.concatenation": "concat",
     "pbdkit.api": "analyse identify load rerun resume run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, StorageError
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -18,6 +17,7 @@ from pbdkit.interfaces import Component
 from pbdkit.prediction.analysis import Analysis
 from pbdkit.prediction.forecast import refuse_too_much_output
 from pbdkit.registry.registry import GIVEN, Registry
+from pbdkit.results.carried import carried
 from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
@@ -140,7 +140,7 @@ def resume(
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
     here = {"pbdkit": version("pbdkit")} | experiment.distributions()
-    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | _carried(dataset, "plugins")
+    made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | carried(dataset, "plugins")
     for name, now in here.items():
         before = made_by.get(name)
         if name != GIVEN and before != now:
@@ -179,27 +179,17 @@ def sweep(
 def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
     """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
     it wants components that are not there."""
-    if "experiment" not in dataset.attrs:
+    parts = carried(dataset, "experiment")
+    if not parts:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", _carried(dataset, "experiment"))
+    source = Source("dataset", parts)
     try:
         return Experiment.build(source, components)
     except ExperimentError as error:
-        given = _carried(dataset, "plugins").get(GIVEN)
+        given = carried(dataset, "plugins").get(GIVEN)
         if given is None or components:
             raise
         raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
-
-
-def _carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
-    """What a dataset carries as JSON; StorageError where it is not."""
-    try:
-        found = json.loads(dataset.attrs.get(attribute, "{}"))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise StorageError(f"its attribute '{attribute}' is damaged: {error}") from None
-    if not isinstance(found, dict):
-        raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
-    return found
 
 
 def _experiment(given: Given, components: Components) -> Experiment:

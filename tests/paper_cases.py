@@ -53,7 +53,7 @@ def parted(case, threshold=None, *settings):
         shells = 1 if case.startswith(("d1", "f1")) else 2
         settings = (f"fracture.thresholds={[threshold] * shells}", *settings)
     ds = run(case, "steps=15", QUIET, *settings)
-    ends, steps = ds.bond.values, ds.broken_step.values
+    ends, steps = ds.bond_ends.values - 1, ds.broken_step.values
     site, body = ds.site.values[ends], (ds.kind[0] != FRAME).values[ends].all(axis=1)
     torn = body & (np.sort(site[:, :, 0], axis=1) == (8, 9)).all(axis=1)
     row = np.where(site[:, 0, 0] == 9, site[:, 0, 1], site[:, 1, 1])

@@ -410,7 +410,7 @@ def simulate(experiment: Part) -> Part:
         "reference": [list(p) for p in body.X],
         "position": [[list(p) for p in x] for x in history],
         "kind": [[kind(j, max(t, 1)) for j in everyone] for t in times_0_to_end],
-        "bond": [list(bond) for bond in bonds],
+        "bond_ends": [[j + 1, k + 1] for j, k in bonds],
         "shell": [near.shell for near in bonds.values()],
         "broken_step": [broken.get(bond, NEVER) for bond in bonds],
         "pe1": [[pe1(body, j, x, set()) for j in everyone] for x in history],

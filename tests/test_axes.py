@@ -103,6 +103,7 @@ def test_its_dataset_has_three_axes():
     assert ds.axis.values.tolist() == ["x", "y", "z"]
     assert ds.position.shape == (STEPS + 1, block.raster.count, 3)
     assert ds.site.values.tolist() == [list(site) for site in faces()[2]]
+    assert (ds.site.values == np.stack([ds.i, ds.j, ds.k], axis=1)).all()
 
 
 def test_its_spectrum_is_the_closed_form():

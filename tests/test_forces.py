@@ -240,7 +240,7 @@ def test_the_dataset_is_described_and_stored(tmp_path):
     schema = json.loads((Path(__file__).parent.parent / "schemas/dataset.schema.json").read_text())
     made = ds.to_dict(data=False)
     jsonschema.validate(json.loads(json.dumps(made, default=lambda a: a.tolist())), schema)
-    assert ds.reaction.attrs["units"].startswith("unit of youngs_modulus * ")
+    assert ds.reaction.attrs["units"].startswith("stress unit * thickness unit * ")
 
 
 def test_reactions_without_leaders_are_refused():

@@ -50,7 +50,7 @@ def test_a_bond_breaks_when_its_strain_exceeds_failure(precision, a):
     ds = run(given)
     assert ds.broken_step.values.tolist() == [17]
     assert ds.broken_strain.values.tolist() == [17 * RATE]
-    assert (ds.crack_bond.values.tolist(), ds.crack_step.values.tolist()) == ([0], [17])
+    assert (ds.crack_bond.values.tolist(), ds.crack_step.values.tolist()) == ([1], [17])
     assert ds.crack_midpoint.values.tolist() == [[0.5 * a, 0.0]]
 
 
@@ -189,7 +189,7 @@ def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
     given = bar(9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, **SHEET)
     record(Run(build_scene(pbdkit.Experiment(**given))), NetcdfSink(tmp_path / "o.nc"))
     with pbdkit.open(tmp_path / "o.nc") as ds:
-        rows, steps = ds.crack_bond.values, ds.crack_step.values
+        rows, steps = ds.crack_bond.values - 1, ds.crack_step.values
         assert sorted(rows) == np.flatnonzero(ds.broken_step >= 0).tolist()
         assert (np.diff(steps) >= 0).all()
         assert steps[0] == 0 < steps[-1]
@@ -199,7 +199,7 @@ def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
         assert (np.diff(ds.crack_strain)[same & (steps[1:] > 0)] <= 0).all()
         assert np.isnan(ds.crack_strain[steps == 0]).all()
         X = ds.reference.values
-        middle = X[ds.bond.values[rows]].mean(axis=1)
+        middle = X[ds.bond_ends.values[rows] - 1].mean(axis=1)
         np.testing.assert_allclose(ds.crack_midpoint, middle, rtol=0, atol=1e-14)
 
 
@@ -210,7 +210,7 @@ def test_the_strain_at_break_is_that_of_the_intermediate_configuration():
     broken = np.flatnonzero(ds.broken_step > 0)
     assert len(broken) > 5
     for row in broken:
-        step, (a, b) = int(ds.broken_step[row]), ds.bond.values[row]
+        step, (a, b) = int(ds.broken_step[row]), ds.bond_ends.values[row] - 1
         m = np.where((ds.kind[step] == 0).values[:, None], ds.u[step], ds.u[step - 1])
         rest = ds.reference.values[b] - ds.reference.values[a]
         expected = np.hypot(*(rest + m[b] - m[a])) / np.hypot(*rest) - 1

@@ -135,7 +135,7 @@ def new_cracks(ds):
 
 def pieces(ds):
     """The label of the piece that each particle is in, by the bonds that hold."""
-    i, j = ds.bond.values[ds.broken_step.values < 0].T
+    i, j = ds.bond_ends.values[ds.broken_step.values < 0].T - 1
     size = ds.sizes["particle"]
     return connected_components(coo_array((np.ones(len(i)), (i, j)), (size, size)), False)
 
@@ -198,7 +198,7 @@ def strength(a, notched):
         "diagnostics.1={type: displacement}",
     ]
     ds = run("notch", *settings)
-    lower, upper = ds.bond.values[ds.broken_step.values < 0].T
+    lower, upper = ds.bond_ends.values[ds.broken_step.values < 0].T - 1
     X, u = ds.reference.values, ds.u.values[-1]
     r, d = X[upper] - X[lower], u[upper] - u[lower]
     strain = (d * r).sum(axis=1) / (r * r).sum(axis=1)

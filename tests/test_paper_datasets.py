@@ -19,11 +19,15 @@ BASE = {
     "axis": (("axis",), None),
     "particle": (("particle",), "int64"),
     "number": (("particle",), "int64"),
+    "i": (("particle",), "int32"),
+    "j": (("particle",), "int32"),
+    "role": (("particle",), "int8"),
     "site": (("particle", "index"), None),
     "reference": (("particle", "axis"), "float64"),
     "position": (("time", "particle", "axis"), "float64"),
     "kind": (("time", "particle"), "int8"),
-    "bond": (("bond", "end"), "int64"),
+    "bond": (("bond",), "int32"),
+    "bond_ends": (("bond", "end"), "int32"),
     "shell": (("bond",), None),
     "pe1": (("time", "particle"), "float64"),
     "pe2": (("time", "particle"), "float64"),
@@ -52,7 +56,8 @@ def test_datasets_have_the_names_dims_and_dtypes_of_the_contract(case):
         assert ds[name].dims == dims, name
         assert dtype is None or ds[name].dtype == dtype, name
         assert np.issubdtype(ds[name].dtype, np.integer) or dtype == "float64" or name == "axis"
-    assert {"time", "axis", "number", "particle"} <= set(ds.coords)
+    labels = {"time", "axis", "number", "particle", "i", "j", "reference", "role", "bond"}
+    assert labels <= set(ds.coords)
     assert ds.axis.values.tolist() == ["x", "y"]
     assert np.array_equal(ds.particle, ds.number)
     assert np.array_equal(ds.particle, np.arange(1, ds.sizes["particle"] + 1))
@@ -78,10 +83,11 @@ def test_datasets_have_the_attributes_of_the_contract(case):
 @every_case
 def test_bonds_are_sorted_once_each_and_have_a_body_end(case):
     ds = run(case)
-    bond, body = ds.bond.values, (ds.kind[0] != FRAME).values
-    assert (bond[:, 0] < bond[:, 1]).all()
-    assert np.array_equal(np.unique(bond, axis=0), bond)
-    assert body[bond].any(axis=1).all()
+    ends, body = ds.bond_ends.values, (ds.kind[0] != FRAME).values
+    assert (ends[:, 0] < ends[:, 1]).all()
+    assert np.array_equal(np.unique(ends, axis=0), ends)
+    assert body[ends - 1].any(axis=1).all()
+    assert np.array_equal(ds.bond, np.arange(1, len(ends) + 1))
 
 
 @every_case

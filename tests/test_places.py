@@ -90,7 +90,7 @@ def test_rule_draws_and_bonds_agree_on_places(lattice):
     middle = (X.min(axis=0) + X.max(axis=0)) / 2
     np.testing.assert_allclose(centred, X - middle, rtol=0, atol=1e-12)
     middles = np.column_stack([ds.middle_x, ds.middle_y])
-    np.testing.assert_allclose(middles, X[ds.bond.values].mean(axis=1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(middles, X[ds.bond_ends.values - 1].mean(axis=1), rtol=0, atol=1e-12)
 
 
 class Soft(pbdkit.FollowerRule):

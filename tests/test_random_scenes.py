@@ -57,7 +57,7 @@ def compare(experiment):
     ds = run_unless_refused(experiment)
     expected = plain_loops.simulate(with_the_noise_drawn(experiment))
 
-    for name in ("number", "site", "kind", "bond", "shell"):
+    for name in ("number", "site", "kind", "bond_ends", "shell"):
         np.testing.assert_array_equal(ds[name], np.array(expected[name]).reshape(ds[name].shape))
     if "broken_step" in ds:
         np.testing.assert_array_equal(ds["broken_step"], expected["broken_step"])

@@ -233,10 +233,10 @@ def test_a_newer_store_is_refused_with_its_version(
     stopped(call, monkeypatch)
     with RunStore(store_of(OUT)) as store:
         about = store.facts("about")
-    put("about", json.dumps(about | {"format": "2"}).encode())
+    put("about", json.dumps(about | {"format": "3"}).encode())
     for command in ("resume", "status", "plot"):
         found = call(command, str(OUT))
-        assert (found.code, "is of format 2" in found.err) == (6, True), found
+        assert (found.code, "is of format 3" in found.err) == (6, True), found
 
 
 def test_a_store_that_a_killed_process_was_making_is_none(call: Any) -> None:

@@ -197,7 +197,7 @@ def _search() -> tuple[int, list[float]]:
         limits = f"fracture.thresholds=[{threshold}, {threshold}]"
         sheet = run("paper/f2", limits, "steps=200", "record.every=20")
         steps = sheet.ds["broken_step"].values
-        ends = sheet.ds["bond"].values[(steps >= 60) & (steps <= 150)]
+        ends = sheet.ds["bond_ends"].values[(steps >= 60) & (steps <= 150)] - 1
         piece = sheet.body & (sheet.site[:, 0] < sheet.columns - 1)
         if piece[ends].any():
             late.append(float(threshold))

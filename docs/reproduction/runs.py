@@ -11,7 +11,8 @@ import pbdkit
 from pbdkit.experiment.source import read_text
 
 Floats = NDArray[np.float64]
-LEADER, FRAME = 0, 2
+LEADER, BODY = 0, 0
+"""A kind and a role, as the datasets' flags say."""
 COLUMNS = ROWS = 10
 """Every case is a grid of this size; its marked particles are named by column and row from 0."""
 
@@ -21,7 +22,7 @@ class Sheet:
 
     def __init__(self, dataset: xarray.Dataset) -> None:
         self.ds = dataset
-        self.body = (dataset["kind"].values[0] != FRAME).astype(bool)
+        self.body = dataset["role"].values == BODY
         self.site = dataset["site"].values
         self.columns, self.rows = (int(n) + 1 for n in self.site[self.body].max(axis=0))
 
@@ -61,7 +62,7 @@ class Sheet:
         configuration, with the leaders where the step takes them and all else where it was."""
         place, leads = self.position, self.ds["kind"].values[1:, :, None] == LEADER
         judged = np.where(leads, place[1:], place[:-1])
-        across = judged[:, self.ds["bond"].values]
+        across = judged[:, self.ds["bond_ends"].values - 1]
         length = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=-1).max(axis=1)
         return float(length.max()), int(length.argmax()) + 1
 
@@ -89,7 +90,7 @@ def run_text(text: str) -> Sheet:
 
 def parted(sheet: Sheet) -> list[int | None]:
     """For each row the step at which its leader lost its last bond to the column beside it."""
-    ends, steps = sheet.ds["bond"].values, sheet.ds["broken_step"].values
+    ends, steps = sheet.ds["bond_ends"].values - 1, sheet.ds["broken_step"].values
     last = sheet.columns - 1
     first, second = sheet.site[ends[:, 0]], sheet.site[ends[:, 1]]
     inside = sheet.body[ends].all(axis=1)

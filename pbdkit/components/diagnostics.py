@@ -157,14 +157,15 @@ class CrackPath(Diagnostic):
 
     def variables(self) -> tuple[Variable, ...]:
         """`crack_bond`, `crack_step`, `crack_strain`, `crack_midpoint`."""
-        bond = "broken bonds in their order, as positions along `bond` from 0"
-        strain = "strain with which the bond broke, NaN where it was cut or broken from the start"
-        where = "middle of the broken bond in the reference configuration"
+        crack, no_strain = ("crack",), "NaN where it was cut, or broken from the start"
+        where = "reference position of the broken bond's middle"
         return (
-            Variable("crack_bond", ("crack",), bond, "1", dtype="i8"),
-            Variable("crack_step", ("crack",), "step at which the bond broke", "step", dtype="i4"),
-            Variable("crack_strain", ("crack",), strain, "1"),
-            Variable("crack_midpoint", ("crack", "axis"), where, LENGTH.lattice),
+            Variable("crack_bond", crack, "number of the broken bond", "1", dtype="i8"),
+            Variable("crack_step", crack, "time of breaking", "step", dtype="i4"),
+            Variable(
+                "crack_strain", crack, "strain at breaking", "1", attributes={"comment": no_strain}
+            ),
+            Variable("crack_midpoint", (*crack, "axis"), where, LENGTH.lattice),
         )
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
@@ -172,7 +173,7 @@ class CrackPath(Diagnostic):
         bonds = now.bonds()
         step, strain = bonds.broken_step, bonds.broken_strain
         order = breaking_order(step, strain)
-        return order, step[order], strain[order], bonds.midpoint[order]
+        return order + 1, step[order], strain[order], bonds.midpoint[order]
 
 
 def _squared_extension(d: Vector, r: Vector) -> Any:

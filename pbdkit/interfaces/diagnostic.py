@@ -198,7 +198,7 @@ class Moment(ABC):
 
     @abstractmethod
     def bonds(self) -> BondHistory:
-        """The table of bonds, in the order of the dataset."""
+        """The table of bonds, in the order of the dataset: row n is the bond with number n + 1."""
 
     @abstractmethod
     def remembered(self, name: str) -> NDArray[Any]:

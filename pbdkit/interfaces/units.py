@@ -33,6 +33,7 @@ class Quantity:
     It annotates a parameter: ``a: Annotated[float, Field(gt=0.0), LENGTH]``. `lattice` is what it
     is counted in, as variables of the dataset say it: of the lattice's length L, Young's modulus E
     and thickness t, L^length · E^youngs_modulus · t^thickness; `unit` is the same of mm and MPa.
+    A stress unit is the one in which Young's modulus is given, a thickness unit that of thickness.
     """
 
     meaning: str
@@ -57,20 +58,20 @@ class Quantity:
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
 AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
-STRESS = Quantity("stress", "unit of youngs_modulus", "MPa", youngs_modulus=1)
+STRESS = Quantity("stress", "stress unit", "MPa", youngs_modulus=1)
 FORCE = Quantity(
-    "force", "unit of youngs_modulus * unit of thickness * lattice unit", "N",
+    "force", "stress unit * thickness unit * lattice unit", "N",
     length=1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
 ENERGY = Quantity(
-    "energy", "unit of youngs_modulus * unit of thickness * lattice unit^2", "mJ",
+    "energy", "stress unit * thickness unit * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
 BODY_FORCE = Quantity(
-    "force per area", "unit of youngs_modulus * unit of thickness / lattice unit", "N/mm^2",
+    "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
-QUANTITIES = {quantity.lattice: quantity for quantity in (LENGTH, AREA, STRESS, FORCE, ENERGY)}
+QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_FORCE)}
 """By what they are counted in."""
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]

@@ -8,13 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import xarray
 from xarray.backends import StoreBackendEntrypoint
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.results import picture
-from pbdkit.results.layout import SCHEMA_VERSION, base_columns
+from pbdkit.results.layout import INDICES, SCHEMA_VERSION, base_columns
+from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.physical import in_physical_units
 from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.run_files import STORE, store_of
@@ -48,7 +50,7 @@ def open(path: str | Path) -> xarray.Dataset:
             f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
         )
     try:
-        dataset = _unfinished(left) if left else _opened(file)
+        dataset = in_this_layout(_unfinished(left) if left else _opened(file))
     except PbdkitError:
         raise
     except Exception as error:  # whatever the libraries below make of a damaged file
@@ -162,7 +164,7 @@ class PbdAccessor:
     """What pbdkit adds to a dataset: ``dataset.pbd.plot(...)``."""
 
     def __init__(self, dataset: xarray.Dataset) -> None:
-        self._dataset = dataset
+        self._dataset = in_this_layout(dataset)
 
     def plot(
         self,
@@ -184,6 +186,39 @@ class PbdAccessor:
             assert whole is not None
             return whole
         return picture.draw(self._dataset, [time], ax=ax, **look)[0]
+
+    def at(self, **index: int) -> xarray.Dataset:
+        """What stands at site indices: ``at(i=3, j=4)`` is one particle, as ``sel(particle=...)``
+        gives it, ``at(j=0)`` all of a line.
+
+        Every site has indices of its own, those of one repeat cell too. Raises ExperimentError
+        where no particle is, and for what is no index.
+        """
+        dataset, found = self._dataset, self._dataset.variables
+        known = [n for n in INDICES if n in found and found[n].dims == ("particle",)]
+        here = np.ones(dataset.sizes.get("particle", 0), np.bool_)
+        for name, value in index.items():
+            if name not in known:
+                raise ExperimentError(f"particles here are found by {known}, not by '{name}'")
+            here &= found[name].values == value
+        rows = np.flatnonzero(here)
+        if not len(rows):
+            place = ", ".join(f"{name}={value}" for name, value in index.items())
+            raise ExperimentError(f"there is no particle at {place}")
+        return dataset.isel(particle=rows[0] if {*index} == {*known} else rows)
+
+    def components(self) -> xarray.Dataset:
+        """The dataset with `position_x`, `position_y` in place of `position`, and so on of
+        everything along `axis`: for plots of one against the other, and for tables."""
+        parts: dict[str, xarray.Variable] = {}
+        labels = []
+        for name, vector in self._dataset.variables.items():
+            for n in range(vector.sizes.get("axis", 0)) if name != "axis" else ():
+                axis = self._dataset["axis"].values[n]
+                part = parts[f"{name}_{axis}"] = vector.isel(axis=n)
+                part.attrs["long_name"] = f"{part.attrs.get('long_name', name)}, {axis} component"
+                labels += [f"{name}_{axis}"] if name in self._dataset.coords else []
+        return self._dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
 
     def physical(self) -> xarray.Dataset:
         """The dataset in mm, mm² and, of stresses, forces and energies, MPa, N and mJ, as far as

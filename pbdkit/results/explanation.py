@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Bonds, BreaksAtStrain, FractureModel
 from pbdkit.interfaces.fracture_model import breaking_order
+from pbdkit.results.layout import OF_FRAME
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.places import Places
-from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import describe_bonds
 
@@ -56,7 +56,7 @@ class Explained:
     """What a dataset tells of its bonds. Raises ExperimentError where it has no table of them."""
 
     def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
-        if "bond" not in dataset.variables:
+        if "bond_ends" not in dataset.variables:
             raise ExperimentError(
                 "has no table of bonds: nothing could break in this run; run the experiment with "
                 "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
@@ -74,7 +74,7 @@ class Explained:
         """(bond,): those that were cut after the first step had begun."""
         self.order: Rows = breaking_order(self.steps, self.strains_at_break)
         """The rows of the broken bonds, in the order in which they broke."""
-        if not np.array_equal(self.bonds.ends - 1, dataset["bond"].values):
+        if not np.array_equal(self.bonds.ends, dataset["bond_ends"].values):
             raise ExperimentError(
                 "its bonds are not those of the experiment that it carries: the file was changed, "
                 "or another version of a part made it"
@@ -107,7 +107,7 @@ class Explained:
         """(bond,): those that cannot break."""
         if not self.model.can_break:
             return np.ones(len(self.bonds), np.bool_)
-        frame = self._dataset["kind"].isel(time=0).values == FRAME
+        frame = self._dataset["role"].values == OF_FRAME
         touches = frame[self.bonds.ends - 1].any(axis=1)
         return np.asarray(touches & (not self.model.breaks_frame_bonds()))
 

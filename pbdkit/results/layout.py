@@ -24,8 +24,11 @@ ATTRIBUTES = (
     "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
     "prediction", "status", "stop_reason", "created",
 )  # fmt: skip
-
-
+INDICES = "ijk"
+"""The names of a site's indices, one for each axis of the lattice."""
+OF_BODY, OF_FRAME = np.int8(0), np.int8(1)
+"""The roles of particles: leaders and followers are body, at every step."""
+STEP, ENDS = "step", "their numbers, the lower one first"
 Values = dict[str, Any]
 """What goes into a dataset, by the name of the variable."""
 
@@ -41,8 +44,11 @@ class When(Enum):
 
 @dataclass(frozen=True)
 class Column:
-    """One variable of the dataset with its full dimensions; `coordinate` marks coordinates, `more`
-    are attributes besides its meaning and its units."""
+    """One variable of the dataset with its full dimensions; `coordinate` marks coordinates.
+
+    `long_name` is short, as it stands at the axes of plots; `comment` says the rest. `more` are
+    other attributes.
+    """
 
     name: str
     dims: tuple[str, ...]
@@ -52,6 +58,7 @@ class Column:
     units: str = ""
     coordinate: bool = False
     more: dict[str, Any] = field(default_factory=dict)
+    comment: str = ""
 
     @property
     def grows(self) -> bool:
@@ -61,64 +68,81 @@ class Column:
     @property
     def attributes(self) -> dict[str, Any]:
         """All that stands with it in the dataset."""
-        units = {"units": self.units} if self.units else {}
-        return {"long_name": self.long_name} | units | self.more
+        said = {"long_name": self.long_name, "units": self.units, "comment": self.comment}
+        return {name: text for name, text in said.items() if text} | self.more
 
 
 def coordinate(
-    name: str, long_name: str, dtype: str = "i8", when: When = When.START, units: str = ""
+    name: str,
+    long_name: str,
+    dtype: str = "i8",
+    dims: tuple[str, ...] = (),
+    *,
+    when: When = When.START,
+    units: str = "",
+    comment: str = "",
+    more: dict[str, Any] | None = None,
 ) -> Column:
-    """The coordinate of a dimension."""
-    return Column(name, (name,), dtype, when, long_name, units, True)
+    """A coordinate; that of the dimension with its name unless other dimensions are given."""
+    return Column(name, dims or (name,), dtype, when, long_name, units, True, more or {}, comment)
 
 
-def base_columns() -> list[Column]:
-    """What every dataset has."""
-    kinds = np.array([LEADER, FOLLOWER, FRAME], np.int8)
-    flags = {"flag_values": kinds, "flag_meanings": "leader follower frame"}
-    number = "number of the particle, by site (i, then j), from 1"
-    role = "role during the step, at time 0 that of step 1"
-    at, each, on = When.START, "particle", When.RECORD
+def base_columns(axes: int = 2) -> list[Column]:
+    """What every dataset has, on a lattice with so many axes."""
+    each, on, number = ("particle",), When.RECORD, "number of the particle"
+    by_site, now = "counted from 1, by site: i, then j", "during the step; at time 0 during step 1"
+    kinds = _flags({"leader": LEADER, "follower": FOLLOWER, "frame": FRAME})
+    roles = _flags({"body": OF_BODY, "frame": OF_FRAME})
     return [
-        coordinate("time", "step", when=on, units="step"),
-        coordinate(each, number),
-        Column("number", (each,), "i8", at, number, coordinate=True),
-        coordinate("axis", "coordinate axis", "str"),
-        Column("site", (each, "index"), "i4", at, "lattice index (i, j)"),
-        Column("reference", (each, "axis"), "f8", at, "reference position X", LENGTH.lattice),
-        Column("position", ("time", each, "axis"), "f8", on, "position x", LENGTH.lattice),
-        Column("kind", ("time", each), "i1", on, role, more=flags),
+        coordinate("time", "time", when=on, units=STEP),
+        coordinate("particle", number, comment=by_site),
+        coordinate("number", number, dims=each, comment=by_site),
+        *(coordinate(name, f"site index {name}", "i4", each) for name in INDICES[:axes]),
+        coordinate("role", "role of the particle", "i1", each, more=roles),
+        coordinate("axis", "axis", "str"),
+        coordinate("site", "site indices", "i4", (*each, "index")),
+        coordinate("reference", "reference position", "f8", (*each, "axis"), units=LENGTH.lattice),
+        Column("position", ("time", *each, "axis"), "f8", on, "position", LENGTH.lattice),
+        Column("kind", ("time", *each), "i1", on, "kind of the particle", more=kinds, comment=now),
     ]
+
+
+def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
+    """The attributes of a variable whose values stand for words."""
+    values = np.array([*meanings.values()], np.int8)
+    return {"flag_values": values, "flag_meanings": " ".join(meanings)}
 
 
 def optional_columns() -> list[list[Column]]:
     """What only some datasets have, whatever their diagnostics: the table of bonds, when each
     broke, the coordinate of what is measured at every step, and those of leader groups, of loads
     and of obstacles."""
-    bond, ends = ("bond",), "the two particles of the bond, as positions along `particle` from 0"
-    step = "step at which the bond broke, -1 if it has not"
-    strain = "strain with which the bond broke, NaN if it has not, was cut or broken from the start"
-    group = "leader group, by its place among the experiment's leaders, from 0"
-    obstacle = "obstacle, by its place among the experiment's obstacles, from 0"
+    bond, by_ends = ("bond",), "counted from 1, by its ends"
+    whole = "-1 where it has not broken"
+    no_strain = "NaN where it has not broken, was cut, or was broken from the start"
+    place = "counted from 0, by its place in the experiment"
     return [
         [
-            Column("bond", ("bond", "end"), "i8", When.START, f"{ends}, lower first", "", True),
-            Column("shell", bond, "i1", When.START, "shell of the bond, from 1"),
+            coordinate("bond", "number of the bond", "i4", comment=by_ends),
+            coordinate("bond_ends", "particles of the bond", "i4", ("bond", "end"), comment=ENDS),
+            coordinate("shell", "shell of the bond", "i1", bond, comment="counted from 1"),
         ],
         [
-            Column("broken_step", bond, "i4", When.END, step),
-            Column("broken_strain", bond, "f8", When.END, strain, "1"),
+            Column("broken_step", bond, "i4", When.END, "time of breaking", STEP, comment=whole),
+            Column(
+                "broken_strain", bond, "f8", When.END, "strain at breaking", "1", comment=no_strain
+            ),
         ],
-        [coordinate("step", "step", when=When.STEP, units="step")],
-        [coordinate("leader_group", group)],
-        [coordinate("load", "load, by its place among the experiment's loads, from 0")],
-        [coordinate("obstacle", obstacle)],
+        [coordinate("step", "time", when=When.STEP, units=STEP)],
+        [coordinate("leader_group", "leader group", comment=place)],
+        [coordinate("load", "load", comment=place)],
+        [coordinate("obstacle", "obstacle", comment=place)],
     ]
 
 
 def reserved_names() -> set[str]:
     """The names that nobody else can give to a variable or a dimension."""
-    ours = chain(base_columns(), *optional_columns())
+    ours = chain(base_columns(len(INDICES)), *optional_columns())
     return {name for column in ours for name in (column.name, *column.dims)}
 
 
@@ -142,6 +166,12 @@ def diagnostic_column(variable: Variable, diagnostic: Diagnostic | type[Diagnost
     dims = (*{When.STEP: ["step"], When.RECORD: ["time"]}.get(when, []), *variable.dims)
     described = variable.long_name, variable.units, False, variable.attributes
     return Column(variable.name, dims, variable.dtype, when, *described)
+
+
+def own_coordinate(diagnostic: Diagnostic | type[Diagnostic]) -> Column:
+    """That of the dimension whose length a diagnostic knows at the end only."""
+    name = diagnostic.own_dimension
+    return coordinate(name, name.replace("_", " "), when=When.END, comment="counted from 1")
 
 
 def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, Any]:

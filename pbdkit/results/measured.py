@@ -84,6 +84,8 @@ class Measured:
             for name in (*own, *filter(None, [diagnostic.own_dimension])):
                 _refuse_taken(name, taken, f"{whose} the dimension '{name}'")
             columns += [layout.coordinate(n, n, v.dtype.str[1:]) for n, v in own.items()]
+            if diagnostic.own_dimension:
+                columns.append(layout.own_coordinate(diagnostic))
             known = {*self.sizes, "time", "step", diagnostic.own_dimension}
             for variable, _ in self.physical.scaled(diagnostic):
                 _refuse_taken(variable.name, taken, f"{whose} the variable '{variable.name}'")
@@ -101,13 +103,16 @@ class Measured:
         return {n: values for d in self._diagnostics for n, values in d.coordinates().items()}
 
     def remembered(self, now: Moment, *, first: bool) -> Values:
-        """What is remembered and changes and, the `first` time, what stays. Raises
-        FloatingPointError for what changes and is not finite."""
-        wanted = [column for column in self._remembered if column.grows or first]
-        values = {column.name: now.remembered(column.name) for column in wanted}
-        for column in wanted:
-            if column.grows and not np.isfinite(values[column.name]).all():
+        """What is remembered and changes and, the `first` time, what stays; of particles it is of
+        the body, NaN at frame points unless whole. Raises FloatingPointError for what changes and
+        is not finite."""
+        values: Values = {}
+        for column in (c for c in self._remembered if c.grows or first):
+            value = now.remembered(column.name)
+            if column.grows and not np.isfinite(value).all():
                 raise FloatingPointError(f"{column.name} at step {now.step}")
+            of_body = column.dims[-1] == "particle" and value.dtype.kind == "f"
+            values[column.name] = np.where(now.body, value, np.nan) if of_body else value
         return values
 
     def diagnosed(self, when: When, now: Moment) -> Values:
@@ -140,6 +145,8 @@ class Measured:
                     values[variable.name] = (
                         np.array(value) if factor == 1.0 else np.multiply(value, factor)
                     )
+            if own in sizes:
+                values[own] = np.arange(1, sizes[own] + 1)
         return values
 
 

@@ -22,6 +22,8 @@ OPEN_CHUNK = 1024
 """Entries a chunk along a dimension whose length is known at the end only."""
 LEVEL = 1
 """Of zlib: the next levels cost much and gain little on positions."""
+LABELS = "coordinates"
+"""The attribute of CF that names such as are no dimension's; xarray reads that of the file too."""
 FIRST_LENGTH = 1024
 """Of a dimension that grows, until there is more."""
 
@@ -48,10 +50,8 @@ class NetcdfFile:
         self._batch: dict[str, int] = {}
         grow = dict.fromkeys(d for column in self._columns.values() for d in column.dims)
         self._content.dimensions = {dim: sizes.get(dim) or None for dim in grow}
-        # A table named as its dimension comes last: to the library the dimension is fixed then.
-        tables = {name: len(c.dims) > 1 and name in c.dims for name, c in self._columns.items()}
-        for name in sorted(self._columns, key=tables.__getitem__):
-            self._define(self._columns[name], sizes, planned)
+        for column in self._columns.values():
+            self._define(column, sizes, planned)
 
     def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
         """Goes on with a file as it was committed. Raises StorageError where it does not hold what
@@ -87,7 +87,10 @@ class NetcdfFile:
             along = [n for n in self.written if self._columns[n].dims[0] == dim]
             if along and grown.size:
                 self._content.resize_dimension(dim, max(self.written[name] for name in along))
-        self._content.attrs.update(attributes)
+        values = [{*column.dims} for column in self._columns.values() if not column.coordinate]
+        named = {name for dims in values for name in self._labels(dims)}
+        unnamed = (name for name in self._labels({*self._content.dimensions}) if name not in named)
+        self._content.attrs.update({**attributes, LABELS: " ".join(unnamed)})
         self._content.close()
         self._h5.close()
 
@@ -129,8 +132,13 @@ class NetcdfFile:
         dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
         variable = self._content.create_variable(column.name, column.dims, dtype, **more)
         variable.attrs.update(column.attributes)
-        if "particle" in column.dims and not column.coordinate:
-            variable.attrs["coordinates"] = "number"
+        if not column.coordinate and (labels := self._labels({*column.dims})):
+            variable.attrs[LABELS] = " ".join(labels)
+
+    def _labels(self, dims: set[str]) -> list[str]:
+        """The coordinates along these dimensions that are no dimension's own."""
+        of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
+        return [column.name for column in of_others if dims.issuperset(column.dims)]
 
     def _lengthen(self, dim: str, length: int) -> None:
         if self._content.dimensions[dim].size < length:

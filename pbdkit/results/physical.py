@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import xarray
 
 IN_MM = f"_{LENGTH.unit}"
+OF_GIVEN = {"youngs_modulus": "stress unit", "thickness": "thickness unit"}
+"""What the units are called in which these are given as plain numbers."""
 UNITS, FACTOR, TWIN_OF = "physical_units", "physical_factor", "physical_of"
 """The attributes of a variable in lattice units: times the factor it is in those units; and of what
 stands beside a variable, its name."""
@@ -40,7 +42,9 @@ class Physical:
             quantity = QUANTITIES.get(variable.units)
             if quantity and quantity.youngs_modulus and self._gave(diagnostic, quantity):
                 assert self._units is not None
-                own: dict[str, Any] = {"lattice_units": quantity.lattice.replace("unit of ", "")}
+                own: dict[str, Any] = {"lattice_units": quantity.lattice}
+                for name, unit in OF_GIVEN.items():
+                    own["lattice_units"] = own["lattice_units"].replace(unit, name)
                 own["lattice_factor"] = 1.0 / self._units.scale(quantity)
                 attributes = variable.attributes | own
                 factor = (self._units.value("length") or 1.0) ** quantity.length
@@ -58,9 +62,9 @@ class Physical:
         )
 
     def columns(self, columns: Iterable[Column]) -> list[Column]:
-        """The same with their scales, and what stands beside them. Raises PluginError where a name
-        is taken."""
-        found = list(columns)
+        """The same with a word on their units, their scales, and what stands beside them. Raises
+        PluginError where a name is taken."""
+        found = list(map(_explained, columns))
         if self._units is None:
             return found
         scale, names = self._units.value("length") or 1.0, {column.name for column in found}
@@ -80,6 +84,16 @@ class Physical:
                 more = column.more | {TWIN_OF: column.name}
                 found.append(replace(column, name=twin, units=LENGTH.unit, more=more))
         return found
+
+
+def _explained(column: Column) -> Column:
+    """A column that says of which given number its units are."""
+    given = [
+        f"{unit}: that of {n} as it is given"
+        for n, unit in OF_GIVEN.items()
+        if unit in column.units
+    ]
+    return replace(column, comment="; ".join(given)) if given else column
 
 
 class Twins:

@@ -19,6 +19,7 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.physical import Twins
 from pbdkit.results.sink import Sink
 from pbdkit.results.tables import Tables
+from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -67,10 +68,14 @@ class Recorder:
         numbers = np.arange(1, raster.count + 1)
         yield {"particle": numbers, "number": numbers}
         yield {"axis": np.array(list("xyz"[: scene.axes]))}
-        yield {"site": raster.site_table()}
+        site = raster.site_table()
+        yield {"site": site, **dict(zip(layout.INDICES, site.T, strict=False))}
+        yield {"role": np.where(raster.table_kind == FRAME, layout.OF_FRAME, layout.OF_BODY)}
         yield {"reference": raster.reference()}
         if scene.experiment.shows_bonds:
-            yield {"bond": scene.bonds.ends, "shell": scene.bonds.shell}
+            bonds = scene.bonds
+            yield {"bond": np.arange(1, len(bonds.ends) + 1, dtype=np.int32), "shell": bonds.shell}
+            yield {"bond_ends": np.add(bonds.ends, 1, dtype=np.int32, casting="same_kind")}
         if self._measured.shows_leaders:
             yield {"leader_group": np.arange(len(scene.leading))}
         if self._measured.shows_loads:
@@ -149,7 +154,7 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.shows_obstacles,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
-    all_of_them = [*layout.base_columns(), *some, *measured.columns()]
+    all_of_them = [*layout.base_columns(scene.axes), *some, *measured.columns()]
     columns = measured.physical.columns(all_of_them)
     if scene.experiment.record.dtype == "float64":
         return columns

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.registry.blame import one_line
-from pbdkit.scene.raster import FRAME
+from pbdkit.results.layout import OF_BODY
 
 if TYPE_CHECKING:
     import xarray
@@ -62,7 +62,7 @@ def take_snapshots(
 
 def _snapshot(now: xarray.Dataset, color: str | None, triangles: Array | None) -> Snapshot:
     step = int(now["time"])
-    bonds = now["bond"].values if "bond" in now else np.empty((0, 2), np.intp)
+    bonds = now["bond_ends"].values - 1 if "bond_ends" in now else np.empty((0, 2), np.intp)
     broken = now["broken_step"].values if "broken_step" in now else np.full(len(bonds), -1)
     gone = (broken >= 0) & (broken <= step)
     values = None if color is None else _values(now[color])
@@ -105,7 +105,7 @@ def _body_triangles(dataset: xarray.Dataset) -> Array:
     from matplotlib.tri import Triangulation
 
     reference = dataset["reference"].values
-    body = np.flatnonzero(dataset["kind"].isel(time=0).values != FRAME)
+    body = np.flatnonzero(dataset["role"].values == OF_BODY)
     try:
         triangles = body[Triangulation(*reference[body].T).triangles]
     except (RuntimeError, ValueError):

@@ -16,7 +16,7 @@ from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.results.accessor import reading
-from pbdkit.results.layout import Column, Values, When
+from pbdkit.results.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink
 from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import Watch
@@ -106,6 +106,11 @@ def _continued(output: Path, watch: Watch, steps: int, anyway: bool) -> Resumpti
         about = dataset.attrs
         if about.get("status") not in ENDED:
             raise ExperimentError(f"is {about.get('status')}: there is nothing to continue")
+        if (made_as := about.get("schema_version")) != SCHEMA_VERSION:
+            raise ExperimentError(
+                f"is of schema_version {made_as}, and what is recorded now is laid out as "
+                f"{SCHEMA_VERSION}; run it anew with --set steps={steps}"
+            )
         standing = _final_state(output)
         experiment = _experiment(about, str(output), steps, standing.facts.get("step"))
         if not experiment.solver.makes_steps:

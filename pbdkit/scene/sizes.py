@@ -94,8 +94,8 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
     each_time, every_step = 2 * recorded + 1.0, 0
-    each_bond = 17 + 12 * experiment.parts_bonds
-    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 4 + 2 * 8
+    each_bond = 4 + 2 * 4 + 1 + 12 * experiment.parts_bonds
+    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 1
     once += experiment.shows_bonds * planes * each_bond
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
     of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))

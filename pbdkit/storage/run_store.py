@@ -16,7 +16,7 @@ import xxhash
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import FULL, is_full, is_local
 
-FORMAT = "1"
+FORMAT = "2"
 """Of the store; a newer one is refused."""
 TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, data BLOB NOT NULL, digest BLOB NOT NULL)"
 SCHEMA = [(TABLE,), (None,)]

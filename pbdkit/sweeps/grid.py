@@ -40,7 +40,7 @@ class Dimension:
 def dimensions(sweep: Sweep, seed: int, taken: Set[str]) -> list[Dimension]:
     """Those of `vary`, `case`, `replicate`, in this order; `seed` is that of the experiment, and
     `taken` are the names that runs have for other things."""
-    names = _names([*sweep.vary, *sweep.together], {*taken, CASE, REPLICATE, STATUS, MESSAGE})
+    names = names_of([*sweep.vary, *sweep.together], {*taken, CASE, REPLICATE, STATUS, MESSAGE})
     found = []
     for path, values in sweep.vary.items():
         settings = tuple((Setting("vary", path, value),) for value in values)
@@ -48,7 +48,7 @@ def dimensions(sweep: Sweep, seed: int, taken: Set[str]) -> list[Dimension]:
     if sweep.together:
         each = ([Setting("together", p, v) for v in vs] for p, vs in sweep.together.items())
         along = {CASE: np.arange(sweep.cases)}
-        along |= {names[path]: _values(values) for path, values in sweep.together.items()}
+        along |= {names[path]: values_along(values) for path, values in sweep.together.items()}
         found.append(Dimension(CASE, tuple(zip(*each, strict=True)), along))
     if sweep.replicates > 1:
         seeds = replicate_seeds(seed, sweep.replicates)
@@ -75,7 +75,7 @@ def replicate_seeds(seed: int, count: int) -> list[int]:
     return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(count)]
 
 
-def _names(paths: list[str], taken: Set[str]) -> dict[str, str]:
+def names_of(paths: list[str], taken: Set[str]) -> dict[str, str]:
     """The last word of each path; all of it, with `_` for `.`, where two end alike, where it ends
     in a position of a list, and where something else has the name."""
     last = [path.rpartition(".")[2] for path in paths]
@@ -91,14 +91,14 @@ def _names(paths: list[str], taken: Set[str]) -> dict[str, str]:
 
 def _coordinates(name: str, values: tuple[Any, ...]) -> dict[str, Array]:
     """Numbers as they are; all else counted from 0, with the text beside it."""
-    along = _values(values)
+    along = values_along(values)
     if along.dtype.kind != "U":
         return {name: along}
     return {name: np.arange(len(values)), name + TEXT: along}
 
 
-def _values(values: tuple[Any, ...]) -> Array:
-    """Numbers, or texts."""
+def values_along(values: tuple[Any, ...]) -> Array:
+    """The values of a parameter as a coordinate: numbers, or texts."""
     if any(type(value) not in (int, float) for value in values):
         return np.array([v if isinstance(v, str) else json.dumps(v) for v in values])
     whole = all(type(value) is int and abs(value) < 2**63 for value in values)

@@ -16,7 +16,7 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
-from pbdkit.results.layout import reserved_names
+from pbdkit.results.layout import SCHEMA_VERSION, reserved_names
 from pbdkit.results.physical import IN_MM
 from pbdkit.sweeps.grid import Dimension, Setting, dimensions, places, words
 from pbdkit.sweeps.specification import Keep, Sweep
@@ -115,7 +115,9 @@ def job_of(experiment: Experiment, keep: Keep, versions: dict[str, str]) -> Job:
     if data["solver"].get("threads") == "auto":
         data["solver"]["threads"] = 1
     text = json.dumps(data)
-    content = json.dumps([text, keep.variables, keep.times, sorted(versions.items())])
+    content = json.dumps(
+        [text, keep.variables, keep.times, sorted(versions.items()), SCHEMA_VERSION]
+    )
     return Job(
         xxhash.xxh3_128_hexdigest(content.encode()), text, keep.variables, keep.times, versions
     )

@@ -113,10 +113,10 @@ class KeptSink(Sink):
 
 
 def kept_columns(columns: list[Column], wanted: set[str] | None) -> dict[str, Column]:
-    """The columns of that name, and the coordinates of their dimensions."""
+    """The columns of that name, and the labels along each of their dimensions."""
     chosen = [c for c in columns if wanted is None or c.name in wanted]
-    dims = {dim for column in chosen for dim in column.dims}
-    return {c.name: c for c in columns if c in chosen or (c.coordinate and {*c.dims} <= dims)}
+    labels = {(dim,) for column in chosen for dim in column.dims}
+    return {c.name: c for c in columns if c in chosen or (c.coordinate and c.dims in labels)}
 
 
 def run_members(jobs: list[Job]) -> list[Report]:

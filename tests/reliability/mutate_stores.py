@@ -178,7 +178,7 @@ def hostile(draw: random.Random, others: list[Path]) -> str:
             file.execute("CREATE TABLE more (x DEFAULT (load_extension('precious')))")
         else:
             about = file.execute("SELECT data FROM pieces WHERE key = 'about'").fetchone()[0]
-            data = about.replace(b'"format": "1"', b'"format": "2"')
+            data = about.replace(b'"format": "2"', b'"format": "3"')
             digest = run_store._digest("about", data)
             file.execute("REPLACE INTO pieces VALUES ('about', ?, ?)", (data, digest))
     file.close()

@@ -40,7 +40,7 @@ def chains(bonds, modulus, seed, number=100, steps=INCREMENTS):
     each of its bonds): (chain,), a number, (chain, bond)."""
     increment = 2.2 * weakest_link(bonds, modulus) / steps
     ds = pulled("chain", bonds, number, modulus, seed, increment, steps)
-    row = ds.site.values[ds.bond.values[:, 0], 1]
+    row = ds.j.values[ds.bond_ends.values[:, 0] - 1]
     order = np.argsort(row, kind="stable")
     step = ds.broken_step.values[order].reshape(number, bonds)
     first = np.where(step > 0, step, steps + 1).min(axis=1)
@@ -65,8 +65,8 @@ def stiffness(ds, whole, size):
     Where the mean displacement rests, the differences along whole bonds add up to zero: a net of
     resistors, with currents for loads.
     """
-    column = ds.site.values[:, 0]
-    one, other = ds.bond.values[whole].T
+    column = ds.i.values
+    one, other = ds.bond_ends.values[whole].T - 1
     net = np.zeros((len(column),) * 2)
     net[one, other] = net[other, one] = 1.0
     laplacian = np.diag(net.sum(axis=1)) - net

@@ -93,7 +93,7 @@ def test_large_sheets_are_weaker():
 def test_the_load_of_a_sheet_is_that_of_its_rows():
     """A whole sheet has stiffness 1; where all rows but one are cut in a column, about 1/size."""
     ds = ran("sheet", "steps=1")
-    along = ds.site.values[ds.bond.values]
+    along = ds.site.values[ds.bond_ends.values - 1]
     cut = (along[:, 0, 0] == 3) & (along[:, 1, 0] == 4)
     whole = np.ones(len(cut), bool)
     stiffness = SIZE_EFFECT["stiffness"]
