@@ -14,6 +14,7 @@ from test_calibrated_rules import NATURAL
 import pbdkit
 from pbdkit.equilibrium.load_path import moments
 from pbdkit.interfaces.course import Course
+from pbdkit.results.explanation import Explained
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.choice import choose
 from pbdkit.stepping.numpy_engine import Stepper
@@ -309,10 +310,14 @@ WRONG = {
     "text": ({"fracture": {"type": "strain", "failure": course([1, 5], [1, "x"])}},
              r"fracture\.failure: values: 1: should be a valid number"),
     "no values": ({"fracture": {"type": "strain", "failure": {"steps": [1, 5]}}},
-                  r"fracture\.failure: values: Field required"),
+                  r"fracture\.failure: values: is missing"),
     "drawn": ({"fracture": BREAKING | {"scatter": 0.1}}, r"fracture\.failure: 'strain' draws"),
     "relaxation": ({"solver": {"type": "stepping", "relaxation": course([1, 2], [1, 0])}},
                    r"solver\.relaxation\.values\.1: should be greater than 0"),
+    "in a field": ({"regions": {"a": {"type": "disc", "radius": 1.0, "centre": [0.0, 0.0]}},
+                    "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness":
+                             {"otherwise": 1.0, "a": {"steps": [1], "values": [2.0]}}}},
+                   r"rule\.stiffness: 'a' should be a number: there is no field in a field"),
     "auto": ({"solver": {"type": "stepping", "relaxation": "auto",
                          "memory": course([1, 2], [0.1, 0.2])}},
              r"'auto' needs numbers that stay"),
@@ -329,3 +334,37 @@ def test_wrong_courses_are_told_with_their_place(name):
     parts, said = WRONG[name]
     with pytest.raises(pbdkit.ExperimentError, match=said):
         pbdkit.run(SHEET | parts, progress=False)
+
+
+def test_explain_says_the_limit_of_the_step_in_which_a_bond_broke():
+    ds = pbdkit.run("modelling/ageing", progress=False)
+    found = Explained(ds, build_scene(pbdkit.load("modelling/ageing")))
+    broken = found.steps > 0
+    limits = np.interp(found.steps[broken], [100, 1000], [0.2, 0.02])
+    np.testing.assert_allclose(found.limits[broken], limits, rtol=1e-12)
+
+
+def test_what_changes_nothing_is_warned_of():
+    far = {"type": "disc", "radius": 1.0, "centre": [50.0, 50.0]}
+    soft = {"type": "elastic", "stiffness": {"otherwise": 1.0, "far": 2.0}, "poisson_ratio": 0.3}
+    scene = build_scene(
+        pbdkit.Experiment(
+            **SHEET | {"regions": {"far": far, "idle": far}, "rule": soft, "frame": NATURAL}
+            | {"fracture": {"type": "strain", "failure": course([0, 99], [1.0, 0.5])}}
+            | {"solver": {"type": "equilibrium"}}
+        )
+    )  # fmt: skip
+    for said in (
+        "regions.far: lies outside of the body",
+        "regions.idle: nothing names it",
+        "fracture.failure: changes until step 99, and the run ends with step 30",
+        "record: of an equilibrium the start and the end",
+    ):
+        assert sum(warning.startswith(said) for warning in scene.warnings) == 1
+
+
+def test_check_warns_where_loads_have_no_time_to_come_to_rest(call, tmp_path):
+    given_ = SHEET | {"leaders": [HELD], "loads": FORCE, "frame": NATURAL}
+    (tmp_path / "hasty.yaml").write_text(json.dumps(given_))
+    said = json.loads(call("check", str(tmp_path / "hasty.yaml"), "--json").out)["warnings"]
+    assert any(w.startswith("steps: under its loads the body comes to rest in") for w in said)

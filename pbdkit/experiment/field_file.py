@@ -23,7 +23,8 @@ def read_field(given: dict[str, Any], folder: Path) -> Gridded:
         raise ValueError("file and variable should be words")
     path = folder / name
     if not path.is_file():
-        raise ValueError(f"{path} is no regular file; its place counts from the experiment's file")
+        what = "is no regular file" if path.exists() else "is not there"
+        raise ValueError(f"{path} {what}; its place counts from the experiment's file")
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path} is larger than 1 GiB")
     import xarray

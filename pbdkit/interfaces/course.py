@@ -96,7 +96,8 @@ def as_course(given: Any) -> Course[float] | None:
         fault = error.errors(include_url=False)[0]
         place = "".join(f"{word}: " for word in fault["loc"])
         text = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
-        raise ValueError(place + text) from None
+        missing = fault["type"] == "missing"
+        raise ValueError(f"{place}{'is missing' if missing else text}") from None
 
 
 def at(number: float | Course[float], moment: float) -> float:

@@ -177,11 +177,14 @@ class TakesFields(Component):
             except ValidationError as error:
                 for fault in error.errors(include_url=False):
                     name = next((w for w in fault["loc"] if w in here), None)
-                    if name or not fault["loc"]:  # else it is about another parameter
-                        text = fault["msg"].removeprefix("Value error, ")
-                        text = text.replace("Input should", "should")
-                        got = f", got {here[name]:g}" if name else ""
-                        raise _fault(str(name or min(here)), f"{label}: {text}{got}") from None
+                    if fault["type"] == "key" or (fault["loc"] and not name):
+                        continue  # it is about another parameter
+                    text = fault["msg"].removeprefix("Value error, ")
+                    text = text.replace("Input should", "should")
+                    got = f", got {here[name]:g}" if name else ""
+                    known = varying[name].samples if name else [label]
+                    where = label if label in known else next(iter(known))
+                    raise _fault(str(name or min(here)), f"{where}: {text}{got}") from None
 
 
 def _first(field: Varying | Course[float]) -> float:

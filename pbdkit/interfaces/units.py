@@ -75,20 +75,19 @@ QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_F
 """By what they are counted in."""
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
-"""Two lengths, (x, y); an experiment file writes them as a list of two."""
+"""Two lengths, (x, y)."""
 OneForce = Annotated[
     Annotated[float, FORCE, Tag(PLAIN)] | Annotated[Course[Annotated[float, FORCE]], Tag(COURSE)],
     Discriminator(form_of),
 ]
 Force = Annotated[tuple[OneForce, OneForce], Field(strict=False)]
-"""Two forces, along x and y, each of which may change in time."""
+"""Two forces, along x and y, each of which may change in time; so of a unit of area."""
 OneBodyForce = Annotated[
     Annotated[float, BODY_FORCE, Tag(PLAIN)]
     | Annotated[Course[Annotated[float, BODY_FORCE]], Tag(COURSE)],
     Discriminator(form_of),
 ]
 BodyForce = Annotated[tuple[OneBodyForce, OneBodyForce], Field(strict=False)]
-"""Two forces on a unit of area, along x and y."""
 
 
 def _positive(unit: str, meaning: str) -> BeforeValidator:

@@ -172,6 +172,9 @@ def as_varying(given: Any) -> Varying | None:
         return None
     if "otherwise" in given:
         return _by_region(given)
+    by_chance = given.keys() & {"mean", "scatter", "correlation_length"}
+    if given and not by_chance and all(isinstance(v, (int, float)) for v in given.values()):
+        raise ValueError("otherwise is missing: the number where none of these regions is")
     if given.keys() == {"x", "y", "values"}:
         return Gridded(given["x"], given["y"], _unpacked(given))
     raise ValueError(
@@ -184,6 +187,11 @@ def as_varying(given: Any) -> Varying | None:
 
 def _by_region(given: dict[str, Any]) -> ByRegion:
     for name, value in given.items():
+        if isinstance(value, dict):
+            raise ValueError(
+                f"'{name}' should be a number: there is no field in a field, and none that changes "
+                "in time"
+            )
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"'{name}' should be a number, got {value!r:.40}")
     values = {name: float(value) for name, value in given.items()}

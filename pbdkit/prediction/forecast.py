@@ -98,6 +98,7 @@ def forecast(scene: Scene) -> Forecast:
             *WITHOUT[: len(scene.barriers)],
             *analysis.warnings(),
             *_on_the_way(scene),
+            *_too_short(analysis),
             *waves,
         ],
         **{name: getattr(analysis, name) for name in ANALYSED},
@@ -136,6 +137,19 @@ def prediction(scene: Scene) -> dict[str, Any]:
         "largest_stable_relaxation": bound.largest_stable_relaxation(memory),
         "smallest_eigenvalue": bound.smallest,
     }
+
+
+def _too_short(analysis: Analysis) -> list[str]:
+    """Where a run ends long before its loads have come to rest: nobody could see it."""
+    experiment, settled = analysis.scene.experiment, analysis.steps_to["1e-3"]
+    if not (experiment.loads and experiment.solver.makes_steps and settled):
+        return []
+    if experiment.stepping.settle or settled <= experiment.steps:
+        return []
+    return [
+        f"steps: under its loads the body comes to rest in about {settled} steps, and the run has "
+        f"{experiment.steps}; take solver: {{type: equilibrium}}, memory: auto, or more steps"
+    ]
 
 
 def _on_the_way(scene: Scene) -> list[str]:

@@ -86,9 +86,19 @@ class Explained:
 
     @cached_property
     def limits(self) -> Floats:
-        """(bond,): the strain above which each breaks, NaN where the model does not say."""
-        limits = np.full(len(self.bonds), np.nan)
-        constants = self._scene.at(int(self._dataset["time"][-1])).constants
+        """(bond,): the strain above which each broke, or breaks at the last recorded step; NaN
+        where the model does not say."""
+        limits, last = np.full(len(self.bonds), np.nan), int(self._dataset["time"][-1])
+        moments = np.where(self.steps > 0, self.steps, last)
+        if not self._scene.experiment.courses:
+            moments[:] = last
+        for moment in np.unique(moments).tolist():
+            at = moments == moment
+            limits[at] = self._limits_at(moment)[at]
+        return limits
+
+    def _limits_at(self, moment: int) -> Floats:
+        limits, constants = np.full(len(self.bonds), np.nan), self._scene.at(moment).constants
         known = all(name in self._dataset for name in self._remembered)
         model = self.model
         if not (known and model.can_break and isinstance(model, BreaksAtStrain)):

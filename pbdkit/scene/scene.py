@@ -17,7 +17,7 @@ from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
-from pbdkit.scene.doubts import doubts_of
+from pbdkit.scene.doubts import doubts_of, without_effect
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
@@ -143,7 +143,7 @@ def _build(experiment: Experiment) -> Scene:
     warnings += doubts_of(experiment, neighbourhood, filling.body, layers)
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
-    warnings += doubts(raster, experiment.leaders)
+    warnings += [*without_effect(experiment, raster), *doubts(raster, experiment.leaders)]
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
