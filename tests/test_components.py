@@ -51,7 +51,7 @@ REQUIRED = {
 def an_instance(component):
     """One of it, with the parameters that it cannot do without."""
     fields = component.model_fields.items()
-    given = {f.alias or name: REQUIRED[name] for name, f in fields if is_needed(f)}
+    given = {f.alias or name: REQUIRED[f.alias or name] for name, f in fields if is_needed(f)}
     return component.model_validate(given)
 
 

@@ -15,7 +15,7 @@ from pbdkit.experiment.source import read_text
 
 ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"
-NOTEBOOKS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
+NOTEBOOKS = sorted(p for p in (ROOT / "docs" / "tutorial").glob("*.md") if p.stem != "index")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(EXTENDING.glob("*.md"))]
 
 

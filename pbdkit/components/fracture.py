@@ -24,8 +24,14 @@ from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.units import LENGTH
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
+
+
+class LimitCourse(Course[Limit]):
+    """Of a threshold."""
+
+
 LimitInTime = Annotated[
-    Annotated[Limit, Tag(PLAIN)] | Annotated[Course[Limit], Tag(COURSE)], Discriminator(form_of)
+    Annotated[Limit, Tag(PLAIN)] | Annotated[LimitCourse, Tag(COURSE)], Discriminator(form_of)
 ]
 Thresholds = Annotated[tuple[LimitInTime, ...], Field(strict=False)]
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces.component import Strict
 from pbdkit.interfaces.course import Course, at
-from pbdkit.interfaces.units import BodyForce, Force
+from pbdkit.interfaces.forces import BodyForce, Force
 
 
 class Load(Strict):

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from pbdkit.experiment.motion import Floats, Motion
 from pbdkit.interfaces.course import at
-from pbdkit.interfaces.units import Force, Place
+from pbdkit.interfaces.forces import Force
+from pbdkit.interfaces.units import Place
 
 
 class Newton(Motion):

@@ -25,13 +25,25 @@ Threads = Annotated[
     Word | Annotated[int, Field(ge=1, le=1024), Tag(PLAIN)], Discriminator(_form_of)
 ]
 _Relaxation = Annotated[float, Field(gt=0.0, le=1e6)]
+
+
+class RelaxationCourse(Course[_Relaxation]):
+    """Of the relaxation."""
+
+
 Relaxation = Annotated[
-    Word | Annotated[_Relaxation, Tag(PLAIN)] | Annotated[Course[_Relaxation], Tag(COURSE)],
+    Word | Annotated[_Relaxation, Tag(PLAIN)] | Annotated[RelaxationCourse, Tag(COURSE)],
     Discriminator(_form_of),
 ]
 _Memory = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class MemoryCourse(Course[_Memory]):
+    """Of the memory."""
+
+
 Memory = Annotated[
-    Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[Course[_Memory], Tag(COURSE)],
+    Word | Annotated[_Memory, Tag(PLAIN)] | Annotated[MemoryCourse, Tag(COURSE)],
     Discriminator(_form_of),
 ]
 

@@ -79,6 +79,10 @@ class Course(Strict, Generic[Value]):
         return values  # type: ignore[no-any-return]  # what stands for Value is a number
 
 
+class NumberCourse(Course[float]):
+    """Of a plain number. Each kind of number has a class of its own, which can be pickled."""
+
+
 def form_of(value: Any) -> str:
     """Which of two forms is meant."""
     return COURSE if isinstance(value, (dict, Course)) else PLAIN
@@ -91,7 +95,7 @@ def as_course(given: Any) -> Course[float] | None:
     if not (isinstance(given, dict) and "steps" in given):
         return None
     try:
-        return Course[float].model_validate(given)
+        return NumberCourse.model_validate(given)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         place = "".join(f"{word}: " for word in fault["loc"])

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo
+from pydantic import BeforeValidator, Field, ValidationInfo
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
 from pbdkit.interfaces.component import Component, Strict
-from pbdkit.interfaces.course import COURSE, PLAIN, Course, form_of
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
 WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"
@@ -76,18 +75,6 @@ QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_F
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]
 """Two lengths, (x, y)."""
-OneForce = Annotated[
-    Annotated[float, FORCE, Tag(PLAIN)] | Annotated[Course[Annotated[float, FORCE]], Tag(COURSE)],
-    Discriminator(form_of),
-]
-Force = Annotated[tuple[OneForce, OneForce], Field(strict=False)]
-"""Two forces, along x and y, each of which may change in time; so of a unit of area."""
-OneBodyForce = Annotated[
-    Annotated[float, BODY_FORCE, Tag(PLAIN)]
-    | Annotated[Course[Annotated[float, BODY_FORCE]], Tag(COURSE)],
-    Discriminator(form_of),
-]
-BodyForce = Annotated[tuple[OneBodyForce, OneBodyForce], Field(strict=False)]
 
 
 def _positive(unit: str, meaning: str) -> BeforeValidator:
