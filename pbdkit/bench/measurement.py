@@ -17,6 +17,7 @@ import numpy as np
 from pbdkit.api import load
 from pbdkit.bench.size import resized
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.experiment.model import Experiment
 from pbdkit.stepping.choice import processors
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
@@ -75,6 +76,13 @@ def engines() -> list[tuple[str, str, int]]:
     """Engine, precision and threads of all ways to step, the reference first."""
     ways = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
     return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
+
+
+def ways(asked: Experiment) -> int:
+    """So many rows `measure` gives of a size, or a few less."""
+    if asked.solver.makes_steps:
+        return len(engines())
+    return 2 + len(TOLERANCES) * len(METHODS)
 
 
 def measure(

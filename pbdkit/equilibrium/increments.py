@@ -32,8 +32,6 @@ VALUES_A_CALL = 200_000_000
 """An engine makes so many values' steps a call, some tenths of a second."""
 MOST_SETTLINGS = 2000
 """So often bonds may change in an increment, one after the other or little by little."""
-
-
 TINY, SMALLEST = 1e-9, 2.0**-12
 """The last part of a way is taken with what is left of it; no part is smaller than the other share
 of its increment."""
@@ -42,7 +40,9 @@ MOST_ROUNDS, STEPS_A_ROUND = 40, 50
 Way = Generator[float, None, Certificate]
 
 
-def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> Way:
+def increments(
+    scene: Scene, state: State, watch: Watch, since: float = 0.0, *, compiles: bool = True
+) -> Way:
     """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
     moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
     the state decide all that follows.
@@ -65,7 +65,7 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
                 (field, n, "motion"),
             )
     scale = scale_of(scene, initial_state(scene) if since or state.step else state)
-    finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
+    finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch, compiles)
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))
@@ -74,9 +74,11 @@ def increments(scene: Scene, state: State, watch: Watch, since: float = 0.0) -> 
     return _settle_at(scene, state, finder, steps)
 
 
-def settle(scene: Scene, state: State, watch: Watch | None = None) -> Certificate:
-    """The same in one go."""
-    way = increments(scene, state, watch or Watch())
+def settle(
+    scene: Scene, state: State, watch: Watch | None = None, *, compiles: bool = True
+) -> Certificate:
+    """The same in one go; moves are compiled where that `compiles` and they are many."""
+    way = increments(scene, state, watch or Watch(), compiles=compiles)
     while True:
         try:
             next(way)

@@ -27,9 +27,13 @@ ROUNDING = 4 * float(np.finfo(float).eps)
 
 class Moves:
     """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
-    frame standing where the body tells it to, and obstacles where they are at a moment."""
+    frame standing where the body tells it to, and obstacles where they are at a moment.
 
-    def __init__(self, scene: Scene) -> None:
+    Of large bodies they are compiled, which is worth its seconds where they are asked for often
+    with the same numbers; `compiles` says whether that is so.
+    """
+
+    def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
         stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
         self._scene = scene
         self._engine: Engine | None = None
@@ -38,7 +42,8 @@ class Moves:
         renews = isinstance(scene.experiment.rule, RenewsParticles)
         self._loads = replace(scene.loads) if scene.loads else None
         stepped = replace(scene, loads=self._loads)
-        if scene.raster.count > LARGEST_BY_NUMPY and not (scene.has_fracture or renews):
+        large = compiles and scene.raster.count > LARGEST_BY_NUMPY
+        if large and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
             free = replace(stepped, barriers=())
             stepped = replace(free, experiment=experiment, leading=_resting(scene))

@@ -21,10 +21,9 @@ MOST_CORRECTIONS = 12
 CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
-SERVES = 0.02
-"""What share of an error a correction may leave for its linearisation to serve once more."""
-NEAR = 1e-3
-"""How accurately corrections are solved for at least, as a share of themselves."""
+SERVES, NEAR = 0.02, 1e-3
+"""What share of an error a correction may leave for its linearisation to serve once more; how
+accurately corrections are solved for at least, as a share of themselves."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
 NUDGE = 1e-6
 """By so much leaders are moved to see what their way does to others."""
@@ -35,19 +34,20 @@ UNSTABLE = "what is found is not stable"
 
 @dataclass(frozen=True)
 class Finder:
-    """Looks for equilibria of a scene, to within a length, by one of the solver's methods; shares
-    are of the length `scale`."""
+    """Looks for equilibria of a scene, to within a length, by one of the solver's methods, shares
+    being of the length `scale`; `compiles` is that of the moves."""
 
     scene: Scene
     tolerance: float
     scale: float
     method: str
     watch: Watch
+    compiles: bool = True
 
     @cached_property
     def moves(self) -> Moves:
         """Of the scene's followers."""
-        return Moves(self.scene)
+        return Moves(self.scene, compiles=self.compiles)
 
     @cached_property
     def linear(self) -> bool:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,9 @@ class Body(Component):
         return False
 
 
+CORNER = dict.fromkeys(("centre", "center"), "`origin` is its lower left corner")
+
+
 class Grid(Body):
     """`columns` × `rows` sites from (0, 0)."""
 
@@ -85,6 +88,8 @@ class Rectangle(Body):
     width: Positive
     height: Positive
     origin: Place = (0.0, 0.0)
+
+    _elsewhere: ClassVar[Mapping[str, str]] = CORNER
 
     def boxes(self) -> list[Box]:
         """Itself."""
@@ -188,6 +193,8 @@ class Dogbone(Body):
     gauge_width: Positive
     radius: Positive
     origin: Place = (0.0, 0.0)
+
+    _elsewhere: ClassVar[Mapping[str, str]] = CORNER
 
     @model_validator(mode="after")
     def _fits(self) -> Dogbone:

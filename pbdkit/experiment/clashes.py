@@ -10,15 +10,15 @@ from pbdkit.interfaces import Calibrated, Draws, Loadable, RenewsParticles, Soft
 from pbdkit.interfaces.fields import unknown_regions
 from pbdkit.interfaces.rule import material_of
 
-Key = str | tuple[str, str]
+Key = str | tuple[str, ...]
 
 
 def clashes_of(asked: Any) -> Iterator[tuple[Key, str]]:
     """The fields of an experiment at which parts clash, each with a message."""
     yield from ((key, text) for key, clashes, text in _looked_at(asked) if clashes)
     for field in ("rule", "fracture"):
-        for name, text in unknown_regions(getattr(asked, field), asked.regions):
-            yield (field, name), text
+        for name, region, text in unknown_regions(getattr(asked, field), asked.regions):
+            yield (field, name, region), text
         yield from _drawn_from(field, getattr(asked, field))
     for name, region in asked.regions.items():
         if any(box.in_sites for box in region.boxes()):

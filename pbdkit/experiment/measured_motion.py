@@ -21,6 +21,8 @@ ON_EDGE = 1e-7
 class Measured(Motion):
     """Moves each particle by the displacement measured where it lies at rest: linear on the
     Delaunay triangles of the points, or along the line on which they lie; within `ramp` steps.
+    `outside` says what of particles beyond the points: they are refused, or take the value of the
+    nearest point.
 
     `file`: a CSV with columns x, y, ux, uy; its content takes its place.
     """
@@ -33,6 +35,7 @@ class Measured(Motion):
     points: Pairs
     displacements: Pairs
     ramp: Steps = 1
+    outside: Literal["refuse", "nearest"] = "refuse"
 
     @model_validator(mode="before")
     @classmethod
@@ -69,7 +72,7 @@ class Measured(Motion):
         key = places.tobytes()
         if key not in self._known:
             self._known.clear()
-            self._known[key] = self._interpolated(places)
+            self._known[key] = self._beyond(places, self._interpolated(places))
         return self._known[key]
 
     @cached_property
@@ -99,6 +102,16 @@ class Measured(Motion):
         shares = np.concatenate([part, 1.0 - part.sum(axis=1, keepdims=True)], axis=1)
         values = np.einsum("pc,pca->pa", shares, self._values[corners])
         return np.where((found >= 0)[:, None], values, np.nan)
+
+    def _beyond(self, places: Floats, found: Floats) -> Floats:
+        beyond = np.isnan(found[:, 0])
+        if self.outside == "refuse" or not beyond.any():
+            return found
+        from scipy.spatial import KDTree
+
+        _, nearest = KDTree(np.array(self.points)).query(places[beyond])
+        found[beyond] = self._values[nearest]
+        return found
 
     def _on_line(self, places: Floats) -> Floats:
         at = np.array(self.points)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from contextlib import suppress
+from importlib import import_module
 from typing import Annotated, Any, Self
 
 from pydantic import (
@@ -155,6 +156,12 @@ class Experiment(Strict):
         experiment._validate(source.data, Registry(components), source)
         return experiment
 
+    def of_parts(self, parts: dict[str, Any]) -> Self:
+        """The experiment of other parts, with the same components at hand."""
+        experiment = type(self).__new__(type(self))
+        experiment._validate(parts, self._registry, Source())
+        return experiment
+
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         """The parts that a file may leave out, as it would write them."""
@@ -197,8 +204,11 @@ class Experiment(Strict):
 
     def at(self, moment: float) -> Experiment:
         """The experiment with its numbers as they are at the end of a step, or within it."""
-        parts = {field: getattr(self, field).at(moment) for field, _ in self.courses}
-        return self.model_copy(update=parts)
+        return self.model_copy(update={f: getattr(self, f).at(moment) for f, _ in self.courses})
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the scene before it runs, and what is known of it."""
+        return str(import_module("pbdkit.drawing.notebook").experiment_html(self))
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""
@@ -214,8 +224,7 @@ class Experiment(Strict):
         lengths may name a unit, where that holds plain values; else all of it in lattice units."""
         if self.units and self._source.data is not None:
             with suppress(TypeError, ValueError):
-                written: dict[str, Any] = json.loads(json.dumps(self._source.data))
-                return written
+                return dict(json.loads(json.dumps(self._source.data)))
         return self.model_dump(mode="json", by_alias=True)
 
     def located(self, error: ExperimentError) -> ExperimentError:
@@ -229,11 +238,8 @@ class Experiment(Strict):
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
         try:
             units = Scales.model_validate({"units": parts.get("units")}).units
-            self.__pydantic_validator__.validate_python(
-                parts,
-                self_instance=self,
-                context={"registry": registry, "folder": source.folder, "units": units},
-            )
+            context = {"registry": registry, "folder": source.folder, "units": units}
+            self.__pydantic_validator__.validate_python(parts, self_instance=self, context=context)
         except ValidationError as error:
             raise report(error, source) from None
         except PluginError as error:

@@ -48,7 +48,7 @@ def report(error: ValidationError, source: Source) -> ExperimentError:
 
 def _plainly(fault: Any) -> Any:
     """The fault without the names of forms, and with all that a word could also be."""
-    where = tuple(word for word in fault["loc"] if word not in FORMS)
+    where = tuple(word for word in fault["loc"] if word not in (*FORMS, "[key]"))
     said = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
     return fault | {"loc": where} | said
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from itertools import takewhile
 from pathlib import Path
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.kinds import EXPERIMENT, of_kind
 from pbdkit.experiment.source import Source, read_file, read_text
 from pbdkit.interfaces.component import did_you_mean
 
 FOLDER = Path(__file__).parent.parent / "experiments"
 SUFFIX = ".yaml"
+LONGEST = 100
+"""So many characters a title has, or it ends at its colon."""
 
 
 def shipped_names() -> list[str]:
@@ -23,6 +28,16 @@ def shipped_text(name: str) -> str:
     return (FOLDER / f"{name}{SUFFIX}").read_text("utf-8")
 
 
+def shipped_title(name: str) -> str:
+    """The first sentence of its file; of a long one what comes before the colon."""
+    lines = takewhile(lambda line: line.startswith("#"), shipped_text(name).splitlines())
+    told = " ".join(line.removeprefix("#").strip() for line in lines)
+    sentence = re.split(r"\.(?=\s|$)", told, maxsplit=1)[0]
+    if len(sentence) > LONGEST:
+        sentence = re.split(r"[:;]\s", sentence, maxsplit=1)[0]
+    return f"{sentence}."
+
+
 def read_experiment(name: str) -> Source:
     """The source of the experiment in a file, or of the shipped experiment of that name."""
     path = Path(name)
@@ -31,7 +46,7 @@ def read_experiment(name: str) -> Source:
     except OSError as error:
         raise ExperimentError(f"{name[:80]}...: {error.strerror}") from None
     if is_file:
-        return read_file(path)
+        return of_kind(EXPERIMENT, read_file(path))
     names = shipped_names()
     if name in names:
         source = read_text(shipped_text(name), name)

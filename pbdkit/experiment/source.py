@@ -7,6 +7,7 @@ keys and tags are what makes YAML dangerous, and an experiment needs none of the
 from __future__ import annotations
 
 import io
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,11 +68,18 @@ def read_file(path: Path) -> Source:
             f"{path}: is a result, no experiment; `pbdkit plot {path}` draws it, and "
             "pbdkit.rerun(pbdkit.open(...)) runs the same again"
         )
+    if raw.startswith(b"SQLite format 3"):
+        raise ExperimentError(
+            f"{path}: is what was kept of an unfinished run or of a sweep, no experiment; `pbdkit "
+            "resume OUT.nc` goes on with a run, `pbdkit sweep` with a sweep"
+        )
     if len(raw) > MAX_BYTES:
         raise ExperimentError(f"{path}: is larger than 1 MiB, which no experiment needs")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if 0 in raw and not raw.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+            raise ExperimentError(f"{path}: is no text, and no experiment") from None
         raise ExperimentError(
             f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8"
         ) from None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -36,13 +37,17 @@ class Identity:
     turns: bool
     symmetric: bool
     rests_at_edges: bool
-    stencil: Primitive
-    spectrum: Spectrum
+    stencil: Primitive = field(repr=False)
+    spectrum: Spectrum = field(repr=False)
     relaxation: float
     memory: float
     kind: str
-    long: LongWaves | None
+    long: LongWaves | None = field(repr=False)
     notes: tuple[str, ...] = ()
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: what the rule is, with its constants."""
+        return str(import_module("pbdkit.drawing.notebook").identity_html(self))
 
     @property
     def symmetry(self) -> str | None:

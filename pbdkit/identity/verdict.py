@@ -24,6 +24,8 @@ SYMMETRIES = {
     "general": "{} with no axis of symmetry",
 }
 Row = tuple[str, str]
+WIDEST = 19
+"""Characters of a title."""
 
 
 def verdict(found: Identity) -> str:
@@ -33,15 +35,27 @@ def verdict(found: Identity) -> str:
     return SYMMETRIES[found.symmetry or "general"].format(found.kind)
 
 
-def table(found: Identity) -> Table:
-    """A row a property; h is the spacing."""
+def table(found: Identity, *, whole: bool = True) -> Table:
+    """A row a property; h is the spacing. Without `whole` the verdict and the constants alone."""
     from rich import box
     from rich.table import Column, Table
 
-    rows = Table(Column(no_wrap=True), "", box=box.SIMPLE, show_header=False, pad_edge=False)
-    for row in (*_what(found), *_waves(found), *_character(found)):
+    rows = Table(
+        Column(no_wrap=True, min_width=WIDEST),
+        "",
+        box=box.SIMPLE,
+        show_header=False,
+        pad_edge=False,
+    )
+    for row in rows_of(found, whole=whole):
         rows.add_row(*row)
     return rows
+
+
+def rows_of(found: Identity, *, whole: bool = False) -> list[Row]:
+    """Titles and what they say, the verdict first."""
+    first = [*_what(found), ("relaxation", _relaxation_text(found))]
+    return [*first, *_waves(found), *_character(found)] if whole else first
 
 
 def _what(found: Identity) -> Iterator[Row]:
@@ -102,7 +116,6 @@ def _character(found: Identity) -> Iterator[Row]:
     turning = f", imaginary parts up to {_number(spectrum.imaginary)}"
     ends = f"{_number(spectrum.smallest)} to {_number(spectrum.largest)}"
     yield "eigenvalues", ends + turning * (spectrum.imaginary > NEUTRAL)
-    yield "relaxation", _relaxation_text(found)
     yield "linear", yes[found.linear]
     yield "symmetric", "yes, k weighs for j as j for k" if found.symmetric else "no"
     yield "turns with the body", yes[found.turns]

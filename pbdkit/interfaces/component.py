@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC
-from collections.abc import Iterable
-from typing import Annotated, Any
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -39,6 +39,9 @@ class Strict(BaseModel):
         validate_by_name=False, validate_by_alias=True, serialize_by_alias=True,
     )  # fmt: skip
 
+    _elsewhere: ClassVar[Mapping[str, str]] = {}
+    """Keys that are looked for here, and what says the same."""
+
     @classmethod
     def known_keys(cls) -> list[str]:
         """The keys that an experiment may write here."""
@@ -52,7 +55,10 @@ class Strict(BaseModel):
             known = [k for k in cls.known_keys() if k != "type"]
             whose = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
             taken = f"known: {', '.join(known)}" if known else f"'{whose}' takes nothing"
-            message = f"unknown key{did_you_mean(str(unknown[0]), known)} ({taken})"
+            hint = did_you_mean(str(unknown[0]), known)
+            if (told := cls._elsewhere.get(str(unknown[0]))) is not None:
+                hint = f"; {told}"
+            message = f"unknown key{hint} ({taken})"
             key = printable(str(unknown[0]))
             raise PydanticCustomError("key", "{text}", {"text": message, "key": key})
         return data

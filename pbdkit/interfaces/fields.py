@@ -195,15 +195,15 @@ def _fault(name: str, text: str) -> PydanticCustomError:
     return PydanticCustomError("fault", "{text}", {"text": text, "key": name})
 
 
-def unknown_regions(part: TakesFields, regions: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The parameters whose fields name regions that there are not, each with a message."""
+def unknown_regions(
+    part: TakesFields, regions: Mapping[str, Any]
+) -> Iterator[tuple[str, str, str]]:
+    """The parameters whose fields name regions that there are not, these, and a message each."""
     for name, field in part.varying.items():
         for region, _ in field.values if isinstance(field, ByRegion) else ():
             if region not in regions:
                 known = (
                     f"known: {', '.join(regions)}" if regions else "there is none: add `regions`"
                 )
-                yield (
-                    name,
-                    f"there is no region '{region}'{did_you_mean(region, regions)} ({known})",
-                )
+                hint = did_you_mean(region, regions)
+                yield name, region, f"there is no region '{region}'{hint} ({known})"

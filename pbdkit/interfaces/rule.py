@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
@@ -55,6 +56,12 @@ class Setting:
     cells: Tiling = field(default_factory=Tiling)
 
 
+SCALES_FORCES = (
+    "a rule says where particles go, which does not depend on it; it scales forces and stresses, "
+    "and stands under `units`, or in each diagnostic that gives them"
+)
+
+
 class FollowerRule(TakesFields):
     """How a follower moves, given its neighbours in the intermediate configuration m.
 
@@ -76,6 +83,10 @@ class FollowerRule(TakesFields):
     `TurnsParticles`, `AppliesTwice`.
     """
 
+    _elsewhere: ClassVar[Mapping[str, str]] = {
+        "youngs_modulus": SCALES_FORCES,
+        "thickness": SCALES_FORCES,
+    }
     linear: ClassVar[bool] = False
     """Whether moves superpose: with the same neighbours the move is a constant and a part linear in
     the displacements. What `check` predicts then holds for the whole run, not near its start

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,14 @@ class Analysis:
     start: exact for linear rules. Numbers are None where they do not exist or cost too much."""
 
     scene: Scene
+
+    def __repr__(self) -> str:
+        """Its experiment alone: the scene has more than anybody reads, the verdict takes time."""
+        return f"<pbdkit.Analysis of {self.scene.experiment.name}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict, and the eigenvalues in a few numbers."""
+        return str(import_module("pbdkit.drawing.notebook").analysis_html(self))
 
     @property
     def exact(self) -> bool:
@@ -164,12 +173,8 @@ class Analysis:
         if not (self.scene.experiment.solver.makes_steps and self.stable):
             return None
         if self.estimated:
-            return lag_of(
-                self.scene,
-                self.spectra.estimate.at_rest,
-                self.spectra.estimate.system,
-                self._slowness,
-            )
+            found = self.spectra.estimate
+            return lag_of(self.scene, found.at_rest, found.system, self._slowness)
         state = initial_state(self.scene)
 
         def system_at(step: int) -> System:
@@ -211,11 +216,8 @@ class Analysis:
         """What stands in the way of settling, with the remedy."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored or self.scene.barriers else self.parts_without_leader
-        found = [
-            f"leaders: none reaches a part of {len(part)} particles (with number {part[0]}): "
-            "nothing holds it"
-            for part in parts
-        ]
+        said = "leaders: none reaches a part of {} particles (with number {}): nothing holds it"
+        found = [said.format(len(part), part[0]) for part in parts]
         if len(parts) > 3:
             found = [f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"]
         if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
@@ -244,7 +246,5 @@ class Analysis:
         relaxation = self.scene.experiment.stepping.relaxation
         if not (self.estimated and bare and bound and NEAR * bound < relaxation < bound):
             return []
-        return [
-            f"solver.relaxation: {relaxation:g} is near the bound of plane waves, {bound:.4g}, and "
-            "edges without a frame may have one up to 10 % lower"
-        ]
+        near = f"solver.relaxation: {relaxation:g} is near the bound of plane waves, {bound:.4g}"
+        return [f"{near}, and edges without a frame may have one up to 10 % lower"]

@@ -21,11 +21,13 @@ from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, Sizes, sizes_of
 from pbdkit.scene.solver_sizes import LARGEST_ANEW
+from pbdkit.stepping.choice import choose, seconds_of
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Counts, with followers at step 1; memory and output in MiB; the solver's relaxation and
+    """Counts, with followers at step 1; memory and output in MiB; about how many seconds the steps
+    take, None for an equilibrium; the solver's relaxation and
     memory; what the analysis found, None where it cannot tell or it would take too long; with
     memory, the period in steps of the slowest mode that swings and by what it shrinks a step, None
     where nothing swings; by how much the body trails its equilibrium in the leaders' fastest steps,
@@ -39,6 +41,7 @@ class Forecast:
     bonds: int
     memory_mib: float
     output_mib: float
+    seconds: float | None
     relaxation: float
     memory: float
     spectral_radius: float | None
@@ -87,6 +90,7 @@ def forecast(scene: Scene) -> Forecast:
         bonds=count_bonds(scene.raster, scene.neighbourhood),
         memory_mib=round(sizes.memory / MIB, 3),
         output_mib=round(sizes.output / MIB, 3),
+        seconds=_seconds(scene),
         relaxation=solver.relaxation,
         memory=solver.memory,
         period=swing.period if swing else None,
@@ -110,6 +114,12 @@ def _size_mm(scene: Scene) -> tuple[float, ...] | None:
         return None
     body = scene.raster.reference(scene.raster.body_rows)
     return tuple((np.ptp(body, axis=0) * units.scale(LENGTH)).tolist())
+
+
+def _seconds(scene: Scene) -> float | None:
+    if not scene.experiment.solver.makes_steps:
+        return None
+    return seconds_of(scene, choose(scene))
 
 
 def _sizes(analysis: Analysis) -> Sizes:

@@ -15,12 +15,13 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
-from pbdkit.results.accessor import reading
 from pbdkit.results.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink
+from pbdkit.results.other_files import refuse_other_file, refuse_store
 from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Recorder, columns_of
+from pbdkit.results.result_file import reading
 from pbdkit.runs.course import Report, Run, record
 from pbdkit.runs.standing import take_up
 from pbdkit.scene.scene import build_scene
@@ -55,8 +56,10 @@ def resumption(
     Raises ExperimentError where there is nothing to go on with, and, unless told to go on `anyway`,
     where the experiment, pbdkit or a plugin changed since; StorageError for what is damaged.
     """
+    refuse_store(output)
     if is_unfinished(output):
         return _unfinished(output, watch, steps, anyway)
+    refuse_other_file(output)
     if not output.exists():
         raise ExperimentError(f"{output}: there is no unfinished run of it, and no result")
     if steps is None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 
 from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.motions import Rotation
 from pbdkit.experiment.record import Record
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
@@ -14,10 +17,15 @@ from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.neighbourhood import Neighbourhood, flatness
 from pbdkit.scene.places import Mask
 from pbdkit.scene.raster import Raster
+from pbdkit.scene.selecting import Selecting
 from pbdkit.scene.sites import has_narrow_slot
 
 FLAT = 0.05
 """Cells flatter than this are warned of."""
+FAR, SHOWN = 2.0, 5
+"""So many spacings from the body a point is warned of, and so many of them are named."""
+ANGLE, ROUNDING, DECIMALS = math.pi / 12, 1e-3, 2
+"""Of this multiples are written as radians, to that many digits; degrees are written with fewer."""
 
 
 def doubts_of(
@@ -76,3 +84,46 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
             "record: of an equilibrium the start and the end are recorded, whatever stands here; "
             "for states between run it to fewer steps, as by a sweep over `steps`"
         )
+
+
+def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
+    """A line each, for the first few, on points of `nearest` that no particle is near."""
+    selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
+    selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
+    points = ((name, at) for name, select in selections.items() for at in select.nearest or ())
+    body = Selecting(raster)
+    limit = FAR * max(math.hypot(*vector) for vector in raster.lattice.cell().vectors)
+    far = (one for one in points if body.distance(one[1]).min() > limit)
+    for name, (x, y) in islice(far, SHOWN):
+        rows = body.nearest([(x, y)])
+        at_x, at_y = raster.reference(rows)[0]
+        yield (
+            f"{name}.select.nearest: ({x:g}, {y:g}) lies {math.hypot(x - at_x, y - at_y):.4g} away "
+            f"from the body; the particle nearest to it is {rows[0] + 1}, at ({at_x:.6g}, "
+            f"{at_y:.6g})"
+        )
+
+
+def angles_in_radians(experiment: Experiment) -> Iterator[str]:
+    """A line each on angles, or turns in all, that are round in radians; degrees are asked for."""
+    found = {}
+    if (angle := getattr(experiment.lattice, "angle", None)) is not None:
+        found["lattice.angle"] = angle, angle
+    for part, driven in (("leaders", experiment.leaders), ("obstacles", experiment.obstacles)):
+        for n, one in enumerate(driven):
+            if isinstance(one.motion, Rotation):
+                whole = one.motion.angle * one.motion.steps
+                found[f"{part}.{n}.motion.angle"] = one.motion.angle, whole
+    for name, (angle, whole) in found.items():
+        if round_in_radians(angle) or round_in_radians(whole):
+            yield (
+                f"{name}: {angle:g} degrees look like radians, which would be "
+                f"{math.degrees(angle):.6g} degrees; angles are in degrees"
+            )
+
+
+def round_in_radians(angle: float) -> bool:
+    """Whether it is a multiple of 15°, up to a full turn, written in radians: 0.7854, not 2.88."""
+    turns = round(abs(angle) / ANGLE)
+    near = abs(abs(angle) - turns * ANGLE) <= ROUNDING
+    return 0 < turns <= 24 and near and round(angle, DECIMALS) != round(angle, 9)

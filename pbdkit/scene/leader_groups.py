@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -19,9 +18,6 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import LEADER, Raster
 from pbdkit.scene.selecting import Selecting, spacing
-
-SHOWN = 5
-"""So many warnings of one kind are given."""
 
 
 @dataclass(frozen=True)
@@ -78,21 +74,6 @@ def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
             alike = not {*found[k].axes}.isdisjoint(found[n].axes)
             if alike and not sets[k].isdisjoint(sets[n]):
                 yield k, n
-
-
-def doubts(raster: Raster, groups: Iterable[LeaderGroup]) -> list[str]:
-    """Warnings about groups that lead others than was meant."""
-    body, found = Selecting(raster), []
-    width = max(math.hypot(*v) for v in raster.lattice.cell().vectors)
-    points = ((n, point) for n, group in enumerate(groups) for point in group.select.nearest or ())
-    for n, (x, y) in points:
-        if body.distance((x, y)).min() > width:
-            at = raster.reference(body.nearest([(x, y)]))[0]
-            found.append(
-                f"leaders.{n}.select.nearest: ({x:g}, {y:g}) lies far from the body; "
-                f"the particle that leads is at ({at[0]:.6g}, {at[1]:.6g})"
-            )
-    return found[:SHOWN]
 
 
 def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:

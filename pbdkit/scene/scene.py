@@ -17,11 +17,11 @@ from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
-from pbdkit.scene.doubts import doubts_of, without_effect
+from pbdkit.scene.doubts import angles_in_radians, doubts_of, far_from_the_body, without_effect
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
-from pbdkit.scene.leader_groups import Leading, build_leading, doubts
+from pbdkit.scene.leader_groups import Leading, build_leading
 from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
 from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
@@ -67,7 +67,7 @@ class Scene:
         now = tuple(course.at(moment) for course in courses)
         if now not in self._known:
             self._known.clear()
-            self._known[now] = _renumbered(self, self.experiment.at(moment))
+            self._known[now] = renumbered(self, self.experiment.at(moment))
         return self._known[now]
 
     @cached_property
@@ -143,7 +143,8 @@ def _build(experiment: Experiment) -> Scene:
     warnings += doubts_of(experiment, neighbourhood, filling.body, layers)
     raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
     warnings += check_diagnostics(experiment, raster, neighbourhood)
-    warnings += [*without_effect(experiment, raster), *doubts(raster, experiment.leaders)]
+    warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
+    warnings += angles_in_radians(experiment)
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
@@ -167,7 +168,7 @@ def _build(experiment: Experiment) -> Scene:
     return with_inner(Scene(experiment, *parts, tuple(warnings), barriers))
 
 
-def _renumbered(scene: Scene, experiment: Experiment) -> Scene:
+def renumbered(scene: Scene, experiment: Experiment) -> Scene:
     """The scene with the numbers of an experiment that is like its own but for them."""
     raster, around = scene.raster, scene.neighbourhood
     setting = setting_of(raster, around)
@@ -225,5 +226,5 @@ def with_inner(scene: Scene) -> Scene:
             )
     experiment = experiment.model_copy(update={"rule": inner})
     constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
-    below = replace(scene, experiment=experiment, constants=constants, loads=None)
+    below = replace(scene, experiment=experiment, constants=constants, inner=None, loads=None)
     return replace(scene, inner=with_inner(below))

@@ -19,6 +19,8 @@ PATIENCE_S = 3.0
 numba and loading a kernel .5 s, making a new one 1 to 5 s)."""
 CALL_S, VALUE_S = 25e-6, 2.5e-9
 """What the numpy engine takes a step and slot, and a step, slot and particle (measured)."""
+KERNEL_S = 2e-9
+"""What kernels take a step and particle (measured: 1 to 2, with 4 or 8 neighbours in motion)."""
 TWO_THREADS_PAY = 100_000
 """Particles from which a second thread pays, with a margin (measured: from 40 000)."""
 
@@ -54,6 +56,13 @@ def choose(scene: Scene) -> Choice:
         threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason)
+
+
+def seconds_of(scene: Scene, choice: Choice) -> float:
+    """About what the steps take at most, with neither compiling nor recording."""
+    if choice.engine == "numpy":
+        return _numpy_seconds(scene)
+    return KERNEL_S * scene.raster.count * _most_steps(scene) / choice.threads
 
 
 def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
@@ -98,15 +107,20 @@ def what_kernels_lack(scene: Scene) -> str:
 
 
 def _numpy_seconds(scene: Scene) -> float:
-    """What the numpy engine takes at most. A run that is to settle makes no more steps than a plain
-    barycentre on a body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
-    steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
-    if settle:
-        settled = (4 * max(scene.raster.shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
-        steps = min(steps, last_event(scene) + settled)
+    """What the numpy engine takes at most."""
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
     a_step = slots * (CALL_S + VALUE_S * scene.raster.count / len(scene.neighbourhood.slots))
-    return a_step * steps
+    return a_step * _most_steps(scene)
+
+
+def _most_steps(scene: Scene) -> float:
+    """Those asked for. A run that is to settle makes no more steps than a plain barycentre on a
+    body of n cells that is held at one end, (2n)² (2/π)² ln(1 / tolerance)."""
+    steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
+    if settle is None:
+        return steps
+    settled = (4 * max(scene.raster.shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
+    return min(steps, last_event(scene) + settled)
 
 
 def _about(seconds: float) -> str:

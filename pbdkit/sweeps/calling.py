@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import ExperimentError, PbdkitWarning
+from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
-from pbdkit.registry.registry import GIVEN
-from pbdkit.results.accessor import open as open_result
 from pbdkit.results.progress import progress_bar
+from pbdkit.results.result_file import open as open_result
 from pbdkit.stepping.choice import processors
 from pbdkit.sweeps.course import carry_out
 from pbdkit.sweeps.crew import Alone, Cluster, Crew
@@ -36,7 +36,7 @@ def called(
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
     data = experiment.as_written()
-    given = _given(experiment)
+    given = given_classes(experiment)
     if given and folder is not None:
         raise ExperimentError(
             "folder: members are known by the versions of what they use, and classes from Python "
@@ -78,9 +78,3 @@ def crew_of(workers: int | None, client: Any, components: tuple[type[Component],
         return Cluster(client)
     number = workers or (1 if components else processors())
     return Alone(components) if number == 1 else Processes(number)
-
-
-def _given(experiment: Experiment) -> tuple[type[Component], ...]:
-    """The classes that were handed over in Python and are used."""
-    types = experiment.distributions().get(GIVEN, "").split(", ")
-    return tuple({type(part): None for part in experiment.components() if part.type in types})

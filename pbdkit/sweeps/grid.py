@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Set
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, NamedTuple
@@ -95,6 +96,15 @@ def _coordinates(name: str, values: tuple[Any, ...]) -> dict[str, Array]:
     if along.dtype.kind != "U":
         return {name: along}
     return {name: np.arange(len(values)), name + TEXT: along}
+
+
+def type_alone(text: str) -> str:
+    """Of the text of a part that says nothing but its type, that; else the text as it is."""
+    with suppress(ValueError, RecursionError):
+        part = json.loads(text)
+        if isinstance(part, dict) and part.keys() == {"type"}:
+            return str(part["type"])
+    return text
 
 
 def values_along(values: tuple[Any, ...]) -> Array:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from itertools import chain, combinations
+from itertools import combinations
 from math import prod
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     Field,
@@ -19,13 +18,14 @@ from pydantic import (
     model_validator,
 )
 
-from pbdkit.errors import ExperimentError
+from pbdkit.experiment.base import Base, base_source
+from pbdkit.experiment.kinds import SWEEP, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import brief, fault, report
 from pbdkit.experiment.schema import DIALECT
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.component import Strict, did_you_mean
+from pbdkit.interfaces.component import Strict
 
 MOST_MEMBERS = 100_000
 """Each takes about a millisecond to be validated, and some kilobytes while the sweep goes on."""
@@ -84,15 +84,6 @@ def _listed(value: Any) -> tuple[Any, ...]:
     return tuple(value)
 
 
-def _an_experiment(value: Any) -> Any:
-    if not isinstance(value, (str, dict)):
-        raise fault(
-            "expected a shipped name, a file beside this one, or the experiment itself, got "
-            f"{brief(value)}"
-        )
-    return value
-
-
 Values = Annotated[
     tuple[Any, ...], BeforeValidator(_listed, json_schema_input_type=Range | list[Any])
 ]
@@ -112,9 +103,7 @@ class Sweep(Strict):
     through at once, and of the replicates, which differ in their seed."""
 
     version: Version = 1
-    experiment: Annotated[
-        Any, AfterValidator(_an_experiment), Field(json_schema_extra={"type": ["string", "object"]})
-    ]
+    experiment: Base
     vary: dict[str, Values] = Field(default_factory=dict)
     together: dict[str, Values] = Field(default_factory=dict)
     replicates: Annotated[int, Field(ge=1, le=MOST_MEMBERS)] = 1
@@ -159,42 +148,11 @@ def read_sweep(path: Path) -> tuple[Sweep, Source, Source]:
 
     Raises ExperimentError.
     """
-    source = read_file(path)
+    name = path.as_posix()
+    shipped = not path.is_file() and name in shipped_names()
+    source = of_kind(SWEEP, read_text(shipped_text(name), name) if shipped else read_file(path))
     sweep = checked(source.data, source)
-    if isinstance(sweep.experiment, dict):
-        inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}
-        return sweep, Source(str(path), sweep.experiment, inner, path.parent), source
-    try:
-        return sweep, _beside(path, sweep.experiment), source
-    except _NoSuchExperimentError as error:
-        text = source.message(("experiment",), str(error))
-        raise ExperimentError(text, ("experiment",)) from None
-
-
-class _NoSuchExperimentError(ExperimentError):
-    """The field `experiment` leads nowhere."""
-
-
-def _beside(path: Path, name: str) -> Source:
-    """The source of a file in the folder of the sweep, or below it, or of a shipped experiment."""
-    given, folder = PurePath(name), path.absolute().parent
-    accepted = "give a shipped name, or a file in the folder of the sweep or below it"
-    if given.is_absolute() or ".." in given.parts:
-        raise _NoSuchExperimentError(f"{brief(name)} leads elsewhere; {accepted}")
-    try:
-        file = (folder / given).resolve()
-        found = file.is_file()
-    except (OSError, ValueError):
-        raise _NoSuchExperimentError(f"{brief(name)} is no name of a file") from None
-    if found and not file.is_relative_to(folder.resolve()):
-        raise _NoSuchExperimentError(f"{brief(name)} is a link that leads elsewhere; {accepted}")
-    if found:
-        return read_file(path.parent / given)
-    if name in (names := shipped_names()):
-        return read_text(shipped_text(name), name)
-    files = chain(path.parent.glob("*.yaml"), path.parent.glob("*.yml"))
-    hint = did_you_mean(name, [*(file.name for file in files), *names])
-    raise _NoSuchExperimentError(f"{brief(name)} is neither{hint} ({accepted})")
+    return sweep, base_source(path, sweep.experiment, source), source
 
 
 def sweep_schema() -> dict[str, Any]:
