@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import StorageError
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.source import Source
+from pbdkit.interfaces import Component
+from pbdkit.registry.registry import GIVEN
 
 if TYPE_CHECKING:
     import xarray
@@ -23,3 +28,21 @@ def carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
     return found
+
+
+def experiment_of(
+    dataset: xarray.Dataset, components: Iterable[type[Component]] = ()
+) -> Experiment:
+    """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
+    it wants components that are not there."""
+    parts = carried(dataset, "experiment")
+    if not parts:
+        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
+    source = Source("dataset", parts)
+    try:
+        return Experiment.build(source, components)
+    except ExperimentError as error:
+        given = carried(dataset, "plugins").get(GIVEN)
+        if given is None or components:
+            raise
+        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None

@@ -72,6 +72,11 @@ class Column:
         return {name: text for name, text in said.items() if text} | self.more
 
 
+def broken_by(broken_step: Any, step: Any) -> Any:
+    """Whether bonds that broke in these steps, -1 where they did not, are broken after a step."""
+    return (broken_step >= 0) & (broken_step <= step)
+
+
 def coordinate(
     name: str,
     long_name: str,
@@ -196,6 +201,18 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
         "data_vars": group(coordinate=False),
     }
     return {"$schema": DIALECT, "title": "pbdkit dataset"} | _object(parts, sorted(parts))
+
+
+def makers_of(names: set[str]) -> list[str]:
+    """The built-in diagnostics that make a variable of one of these names, as an experiment names
+    them."""
+    found = []
+    for each, types in Registry().spellings(Diagnostic, installed=False).items():
+        if names & {column.name for column in _columns_of(each)}:
+            fields = each.model_fields.items()  # the modulus may come from `units`
+            needed = [n for n, part in fields if part.is_required() or n == "youngs_modulus"]
+            found.append(f"{{{', '.join([f'type: {types[0]}', *(f'{n}: ...' for n in needed)])}}}")
+    return found
 
 
 def _columns_of(diagnostic: type[Component]) -> list[Column]:

@@ -56,17 +56,17 @@ class OverlappingSink(KeepingSink):
 
     def suspend(self, standing: Standing) -> None:
         """When all is written."""
-        self._wait()
+        self._end()
         self._inner.suspend(standing)
 
     def note_end(self, standing: Standing) -> None:
-        """When all is written."""
+        """When all is written; what is known at the end only comes after it."""
         self._wait()
         self._inner.note_end(standing)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """When all is written."""
-        self._wait()
+        self._end()
         self._inner.finish(attributes)
 
     def abandon(self) -> None:
@@ -88,4 +88,7 @@ class OverlappingSink(KeepingSink):
     def _wait(self) -> None:
         while self._waiting:
             self._waiting.popleft()[1].result()
+
+    def _end(self) -> None:
+        self._wait()
         self._thread.shutdown()

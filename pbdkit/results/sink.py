@@ -82,7 +82,7 @@ class MemorySink(Sink):
         """The dataset as in the file."""
         import xarray
 
-        import_module("pbdkit.results.accessor")  # gives every dataset its `pbd`
+        import_module("pbdkit.accessor")  # gives every dataset its `pbd`
         variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
         coordinates = [c.name for c in self._columns if c.coordinate]
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)

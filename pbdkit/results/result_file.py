@@ -1,30 +1,25 @@
-"""Opens result files, and gives every xarray.Dataset the accessor `pbd`."""
+"""Opens result files."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import xarray
 from xarray.backends import StoreBackendEntrypoint
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
-from pbdkit.results import picture
-from pbdkit.results.layout import INDICES, SCHEMA_VERSION, base_columns
+from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.older_layout import in_this_layout
-from pbdkit.results.physical import in_physical_units
+from pbdkit.results.other_files import refuse_other_file
 from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SWEEP = "sweep"
 """The attribute that only datasets of sweeps have."""
@@ -35,20 +30,18 @@ def open(path: str | Path) -> xarray.Dataset:
     """The dataset in a result file; its values are read, and checked, when they are used. Of a run
     that is not finished, what was kept of it last, with the status "interrupted".
 
-    Raises ExperimentError for an experiment, and StorageError where there is no such file, where it
-    is not as it was written, where it cannot be read as netCDF, where pbdkit did not make it, where
-    variables are missing, or where a newer pbdkit made it than this one can read. A change that is
-    met later, as values are read, raises StorageError too. Warns, with pbdkit.PbdkitWarning, of a
-    file without a seal, which is first read once in another process.
+    Raises ExperimentError for an experiment and a sweep, and StorageError where there is no such
+    file, where it is not as it was written, where it cannot be read as netCDF, where pbdkit did not
+    make it, where variables are missing, or where a newer pbdkit made it than this one can read. A
+    change that is met later, as values are read, raises StorageError too. Warns, with
+    pbdkit.PbdkitWarning, of a file without a seal, which is first read once in another process.
     """
+    import_module("pbdkit.accessor")  # gives every dataset its `pbd`
     file = Path(path)
     left = _output_of(file)
     if not left:
+        refuse_other_file(file)
         refuse_no_file(file)
-    if file.suffix in (".yaml", ".yml", ".json"):
-        raise ExperimentError(
-            f"{file}: is an experiment; `pbdkit run {file}` makes a result of it, and says where"
-        )
     try:
         dataset = in_this_layout(_unfinished(left) if left else _opened(file))
     except PbdkitError:
@@ -109,14 +102,15 @@ def _output_of(file: Path) -> Path | None:
 
 
 @contextmanager
-def reading(path: str | Path) -> Iterator[xarray.Dataset]:
-    """The dataset of a run in a result file, to be read from in the block.
+def reading(path: str | Path, *, sweeps: bool = False) -> Iterator[xarray.Dataset]:
+    """The dataset of a run in a result file, or with `sweeps` of either, to be read from in the
+    block.
 
-    Raises ExperimentError for that of a sweep, what `open` does, and StorageError for whatever
-    reading and using its values raises: files are sound when written.
+    Raises ExperimentError for that of a sweep otherwise, what `open` does, and StorageError for
+    whatever reading and using its values raises: files are sound when written.
     """
     with open(path) as dataset:
-        if SWEEP in dataset.attrs:
+        if SWEEP in dataset.attrs and not sweeps:
             raise ExperimentError(
                 f"{path}: holds all members of a sweep, and this looks at one run; in Python, "
                 "pbdkit.open(...) and isel pick what is to be drawn"
@@ -157,70 +151,3 @@ def _fault(dataset: xarray.Dataset) -> str | None:
             what = "has no" if dims is None else f"has other dimensions, {dims}, of"
             return f"{what} variable '{column.name}': it is damaged, or was changed"
     return None
-
-
-@xarray.register_dataset_accessor("pbd")  # type: ignore[no-untyped-call]  # xarray's is untyped
-class PbdAccessor:
-    """What pbdkit adds to a dataset: ``dataset.pbd.plot(...)``."""
-
-    def __init__(self, dataset: xarray.Dataset) -> None:
-        self._dataset = in_this_layout(dataset)
-
-    def plot(
-        self,
-        time: int | Iterable[int] | None = None,
-        color: str | None = None,
-        *,
-        contours: bool = False,
-        numbers: bool = False,
-        ax: Axes | None = None,
-    ) -> Axes | Figure:
-        """A picture: the Axes of one step (default the last), or a Figure of several.
-
-        `contours`, `numbers` and, for one step, `ax` are those of `picture.draw`, and what is
-        raised is too.
-        """
-        look: dict[str, Any] = {"color": color, "contours": contours, "numbers": numbers}
-        if isinstance(time, Iterable):
-            whole = picture.draw(self._dataset, time, **look)[0].get_figure(root=True)
-            assert whole is not None
-            return whole
-        return picture.draw(self._dataset, [time], ax=ax, **look)[0]
-
-    def at(self, **index: int) -> xarray.Dataset:
-        """What stands at site indices: ``at(i=3, j=4)`` is one particle, as ``sel(particle=...)``
-        gives it, ``at(j=0)`` all of a line.
-
-        Every site has indices of its own, those of one repeat cell too. Raises ExperimentError
-        where no particle is, and for what is no index.
-        """
-        dataset, found = self._dataset, self._dataset.variables
-        known = [n for n in INDICES if n in found and found[n].dims == ("particle",)]
-        here = np.ones(dataset.sizes.get("particle", 0), np.bool_)
-        for name, value in index.items():
-            if name not in known:
-                raise ExperimentError(f"particles here are found by {known}, not by '{name}'")
-            here &= found[name].values == value
-        rows = np.flatnonzero(here)
-        if not len(rows):
-            place = ", ".join(f"{name}={value}" for name, value in index.items())
-            raise ExperimentError(f"there is no particle at {place}")
-        return dataset.isel(particle=rows[0] if {*index} == {*known} else rows)
-
-    def components(self) -> xarray.Dataset:
-        """The dataset with `position_x`, `position_y` in place of `position`, and so on of
-        everything along `axis`: for plots of one against the other, and for tables."""
-        parts: dict[str, xarray.Variable] = {}
-        labels = []
-        for name, vector in self._dataset.variables.items():
-            for n in range(vector.sizes.get("axis", 0)) if name != "axis" else ():
-                axis = self._dataset["axis"].values[n]
-                part = parts[f"{name}_{axis}"] = vector.isel(axis=n)
-                part.attrs["long_name"] = f"{part.attrs.get('long_name', name)}, {axis} component"
-                labels += [f"{name}_{axis}"] if name in self._dataset.coords else []
-        return self._dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
-
-    def physical(self) -> xarray.Dataset:
-        """The dataset in mm, mm² and, of stresses, forces and energies, MPa, N and mJ, as far as
-        variables say their scale: those of experiments with `units`."""
-        return in_physical_units(self._dataset)

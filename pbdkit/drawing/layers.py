@@ -1,0 +1,211 @@
+"""What lies over one another in a panel; each layer shows a step, and then another."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.collections import LineCollection, PathCollection
+from numpy.typing import NDArray
+
+from pbdkit.drawing.figures import figure_of
+from pbdkit.drawing.palette import OF_KINDS, Palette
+from pbdkit.drawing.pixels import Grid
+from pbdkit.drawing.recording import Body, Snapshot
+from pbdkit.drawing.scale import Scale
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+Array = NDArray[Any]
+INK, LINE, TORN, REST = "#404040", "#B0B0B0", "#CC3311", "#888888"
+
+
+class Layer(ABC):
+    """Something drawn into axes. `artists` are those that change from step to step."""
+
+    artists: list[Artist]
+
+    @abstractmethod
+    def show(self, now: Snapshot) -> None:
+        """Shows that step in place of the one before."""
+
+
+class Field(Layer):
+    """A quantity of particles over whole cells, as pixels; particles in none are dots of a size in
+    points, and a pixel where that is next to nothing."""
+
+    def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale, size: float) -> None:
+        self._body, self._grid = body, grid
+        self._image = _image(ax, grid, scale)
+        self._alone = ax.scatter([], [], size**2, zorder=2, edgecolors=INK, linewidths=0.08 * size)
+        self._alone.set(cmap=scale.colours, norm=scale.norm)
+        self.artists = [self._image, self._alone]
+
+    def show(self, now: Snapshot) -> None:
+        """The mean of what lies in a pixel."""
+        assert now.values is not None
+        cells = self._body.whole_cells(self._body.cells, now.broken)
+        valued = np.isfinite(now.values)
+        if not valued[self._body.inside].all():
+            cells = cells[valued[cells].all(axis=1)]
+        alone = _alone(cells, self._body.inside & valued)
+        self._alone.set_offsets(now.position[alone])
+        self._alone.set_array(now.values[alone])
+        cells, values = _with(cells, alone), now.values.astype(np.float32)
+        self._image.set_data(self._grid.mean(self._grid.places(now.position)[cells], values[cells]))
+
+
+class BondField(Layer):
+    """A quantity of bonds too many for lines, as pixels."""
+
+    def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale) -> None:
+        self._body, self._grid, self._image = body, grid, _image(ax, grid, scale)
+        self.artists = [self._image]
+
+    def show(self, now: Snapshot) -> None:
+        """The mean of what lies in a pixel."""
+        assert now.values is not None
+        shown = np.isfinite(now.values)
+        corners = self._grid.places(now.position)[self._body.ends[shown][:, [0, 1, 1, 0]]]
+        values = np.repeat(now.values[shown, None], 4, axis=1)
+        self._image.set_data(self._grid.mean(corners, values))
+
+
+class Classes(Layer):
+    """What has a name, of particles too many for dots, as pixels."""
+
+    def __init__(self, ax: Axes, body: Body, grid: Grid, palette: Palette) -> None:
+        from matplotlib.colors import ListedColormap, Normalize
+
+        self._body, self._grid, self._palette = body, grid, palette
+        colours = ListedColormap([colour for _, colour in palette.colours.values()])
+        self._image = ax.imshow(
+            np.full((2, 2), np.nan), cmap=colours.with_extremes(bad=(0, 0, 0, 0)),
+            norm=Normalize(0, len(palette.colours) - 1), extent=grid.box, origin="lower",
+            aspect="equal", zorder=0, interpolation="nearest",
+        )  # fmt: skip
+        self.artists = [self._image]
+
+    def show(self, now: Snapshot) -> None:
+        """That of the nearest particle; of several in a pixel, the one on top."""
+        cells = self._body.whole_cells(self._body.cells_with_frame, now.broken)
+        ranks = self._palette.ranks(now)
+        there = np.isfinite(ranks)
+        cells = cells[there[cells].all(axis=1)]
+        cells = _with(cells, _alone(cells, there))
+        corners = self._grid.places(now.position)[cells]
+        self._image.set_data(self._grid.latest(corners, ranks[cells]))
+
+
+class Dots(Layer):
+    """A dot at each particle, in the colour of its value or its class."""
+
+    def __init__(self, ax: Axes, size: float, colours: Scale | Palette) -> None:
+        self._colours = colours
+        edge: dict[str, Any] = {"edgecolors": INK, "linewidths": 0.08 * size}
+        self._dots: PathCollection = ax.scatter([], [], size**2, zorder=3, **edge)
+        if isinstance(colours, Scale):
+            self._dots.set(cmap=colours.colours, norm=colours.norm)
+        self.artists = [self._dots]
+
+    def show(self, now: Snapshot) -> None:
+        """Leaders over followers over the frame."""
+        palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
+        ranks = palette.ranks(now)
+        order = np.argsort(ranks, kind="stable")
+        order = order[np.isfinite(ranks[order])]
+        self._dots.set_offsets(now.position[order])
+        if isinstance(self._colours, Scale):
+            assert now.values is not None
+            self._dots.set_array(np.ma.masked_invalid(now.values[order]))
+        else:
+            colours = [colour for _, colour in palette.colours.values()]
+            self._dots.set_facecolor([colours[int(rank)] for rank in ranks[order]])
+
+
+class Bonds(Layer):
+    """Lines between neighbours: those that are whole, or, `broken`, those that are not."""
+
+    def __init__(self, ax: Axes, body: Body, width: float, *, broken: bool = False) -> None:
+        self._body, self._broken = body, broken
+        style: dict[str, Any] = {"colors": LINE, "zorder": 1}
+        if broken:
+            style = {"colors": TORN, "zorder": 2, "linestyles": (0, (2.5, 2.0)), "alpha": 0.7}
+        self._lines = LineCollection([], linewidths=width, **style)
+        ax.add_collection(self._lines, autolim=False)
+        self.artists = [self._lines]
+
+    def show(self, now: Snapshot) -> None:
+        """At the places where the particles are."""
+        ends = self._body.ends[now.broken == self._broken]
+        self._lines.set_segments(list(now.position[ends]))
+
+
+class BondValues(Layer):
+    """A quantity of bonds, as the colours of lines; those without a value are not drawn."""
+
+    def __init__(self, ax: Axes, body: Body, width: float, scale: Scale) -> None:
+        self._body = body
+        self._lines = LineCollection(
+            [], linewidths=width, cmap=scale.colours, norm=scale.norm, zorder=2, capstyle="round"
+        )
+        ax.add_collection(self._lines, autolim=False)
+        self.artists = [self._lines]
+
+    def show(self, now: Snapshot) -> None:
+        """At the places where the particles are."""
+        assert now.values is not None
+        shown = np.isfinite(now.values)
+        self._lines.set_segments(list(now.position[self._body.ends[shown]]))
+        self._lines.set_array(now.values[shown])
+
+
+def draw_outline(ax: Axes, sides: Array) -> None:
+    """Lines, (side, end, axis), that stay."""
+    lines = LineCollection(list(sides), colors=REST, linewidths=0.7, zorder=2.5)
+    ax.add_collection(lines, autolim=False)
+
+
+def draw_numbers(ax: Axes, numbers: Array, now: Snapshot, size: float) -> None:
+    """The numbers of particles, to the upper right of dots of that size, in points; as many as do
+    not overprint each other."""
+    places, font = ax.transData.transform(now.position), 6.0
+    point = figure_of(ax).dpi / 72
+    taken: set[tuple[int, int]] = set()
+    box = ax.bbox
+    for number, (x, y), place in zip(numbers, places, now.position, strict=True):
+        text = str(int(number))
+        left, low = x + 0.5 * size * point, y + 0.5 * size * point
+        right, high = left + (0.68 * len(text) * font + 1.5) * point, low + 1.25 * font * point
+        columns = range(int(left / point), int(right / point) + 1)
+        covered = {(c, r) for c in columns for r in range(int(low / point), int(high / point) + 1)}
+        if covered & taken or right > box.x1 or high > box.y1:
+            continue
+        taken |= covered
+        beside = (0.5 * size, 0.5 * size)
+        ax.annotate(text, place, beside, textcoords="offset points", fontsize=font, zorder=4)
+
+
+def _image(ax: Axes, grid: Grid, scale: Scale) -> AxesImage:
+    """Of the pixels of a grid; nothing where there is no value."""
+    return ax.imshow(
+        np.full((2, 2), np.nan), cmap=scale.colours.with_extremes(bad=(0, 0, 0, 0)),
+        norm=scale.norm, extent=grid.box, origin="lower", aspect="equal", zorder=0,
+        interpolation_stage="data",
+    )  # fmt: skip
+
+
+def _alone(cells: Array, chosen: Array) -> Array:
+    """The rows of the chosen particles that are in none of the cells."""
+    alone = chosen.copy()
+    alone[cells] = False
+    return np.flatnonzero(alone)
+
+
+def _with(cells: Array, alone: Array) -> Array:
+    """The cells, and one of no extent for each of those particles."""
+    return np.concatenate([cells, np.repeat(alone[:, None], 4, axis=1)])

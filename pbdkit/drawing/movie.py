@@ -1,0 +1,228 @@
+"""Movies of a dataset: every recorded step, with the same limits and colours from first to last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from itertools import chain
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.drawing.extent import Extent, extent_of
+from pbdkit.drawing.look import Look
+from pbdkit.drawing.recording import Recording, Snapshot
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.registry.blame import one_line
+from pbdkit.registry.extras import refuse_no_matplotlib, refuse_without
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.animation import FuncAnimation
+
+    from pbdkit.drawing.sheet import Sheet
+
+Show = Callable[[str, float], None]
+Frame = NDArray[np.uint8]
+"""(row, column, red green blue)."""
+FORMATS = (".mp4", ".gif")
+WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
+DPI, FASTEST_GIF, GIF_COLOURS = 120, 50, 128
+FINER = 0.6
+"""So many times the pixels of the movie, either way, are those of a field, which is then smooth."""
+NEARLY_WHITE = 240
+FRAMES = 60
+"""So many steps a page in a notebook holds at most."""
+
+
+def silent(what: str, share: float) -> None:
+    """Tells nobody how far it is."""
+
+
+def animate(
+    dataset: xarray.Dataset,
+    file: str | Path,
+    color: str | None = None,
+    *,
+    fps: float = 25.0,
+    every: int = 1,
+    show: Show = silent,
+    **look: Any,
+) -> None:
+    """Writes a movie of every recorded step (with `every`, of the first of each so many, and the
+    last), MP4 or GIF as the name ends, with `fps` of them a second.
+
+    `color` is that of `plot`, and `look` are the options of `Look`; the scale of colours is that of
+    the whole run. `show` is told how far it is. The file appears whole or not at all. Raises
+    ExperimentError for what `plot` does and where what writes movies is missing, and StorageError
+    where the file cannot be written.
+    """
+    path = Path(file)
+    refuse_no_movie(path)
+    if not 0.1 <= fps <= 240 or (path.suffix == ".gif" and fps > FASTEST_GIF):
+        fastest = FASTEST_GIF if path.suffix == ".gif" else 240
+        raise ExperimentError(f"fps: {fps:g} is not between 0.1 and {fastest}")
+    if every < 1:
+        raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
+    recording = Recording(dataset, color or "kind")
+    rows = [*range(0, len(recording.steps), every)]
+    rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
+    moving = Moving(recording, rows, _for_movies(look), show)
+    frames = moving.frames(rows, show)
+    with _appearing(path) as part:
+        if path.suffix == ".gif":
+            few = moving.frames(rows[:: max(1, len(rows) // 4)])
+            _write_gif(part, np.concatenate([*few]), frames, fps)
+        else:
+            _write_mp4(part, frames, fps)
+
+
+def animation(dataset: xarray.Dataset, color: str | None = None, **look: Any) -> FuncAnimation:
+    """The same as an animation of matplotlib, for notebooks: of longer runs 60 steps, evenly
+    chosen."""
+    refuse_no_matplotlib()
+    from matplotlib.animation import FuncAnimation
+
+    recording = Recording(dataset, color or "kind")
+    last = len(recording.steps) - 1
+    rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
+    moving = Moving(recording, rows, _for_movies({"dpi": 80} | look), silent, alone=False)
+    shown = [*recording.snapshots(rows)]
+    return FuncAnimation(
+        moving.sheet.figure, lambda n: moving.put(shown[n]), frames=len(shown), interval=80,
+        blit=False,
+    )  # fmt: skip
+
+
+def refuse_no_movie(path: Path) -> None:
+    """Raises ExperimentError where the name is that of no movie, or nothing here can write it, and
+    StorageError where there is no such folder."""
+    if path.suffix not in FORMATS:
+        raise ExperimentError(f"{path}: a movie ends in {' or '.join(FORMATS)}")
+    writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
+    for module, name in ((writer, WRITERS[writer]), ("matplotlib", "matplotlib")):
+        refuse_without(module, "movie", f"movies need {name}")
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no folder {path.parent}")
+
+
+def _for_movies(look: dict[str, Any]) -> Look:
+    found = Look(**({"dpi": DPI} | look))
+    if found.numbers:
+        raise ExperimentError("numbers are for pictures of one step: leave them out of a movie")
+    return found
+
+
+class Moving:
+    """A sheet of one panel whose layers show step after step, over a background drawn once."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        rows: Sequence[int],
+        look: Look,
+        show: Show,
+        *,
+        alone: bool = True,
+    ) -> None:
+        from pbdkit.drawing.sheet import Sheet
+
+        self._recording, self._name = recording, recording.title
+        looked_at = _told(recording.snapshots(rows), len(rows), "the scale of colours", show)
+        extent: Extent = extent_of(recording, looked_at, look)
+        title = self._title(int(recording.steps[-1]))
+        self.sheet: Sheet = Sheet([recording], [title], "", extent, look, finer=FINER, alone=alone)
+        (self._panel,) = self.sheet.panels
+        self._heading = self._panel.ax.title
+        if self._heading.get_text() != title:  # it was too long
+            self._name = ""
+
+    def _title(self, step: int) -> str:
+        return f"{self._name}, step {step}".lstrip(", ")
+
+    def put(self, now: Snapshot) -> list[Any]:
+        """Shows a step, and returns what changed."""
+        self._panel.show(now)
+        self._heading.set_text(self._title(now.step))
+        return [*self._panel.artists, self._heading]
+
+    def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:
+        """Each of those steps as pixels, an even number of them across and up."""
+        figure = self.sheet.figure
+        pixels = np.ceil(figure.get_size_inches() * figure.dpi / 2 - 1e-9) * 2
+        figure.set_size_inches(*(pixels / figure.dpi))
+        canvas: Any = figure.canvas
+        moving = [*self._panel.artists, self._heading]
+        for artist in moving:
+            artist.set_animated(True)
+        canvas.draw()
+        background = canvas.copy_from_bbox(figure.bbox)
+        for now in _told(self._recording.snapshots(rows), len(rows), "the movie", show):
+            canvas.restore_region(background)
+            for artist in sorted(self.put(now), key=lambda a: a.get_zorder()):
+                figure.draw_artist(artist)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _told(shown: Iterator[Snapshot], count: int, what: str, show: Show) -> Iterator[Snapshot]:
+    for n, now in enumerate(shown):
+        yield now
+        show(what, (n + 1) / count)
+
+
+@contextmanager
+def _appearing(path: Path) -> Iterator[Path]:
+    """A file beside that one, which takes its place at the end, and goes where that fails."""
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        yield part
+        part.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
+    """By ffmpeg, in another process, as every player shows it. Raises OSError where that fails."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    first = next(frames)
+    height, width, _ = first.shape
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}"]
+    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "veryfast"]
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *given, "-i", "-", *coded,
+               "-movflags", "+faststart", str(path)]  # fmt: skip
+    with TemporaryFile() as said:
+        with Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said) as ffmpeg:
+            assert ffmpeg.stdin is not None
+            try:
+                with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
+                    for frame in chain([first], frames):
+                        pipe.write(frame.tobytes())
+            except BaseException:  # an interrupt, after which `with` would not wait for its end
+                ffmpeg.kill()
+                ffmpeg.wait()
+                raise
+        said.seek(0)
+        if ffmpeg.returncode:
+            raise OSError(0, one_line(said.read().decode(errors="replace")))
+
+
+def _write_gif(path: Path, few: Frame, frames: Iterator[Frame], fps: float) -> None:
+    """With one palette, that of `few` of them, so that what does not move does not change."""
+    from PIL import Image
+
+    palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
+    colours = np.reshape(palette.getpalette() or [], (-1, 3))
+    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # the page stays white
+    palette.putpalette(colours.astype(np.uint8).tobytes())
+    drawn = (Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames)
+    next(drawn).save(
+        path, save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,
+        optimize=False,
+    )  # fmt: skip

@@ -1,0 +1,199 @@
+"""A dataset as pictures need it: the body, which does not change, and recorded steps of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.drawing.labels import counted_in, label, plain
+from pbdkit.drawing.mesh import cells_of, whole
+from pbdkit.drawing.quantity import Quantity, quantity_of
+from pbdkit.errors import ExperimentError
+from pbdkit.results.layout import OF_BODY, broken_by
+from pbdkit.results.sites import rows_of
+
+if TYPE_CHECKING:
+    import xarray
+
+Array = NDArray[Any]
+BLOCK_BYTES = 2**26
+"""So much is read of a file at a time."""
+MEASURED = 50_000
+"""The distance of particles is measured in bodies of up to so many, and else from their area."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What does not change: `reference` (particle, axis), `site` (particle, index), `number`
+    (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
+    each bond (bond, 2), and when each broke (bond,), -1 where it did not."""
+
+    reference: Array
+    site: Array
+    number: Array
+    inside: Array
+    ends: Array
+    broken_step: Array
+
+    @cached_property
+    def cells(self) -> Array:
+        """The rows of the corners of the body's cells, (cell, 4)."""
+        rows = np.flatnonzero(self.inside)
+        return np.asarray(rows[cells_of(self.site[rows], self.reference[rows])])
+
+    @cached_property
+    def cells_with_frame(self) -> Array:
+        """The same with those between body and frame."""
+        return cells_of(self.site, self.reference)
+
+    @cached_property
+    def spacing(self) -> float:
+        """How far apart particles are at rest: the median of a few, to the nearest."""
+        x = self.reference
+        if 1 < len(x) <= MEASURED:
+            few = np.linspace(0, len(x) - 1, 50).astype(int)
+            squares = np.array([np.sort(((x - x[k]) ** 2).sum(axis=1))[1] for k in few])
+            return float(np.sqrt(np.median(squares))) or 1.0
+        width, height = np.ptp(x, axis=0) if len(x) else (0.0, 0.0)
+        return float(np.sqrt(width * height / max(1, len(x)))) or 1.0
+
+    def whole_cells(self, cells: Array, broken: Array) -> Array:
+        """Those without a broken bond along a side."""
+        if not broken.any():
+            return cells
+        return np.asarray(cells[whole(cells, self.ends[broken], len(self.reference))])
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One step: `position` (particle, axis), `kind` (particle,), `values` of the quantity, if any,
+    and which bonds are `broken` (bond,)."""
+
+    step: int
+    position: Array
+    kind: Array
+    values: Array | None
+    broken: Array
+
+
+class Recording:
+    """The recorded steps of a dataset, with the quantity of that name, if any.
+
+    Raises ExperimentError for a dataset of several runs, for space that is no plane, and for a
+    quantity that cannot be drawn. Only what is asked for is read.
+    """
+
+    def __init__(self, dataset: xarray.Dataset, color: str | None = None) -> None:
+        self._dataset = of_one_run(dataset)
+        self.quantity: Quantity | None = None
+        if color is not None:
+            self.quantity = quantity_of(self._dataset, color)
+        self.title = plain(dataset.attrs.get("title", ""))
+        self._length_units = counted_in(dataset["position"].attrs)
+        self.steps = self._dataset["time"].values
+
+    @property
+    def axis_labels(self) -> tuple[str, str]:
+        """What stands at both axes."""
+        return label("x", self._length_units), label("y", self._length_units)
+
+    @cached_property
+    def _rows(self) -> Array:
+        """The particles that are there: of several runs joined, some are not in each."""
+        reference = self._dataset["reference"].transpose("particle", "axis").values
+        return np.flatnonzero(np.isfinite(reference).all(axis=1))
+
+    @cached_property
+    def body(self) -> Body:
+        """What does not change."""
+        dataset, rows = self._dataset, self._rows
+        numbers = dataset["number"].values[rows]
+        ends, broken = np.empty((0, 2), np.intp), np.empty(0)
+        if "bond_ends" in dataset:
+            given = dataset["bond_ends"].transpose("bond", "end").values
+            ends = rows_of(numbers, given)
+            self._bonds = np.flatnonzero((ends >= 0).all(axis=1))
+            ends, broken = ends[self._bonds], np.full(len(self._bonds), -1.0)
+        if "broken_step" in dataset and len(ends):
+            broken = np.nan_to_num(dataset["broken_step"].values[self._bonds], nan=-1.0)
+        reference = dataset["reference"].transpose("particle", "axis").values[rows]
+        site = np.stack([dataset[name].values[rows] for name in "ij"], axis=1).astype(np.int64)
+        inside = dataset["role"].values[rows] == OF_BODY
+        return Body(reference, site, numbers, inside, ends, broken)
+
+    def row(self, time: int | None) -> int:
+        """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""
+        if time is None:
+            return len(self.steps) - 1
+        rows = np.flatnonzero(self.steps == time)
+        if not len(rows):
+            near = [*self.steps[self.steps < time][-1:], *self.steps[self.steps > time][:1]]
+            raise ExperimentError(
+                f"step {time} was not recorded; the nearest recorded: "
+                f"{' and '.join(map(str, near))}"
+            )
+        return int(rows[-1])
+
+    def snapshots(self, rows: Sequence[int]) -> Iterator[Snapshot]:
+        """Those steps, in order, of which some at a time are in memory."""
+        body, quantity = self.body, self.quantity
+        names = {"position", "kind", *([quantity.variable] if quantity else [])}
+        names &= {*map(str, self._dataset.variables)}
+        many = max(1, BLOCK_BYTES // (40 * max(1, len(body.reference))))
+        for start in range(0, len(rows), many):
+            chosen = list(rows[start : start + many])
+            part = self._dataset.isel(time=chosen).reset_coords()[[*names]].load()
+            part = part.assign_coords(time=self.steps[chosen])
+            position = part["position"].transpose("time", "particle", "axis").values
+            kind = part["kind"].transpose("time", "particle").values
+            values = quantity.values(part) if quantity else None
+            for n, row in enumerate(chosen):
+                step = int(self.steps[row])
+                broken = broken_by(body.broken_step, step)
+                yield Snapshot(
+                    step,
+                    position[n][self._rows],
+                    np.nan_to_num(kind[n][self._rows]).astype(np.int8),
+                    None if values is None else values[n][self._owners],
+                    broken,
+                )
+
+    @property
+    def _owners(self) -> Array:
+        of_bond = self.quantity is not None and self.quantity.owner == "bond"
+        return self._bonds if of_bond else self._rows
+
+
+def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
+    """The dataset, with a time even where it was one of several. Raises ExperimentError where its
+    positions are not those of one run in the plane."""
+    if "position" not in dataset.variables:
+        raise ExperimentError("there are no positions to draw: keep the variable `position`")
+    position = dataset["position"]
+    others = [str(d) for d in position.dims if d not in ("time", "particle", "axis")]
+    if others:
+        sizes = ", ".join(f"{d}: {position.sizes[d]}" for d in others)
+        first = ", ".join(f"{d}=0" for d in others)
+        raise ExperimentError(
+            f"a picture is of one run, and this holds several ({sizes}); pick one with isel or "
+            f"sel: ds.isel({first}).pbd.plot(...)"
+        )
+    if dataset.sizes["axis"] != 2:
+        raise ExperimentError(
+            f"pictures are of the plane, and positions here have {dataset.sizes['axis']} axes"
+        )
+    if "particle" not in dataset.dims or not dataset.sizes["particle"]:
+        raise ExperimentError("there are no particles to draw: keep the dimension `particle`")
+    if "time" in position.dims:
+        there = dataset
+    else:
+        again = {name: dataset[name].expand_dims("time") for name in ("position", "kind")}
+        there = dataset.assign(again)
+    if not there.sizes["time"]:
+        raise ExperimentError("no step was recorded")
+    return there

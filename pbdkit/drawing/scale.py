@@ -1,0 +1,102 @@
+"""The scale of colours: which value has which, about zero where both signs are there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.drawing.look import Look
+from pbdkit.drawing.quantity import Quantity
+from pbdkit.errors import ExperimentError
+from pbdkit.interfaces.component import did_you_mean
+
+if TYPE_CHECKING:
+    from matplotlib.colors import Colormap, Normalize
+
+Array = NDArray[Any]
+DOTS, FIELD, BOTH_SIGNS = "viridis", "YlOrRd", "RdBu_r"
+NOTHING = "#E0E0E0"
+"""The colour of what has no value."""
+NEARLY = 1e-9
+"""What is so little of the largest is taken for zero, and for no difference."""
+FROM_ZERO = 0.3
+"""A scale whose lowest value is no more than that of its highest begins at zero."""
+LEVELS = 12
+
+
+@dataclass(frozen=True)
+class Scale:
+    """From `low` to `high`; `extend` as matplotlib says it: which values lie beyond. Numbers at the
+    scale are to be multiplied by ten to the `exponent`."""
+
+    low: float
+    high: float
+    colours: Colormap
+    norm: Normalize
+    extend: str
+    exponent: int
+
+
+def scale_of(quantity: Quantity, values: tuple[float, float], look: Look, filled: bool) -> Scale:
+    """The scale of a quantity whose values lie between these two.
+
+    Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`
+    has a range: neutral is zero even then. Raises ExperimentError for a map that is not there.
+    """
+    from matplotlib.colors import BoundaryNorm, Normalize
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = values
+    far = max(abs(low), abs(high))
+    both = quantity.is_signed and low < -NEARLY * far and high > NEARLY * far
+    if look.range is not None:
+        low, high = look.range
+        both = quantity.is_signed and low < 0.0 < high
+    elif both:
+        low, high = -far, far
+    elif 0.0 < low < FROM_ZERO * high and not quantity.is_place:
+        low = 0.0
+    elif FROM_ZERO * low < high < 0.0 and not quantity.is_place:
+        high = 0.0
+    elif high - low <= NEARLY * far:
+        high = low + (far or 1.0)
+    name = look.map or (BOTH_SIGNS if both else FIELD if filled else DOTS)
+    if quantity.is_signed and low < high <= 0.0 and not look.map:
+        name += "_r"  # what is next to zero has the same colour on either side
+    norm: Normalize = Normalize(low, high)
+    if look.contours:
+        levels = MaxNLocator(LEVELS, symmetric=both and look.range is None).tick_values(low, high)
+        norm, low, high = BoundaryNorm(levels, 256), float(levels[0]), float(levels[-1])
+    beyond = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
+    slack = NEARLY * (high - low)
+    extend = beyond[int(values[0] < low - slack), int(values[1] > high + slack)]
+    colours = _map(name, (low, high) if both else None)
+    return Scale(low, high, colours, norm, extend, _exponent(max(abs(low), abs(high))))
+
+
+def _map(name: str, about_zero: tuple[float, float] | None) -> Colormap:
+    """The map of that name; of one about zero only as far as the scale goes on either side."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    if name not in colormaps:
+        near = did_you_mean(name, colormaps) or "; viridis, YlOrRd and RdBu_r are"
+        raise ExperimentError(f"'{name}' is no map of colours{near}")
+    found = colormaps[name]
+    if about_zero is not None:
+        far = max(map(abs, about_zero))
+        low, high = (0.5 + 0.5 * end / far for end in about_zero)
+        found = ListedColormap(found(np.linspace(low, high, 256)))
+    return found.with_extremes(bad=NOTHING)
+
+
+def _exponent(largest: float) -> int:
+    """Of the power of ten that is told once, in place of zeros at every number."""
+    if largest == 0.0 or not math.isfinite(largest):
+        return 0
+    power = math.floor(math.log10(largest) + 1e-9)
+    return 0 if -3 <= power <= 3 else power

@@ -1,0 +1,52 @@
+"""What stands where a result was wanted, by its content, and which command takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.kinds import EXPERIMENT, kind_of, what_takes
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.experiment.source import read_file
+from pbdkit.results.trial import BEGINNINGS
+from pbdkit.storage.run_files import STORE
+
+TEXTS = (".yaml", ".yml", ".json")
+
+
+def refuse_other_file(path: Path) -> None:
+    """Raises ExperimentError where it is known what a path leads to, and that is no result."""
+    if told := other_file(path):
+        raise ExperimentError(f"{path}: {told}")
+
+
+def other_file(path: Path) -> str:
+    """What it is and what takes it; empty for results, for nothing and for what nobody knows."""
+    if path.is_dir():
+        inner = path / "sweep.nc"
+        sweep = f"is the folder of a sweep; its dataset is {inner}"
+        return sweep if inner.is_file() else "is a folder, no result of pbdkit"
+    if not path.is_file():
+        known = path.as_posix() in shipped_names()
+        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * known
+    try:
+        with path.open("rb") as file:
+            if file.read(8).startswith(BEGINNINGS):
+                return ""
+        source = read_file(path)
+    except OSError:
+        return ""
+    except ExperimentError:  # no text, or text that is at fault
+        return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
+    kind = kind_of(source.data)
+    if kind == EXPERIMENT:
+        return f"is an experiment; `pbdkit run {path}` makes a result of it, and says where"
+    takes = f"is {kind}, no result; {what_takes(kind, str(path))}"
+    return takes if kind else "is no result: those end in .nc"
+
+
+def refuse_store(path: Path) -> None:
+    """Raises ExperimentError for the store of an unfinished run in place of its output."""
+    if path.name.endswith(STORE) and path.is_file():
+        output = path.with_name(path.name.removesuffix(STORE))
+        raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")

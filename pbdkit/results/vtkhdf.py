@@ -1,0 +1,183 @@
+"""Results for ParaView: VTKHDF, the format of VTK in HDF5, written without VTK.
+
+The format is that of docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid whose
+points and data follow each other step by step, and `Steps` tells where each step begins.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import StorageError
+from pbdkit.results.destination import Destination
+from pbdkit.results.grid import Grid, grid_of
+from pbdkit.results.layout import broken_by
+
+if TYPE_CHECKING:
+    import h5py
+    import xarray
+
+    from pbdkit.scene.scene import Scene
+
+Array = NDArray[Any]
+VERSION, TYPE = (2, 2), b"UnstructuredGrid"
+BLOCK_BYTES = 2**25
+"""About so much of a variable is in memory at a time."""
+CHUNK = 2**16
+"""Values in a chunk of what grows step by step."""
+ELSEWHERE = ("position", "time", "particle", "site", "axis", "bond_ends", "broken_step")
+"""What the grid itself says."""
+NOT_HERE = {"i": -1, "u": 0, "f": np.nan}
+"""What stands, by the kind of number, in the cells that have no value."""
+
+
+def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace: bool) -> None:
+    """Writes every recorded step: the particles, the bonds, and of a `scene` the cells between
+    them, with all that the dataset knows of them. At most some steps are in memory.
+
+    Raises StorageError where it cannot be written; then nothing stands there.
+    """
+    import h5py
+
+    destination = Destination(path, replace=replace)
+    try:
+        with destination.temporary() as temporary:
+            name = Path(str(temporary.name))
+            try:
+                with h5py.File(temporary, "w") as file:
+                    _write(file, dataset, grid_of(dataset, scene))
+                destination.take(name, "complete")
+            finally:
+                name.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StorageError(f"{path}: cannot be written: {reason}") from None
+
+
+def _write(file: h5py.File, dataset: xarray.Dataset, grid: Grid) -> None:
+    for name, said in dataset.attrs.items():
+        file.attrs[name] = said if isinstance(said, str) else json.dumps(said, default=str)
+    root = file.create_group("VTKHDF")
+    root.attrs["Version"] = VERSION
+    root.attrs.create("Type", np.bytes_(TYPE))
+    count, steps = dataset.sizes["particle"], dataset.sizes["time"]
+    root["NumberOfPoints"] = np.array([count])
+    root["NumberOfCells"] = np.array([len(grid.types)])
+    root["NumberOfConnectivityIds"] = np.array([len(grid.connectivity)])
+    root["Connectivity"], root["Offsets"] = grid.connectivity, grid.offsets
+    root["Types"] = grid.types
+    times = root.create_group("Steps")
+    times.attrs["NSteps"] = steps
+    times["Values"] = dataset["time"].values.astype(float)
+    times["NumberOfParts"], times["PartOffsets"] = np.ones(steps, int), np.zeros(steps, int)
+    for name in ("CellOffsets", "ConnectivityIdOffsets"):
+        times[name] = np.zeros((steps, 1), int)
+    times["PointOffsets"] = count * np.arange(steps)
+    for where in ("PointData", "CellData", "FieldData"):
+        for group in (where, f"Steps/{where}Offsets"):
+            root.create_group(group)
+    times.create_group("FieldDataSizes")
+    points = root.create_dataset("Points", (steps * count, 3), "f8")
+    for begin, values in _blocks(dataset["position"].transpose("time", "particle", "axis")):
+        points[begin * count : (begin + len(values)) * count] = _in_space(values).reshape(-1, 3)
+    for name, variable in dataset.variables.items():
+        _put(Parts(root, str(name), steps), dataset[str(name)], variable.dims, grid)
+    _put_broken(Parts(root, "broken", steps), dataset, grid)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Where a variable goes."""
+
+    root: h5py.Group
+    name: str
+    steps: int
+
+    def once(self, where: str, values: Array) -> None:
+        """The same at every step; of field data the entries are tuples."""
+        self.root[f"{where}/{self.name}"] = values
+        self._from(where, np.zeros(self.steps, int), values)
+
+    def each(self, where: str, rows: Iterator[Array]) -> None:
+        """Values for each step; those that did not change since the last stand there once."""
+        last: Array | None = None
+        starts, start, length, kept = list[int](), 0, 0, None
+        for values in rows:
+            if last is None or not np.array_equal(values, last, equal_nan=values.dtype.kind == "f"):
+                kept = kept or self._growing(where, values)
+                kept.resize(length + len(values), axis=0)
+                kept[length:] = values
+                start, length, last = length, length + len(values), values
+            starts.append(start)
+        if last is not None:
+            self._from(where, np.array(starts), last)
+
+    def _growing(self, where: str, values: Array) -> h5py.Dataset:
+        more = values.shape[1:]
+        chunk = (max(1, min(CHUNK, len(values))), *more)
+        return self.root.create_dataset(
+            f"{where}/{self.name}", (0, *more), values.dtype, chunks=chunk, maxshape=(None, *more)
+        )
+
+    def _from(self, where: str, starts: Array, values: Array) -> None:
+        self.root[f"Steps/{where}Offsets/{self.name}"] = starts
+        if where == "FieldData":
+            size = (values.shape[1] if values.ndim > 1 else 1, len(values))
+            self.root[f"Steps/FieldDataSizes/{self.name}"] = np.tile(size, (self.steps, 1))
+
+
+def _put(parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: Grid) -> None:
+    """A variable where it belongs; what is of neither particles nor bonds is field data."""
+    along = {*dims} - {"time", "axis"}
+    if parts.name in ELSEWHERE or values.dtype.kind not in "biuf" or "step" in along:
+        return
+    where = "PointData" if along == {"particle"} else "FieldData"
+    where = "CellData" if along == {"bond"} else where
+    order = [d for d in ("time", *sorted(along), "axis") if d in dims]
+    whole = values.transpose(*order)
+    vector = "axis" in dims
+
+    def shown(entries: Array) -> Array:
+        entries = _in_space(entries) if vector else entries
+        entries = entries.astype("u1") if entries.dtype.kind == "b" else entries
+        if where == "CellData":
+            entries = grid.of_bonds(entries, NOT_HERE[entries.dtype.kind])
+        return entries if along else entries.reshape(1, *entries.shape)
+
+    if "time" not in dims:
+        parts.once(where, shown(whole.values))
+        return
+    parts.each(where, (shown(row) for _, block in _blocks(whole) for row in block))
+
+
+def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: Grid) -> None:
+    """Which part every cell of the grid is, and where bonds break, which are broken at each step: a
+    cell between particles is where a bond of its corners is."""
+    Parts(parts.root, "part", parts.steps).once("CellData", grid.part)
+    if grid.broken_step is None:
+        return
+    broken, steps = grid.broken_step, dataset["time"].values
+    Parts(parts.root, "broken_step", parts.steps).once("CellData", broken)
+    now = (broken_by(broken, step).astype("u1") for step in steps)
+    parts.each("CellData", now)
+
+
+def _blocks(values: xarray.DataArray) -> Iterator[tuple[int, Array]]:
+    """(first step, values) of some steps at a time."""
+    steps = values.sizes["time"]
+    block = max(1, BLOCK_BYTES * steps // max(1, values.nbytes))
+    for begin in range(0, steps, block):
+        yield begin, values.isel(time=slice(begin, begin + block)).values
+
+
+def _in_space(values: Array) -> Array:
+    """Vectors with three components."""
+    missing = 3 - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])

@@ -1,0 +1,144 @@
+"""Movies: every recorded step is there, on one scale, in even numbers of pixels, or nothing is."""
+
+import re
+import subprocess
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit import ExperimentError, StorageError
+
+pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("matplotlib")
+
+import imageio_ffmpeg
+from PIL import Image
+
+from pbdkit.drawing.look import Look
+from pbdkit.drawing.movie import Moving
+from pbdkit.drawing.recording import Recording
+
+SMALL = {"size": (3.01, 2.47), "dpi": 61}
+"""Of an odd number of pixels either way, as it is given."""
+
+
+@pytest.fixture(scope="module")
+def torn():
+    return pbdkit.run(pbdkit.load("paper/f2", settings=["steps=24"]), progress=False)
+
+
+def frames_of(path):
+    """All of a movie: (frame, row, column, red green blue)."""
+    if path.suffix == ".gif":
+        with Image.open(path) as moving:
+            found = []
+            for n in range(moving.n_frames):
+                moving.seek(n)
+                found.append(np.asarray(moving.convert("RGB")))
+            return np.stack(found)
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
+    decoded = subprocess.run(
+        [*ffmpeg, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
+    )
+    width, height = map(int, re.search(rb"Video: .*?, (\d+)x(\d+)", decoded.stderr).groups())
+    return np.frombuffer(decoded.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_every_recorded_step_is_there(torn, tmp_path, suffix):
+    shares, path = [], tmp_path / f"torn{suffix}"
+    torn.pbd.animate(path, "pe1_intact", show=lambda what, share: shares.append(share), **SMALL)
+    frames = frames_of(path).astype(int)
+    assert frames.shape == (25, 152, 184, 3)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert shares[-1] == 1.0
+    changes = np.abs(np.diff(frames, axis=0)).max(axis=(1, 2, 3))
+    assert changes.min() > 40  # the number of the step, at least
+    same = np.ptp(frames, axis=0).max(axis=2) < 60
+    assert same.mean() > 0.5  # axes, labels and the scale stay
+    assert same[:, :14].all()
+    assert np.median(frames) > 235  # on a white page
+
+
+def test_a_frame_is_the_picture_of_its_step(torn):
+    recording = Recording(torn, "pe1_intact")
+    moving = Moving(recording, range(25), Look(**SMALL), lambda what, share: None)
+    frames = [*moving.frames(range(25))]
+    assert moving.sheet.axes[0].get_title().endswith("step 24")
+    again = next(iter(moving.frames([7])))
+    np.testing.assert_array_equal(again, frames[7])
+    low, high = moving.sheet.axes[0].collections[-1].get_clim()
+    assert (low, high) == (0.0, pytest.approx(float(torn.pe1_intact.max())))
+
+
+def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
+    torn.pbd.animate(tmp_path / "some.gif", every=10, **SMALL)
+    assert len(frames_of(tmp_path / "some.gif")) == 4  # 0, 10, 20 and 24
+
+
+@pytest.mark.parametrize(
+    ("name", "look", "message"),
+    [
+        ("torn.avi", {}, "torn.avi: a movie ends in .mp4 or .gif"),
+        ("torn.gif", {"fps": 100.0}, "fps: 100 is not between 0.1 and 50"),
+        ("torn.gif", {"every": 0}, "every: 0 is below 1; 1 shows all recorded steps"),
+        ("torn.mp4", {"numbers": True}, "numbers are for pictures of one step"),
+        ("torn.mp4", {"color": "pe3"}, "'pe3' cannot be drawn; did you mean"),
+    ],
+)
+def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ExperimentError) as refused:
+        torn.pbd.animate(name, **look)
+    assert message in str(refused.value)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
+    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda name: None)
+    for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
+        with pytest.raises(ExperimentError) as refused:
+            torn.pbd.animate(tmp_path / name)
+        assert f"need {missing}: pip install 'pbdkit[movie]'" in str(refused.value)
+
+
+def test_a_movie_that_cannot_be_written_leaves_nothing(torn, tmp_path, monkeypatch):
+    with pytest.raises(StorageError, match="there is no folder"):
+        torn.pbd.animate(tmp_path / "none" / "torn.gif", **SMALL)
+    shown = []
+
+    def stop(what, share):
+        shown.append(share)
+        if what == "the movie" and share > 0.5:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "torn.mp4"
+    path.write_text("mine")
+    with pytest.raises(KeyboardInterrupt):
+        torn.pbd.animate(path, show=stop, **SMALL)
+    assert [p.name for p in tmp_path.iterdir()] == ["torn.mp4"]
+    assert path.read_text() == "mine"
+
+
+def test_the_command_makes_movies_and_replaces_none(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call("run", "paper/f2", "--set", "steps=9", "-o", "f2.nc").code == 0
+    look = ["--size", "3", "2", "--dpi", "60", "--color", "pe1", "--contours"]
+    done = call("animate", "f2.nc", *look)
+    assert (done.code, done.out) == (0, "f2.mp4 written\n")
+    assert len(frames_of(tmp_path / "f2.mp4")) == 10
+    again = call("animate", "f2.nc", *look)
+    assert (again.code, "f2.mp4: exists; --force replaces it" in again.err) == (2, True)
+    assert call("animate", "f2.nc", "-o", "f2.gif", "--force", *look).code == 0
+    wrong = call("animate", "f2.nc", "-o", "f2.png")
+    assert (wrong.code, "a movie ends in .mp4 or .gif" in wrong.err) == (2, True)
+
+
+def test_notebooks_have_an_animation_of_no_more_than_sixty_steps(torn):
+    from matplotlib.animation import FuncAnimation
+
+    many = torn.isel(time=np.repeat(np.arange(25), 3)).assign_coords(time=np.arange(75))
+    moving = many.pbd.animation("pe1_intact", size=(3, 2), dpi=40)
+    assert isinstance(moving, FuncAnimation)
+    assert moving.to_jshtml().count("data:image/png") == 60

@@ -1,0 +1,402 @@
+"""Pictures of bodies: nothing is clipped or overprinted, whatever their shape; what colours say."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import xarray
+
+import pbdkit
+from pbdkit import ExperimentError
+
+pytest.importorskip("matplotlib")
+
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from pbdkit.drawing import compare, plot
+from pbdkit.drawing.mesh import cells_of, outline, whole
+from pbdkit.drawing.pixels import Grid
+
+HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}
+WHOLE = {"type": "coordination", "shells": 1}
+
+
+def pulled(name, lattice, body, neighbours=WHOLE, **more):
+    """A body held on the left, of which one particle is pulled away."""
+    given = {"lattice": lattice, "body": body, "neighbours": neighbours, **more}
+    ds = pbdkit.run(
+        {
+            "name": name,
+            "rule": {"type": "barycentre"},
+            "leaders": [HOLD, {"select": {"nearest": [[1e3, 1e3]]}, "motion": SIDEWAYS}],
+            "steps": 12,
+            "diagnostics": [{"type": "pe1"}, {"type": "displacement"}],
+            "fracture": {"type": "threshold", "thresholds": [2.5]},
+            **given,
+        },
+        progress=False,
+    )
+    assert ds.attrs["status"] == "complete"
+    return ds
+
+
+SQUARE, HEXAGONAL = {"type": "square", "a": 1.0}, {"type": "hexagonal", "a": 0.5}
+RING = {"type": "ring", "inner": 4.0, "outer": 9.0, "centre": [0.0, 0.0]}
+MADE = {
+    "200 x 6": lambda: pulled("flat", SQUARE, {"type": "grid", "columns": 200, "rows": 6}),
+    "6 x 200": lambda: pulled("tall", SQUARE, {"type": "grid", "columns": 6, "rows": 200}),
+    "50 x 50": lambda: pulled("a/plate", SQUARE, {"type": "grid", "columns": 50, "rows": 50}),
+    "few": lambda: pulled("few", SQUARE, {"type": "grid", "columns": 3, "rows": 1}),
+    "ring": lambda: pulled("a-ring-with-a-long-name" * 5, HEXAGONAL, RING),
+}
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    """Each made when first wanted."""
+    found = {}
+
+    def body(name):
+        if name not in found:
+            found[name] = MADE[name]()
+        return found[name]
+
+    return body
+
+
+@pytest.fixture(scope="module")
+def torn():
+    return pbdkit.run("paper/f2", progress=False)
+
+
+def drawn_texts(figure, monkeypatch):
+    """All texts that a figure writes, with the boxes that they take, in pixels."""
+    found, draw = [], Text.draw
+
+    def drawing(self, renderer):
+        if self.get_visible() and self.get_text().strip():
+            found.append((self.get_text(), self.get_window_extent(renderer)))
+        draw(self, renderer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Text, "draw", drawing)
+        figure.canvas.draw()
+    return found
+
+
+def faults(figure, monkeypatch):
+    """Texts and axes beyond the edge of a figure, and pairs of texts over one another."""
+    page, texts = figure.bbox, drawn_texts(figure, monkeypatch)
+    boxes = texts + [(f"axes {ax.get_label()}", ax.get_window_extent()) for ax in figure.axes]
+    clipped = [
+        name
+        for name, box in boxes
+        if min(box.x0, box.y0) < -0.5 or box.x1 > page.x1 + 0.5 or box.y1 > page.y1 + 0.5
+    ]
+    panels = [(f"axes {ax.get_label()}", ax.get_window_extent()) for ax in figure.axes]
+    over = [
+        (a, b)
+        for (a, one), (b, other) in combinations(texts, 2)
+        if min(one.x1, other.x1) - max(one.x0, other.x0) > 0.5
+        and min(one.y1, other.y1) - max(one.y0, other.y0) > 0.5
+    ]
+    apart = [
+        (a, b)
+        for (a, one), (b, other) in combinations(panels, 2)
+        if min(one.x1, other.x1) > max(one.x0, other.x0)
+        and min(one.y1, other.y1) > max(one.y0, other.y0)
+    ]
+    return clipped + over + apart
+
+
+def figure_of(axes):
+    return (axes[0] if isinstance(axes, list) else axes).get_figure(root=True)
+
+
+LOOKS = {
+    "kinds": {},
+    "a field or dots": {"color": "u_x"},
+    "13 panels": {"color": "u", "time": range(13)},
+    "bonds in a given size": {"color": "broken_step", "size": (4.0, 9.0)},
+    "two in a given size": {"time": [0, 12], "size": (7.0, 6.5)},
+    "numbers": {"numbers": True},
+}
+TRIED = [(name, look) for name in MADE for look in LOOKS if name not in ("50 x 50", "ring")]
+TRIED += [("50 x 50", "13 panels"), ("50 x 50", "kinds"), ("ring", "bonds in a given size")]
+TRIED += [("ring", "a field or dots"), ("ring", "two in a given size")]
+
+
+@pytest.mark.parametrize(("name", "look"), TRIED)
+def test_nothing_is_clipped_or_overprinted(bodies, name, look, monkeypatch):
+    axes = plot(bodies(name), **LOOKS[look], dpi=100)
+    assert faults(figure_of(axes), monkeypatch) == []
+    for ax in axes if isinstance(axes, list) else [axes]:  # a body's shape is that of its panel
+        box, (left, right), (low, high) = ax.get_window_extent(), ax.get_xlim(), ax.get_ylim()
+        assert box.width / (right - left) == pytest.approx(box.height / (high - low), rel=0.02)
+
+
+def test_units_make_labels_no_longer_than_there_is_room(monkeypatch):
+    strip = pbdkit.run("modelling/strip", progress=False)
+    axes = plot(strip, None, "stress_xx")
+    assert faults(figure_of(axes), monkeypatch) == []
+    assert axes.get_title() == "modelling/strip, step 1"
+    said = " ".join(" ".join(text.split()) for text, _ in drawn_texts(axes.figure, monkeypatch))
+    assert "x (lattice unit of 1.25 mm)" in said
+    assert "stress, xx component (MPa)" in said
+
+
+def image_of(ax):
+    """The pixels of a field, and the colour of nothing."""
+    (image,) = ax.get_images()
+    return image
+
+
+def test_fields_of_both_signs_are_neutral_at_zero(bodies):
+    ds = bodies("50 x 50")
+    signed = ds.assign(stress_xx=ds.pe1 - 0.3 * float(ds.pe1.max()))
+    image = image_of(plot(signed, None, "stress_xx"))
+    low, high = image.get_clim()
+    assert low == -high
+    assert image.cmap.name == "RdBu_r" or np.allclose(image.cmap(0.5)[:3], 0.97, atol=0.01)
+    one = image_of(plot(signed, None, "stress_xx", range=(-0.1, 0.3)))
+    assert one.get_clim() == (-0.1, 0.3)
+    neutral = one.cmap(one.norm(0.0))
+    assert np.allclose(neutral[:3], 0.97, atol=0.02)
+    above = image_of(plot(ds, None, "pe1"))
+    below = image_of(plot(ds.assign(pe1=-ds.pe1), None, "pe1"))
+    assert (above.get_clim()[0], below.get_clim()[1]) == (0.0, 0.0)
+    assert above.cmap(0.0) == below.cmap(1.0)
+
+
+def test_all_panels_have_one_scale_and_one_place(torn):
+    axes = plot(torn, [0, 10, 400], "pe1_intact")
+    assert len({ax.collections[-1].get_clim() for ax in axes}) == 1
+    assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
+    assert [ax.get_title() for ax in axes] == ["step 0", "step 10", "step 400"]
+    given = plot(torn, [0, 400], "pe1_intact", range=(0.0, 5.0), map="magma")
+    assert {ax.collections[-1].get_clim() for ax in given} == {(0.0, 5.0)}
+    assert {ax.collections[-1].get_cmap().name for ax in given} == {"magma"}
+
+
+def test_every_panel_shows_something():
+    """At the last step of a sheet that came to rest there is next to nothing to see in colour."""
+    sheet = pbdkit.run("paper/a", progress=False)
+    for ax in plot(sheet, [10, 400], "pe1", contours=True):
+        pixels = image_of(ax).get_array()
+        assert np.isfinite(np.ma.filled(pixels, np.nan)).mean() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("color", "expected", "said"),
+    [
+        ("u", lambda ds: np.hypot(*ds.u.values.T), "length of displacement"),
+        ("u_x", lambda ds: ds.u.sel(axis="x"), "displacement, along x"),
+        ("u_y", lambda ds: ds.u.sel(axis="y"), "displacement, along y"),
+        ("reference_y", lambda ds: ds.reference.sel(axis="y"), "reference position, along y"),
+        ("i", lambda ds: ds.i, "site index i"),
+        ("pe1", lambda ds: ds.pe1, "pseudo-energy PE1"),
+    ],
+)
+def test_colours_are_values(bodies, color, expected, said):
+    ds = bodies("50 x 50")
+    ax = plot(ds, 6, color, filled=False)
+    dots = next(c for c in ax.collections if isinstance(c, PathCollection))
+    order = np.argsort([*map({2: 0, 1: 1, 0: 2}.get, ds.kind.sel(time=6).values)], kind="stable")
+    wanted = np.asarray(expected(ds.sel(time=6)), float)[order]
+    np.testing.assert_allclose(np.ma.filled(dots.get_array(), np.nan), wanted)
+    np.testing.assert_array_equal(dots.get_offsets(), ds.position.sel(time=6).values[order])
+    label = ax.figure.axes[-1].get_ylabel() or ax.figure.axes[-1].get_xlabel()
+    assert said in " ".join(label.split())
+
+
+def test_bonds_show_when_they_broke_and_those_that_did_are_dashed(torn):
+    shown = int(((torn.broken_step >= 0) & (torn.broken_step <= 8)).sum())
+    ax = plot(torn, 8, "broken_step")
+    whole_lines, values = (c for c in ax.collections if isinstance(c, LineCollection))
+    assert len(values.get_segments()) == shown > 0
+    assert len(whole_lines.get_segments()) == torn.sizes["bond"] - shown
+    assert values.get_array().max() <= 8
+    kinds = plot(torn, 8, broken=True, outline=True)
+    dashed = [c for c in kinds.collections if isinstance(c, LineCollection)][1]
+    assert len(dashed.get_segments()) == shown
+    assert dashed.get_linestyle()[0][1] is not None
+
+
+def test_numbers_are_thinned_where_they_would_overprint(bodies, monkeypatch):
+    few = {t for t, _ in drawn_texts(plot(bodies("few"), numbers=True).figure, monkeypatch)}
+    assert {str(n) for n in bodies("few").number.values} <= few
+    ax = plot(bodies("200 x 6"), numbers=True, size=(7.0, 2.0))
+    written = [t for t, _ in drawn_texts(ax.figure, monkeypatch) if t.isdigit()]
+    assert 10 < len(written) < bodies("200 x 6").sizes["particle"] / 4
+
+
+REFUSED = {
+    "not recorded": ({"time": 7000}, "step 7000 was not recorded; the nearest recorded: 400"),
+    "no time": ({"time": []}, "a figure needs at least one time"),
+    "misspelt": (
+        {"color": "pe1_intat"},
+        "'pe1_intat' cannot be drawn; did you mean 'pe1_intact'? what can be drawn: position, ",
+    ),
+    "component": ({"color": "position_z"}, "did you mean 'position_"),
+    "not measured": ({"color": "u_x"}, "u is what {type: displacement} in `diagnostics` records"),
+    "of nothing": ({"color": "track"}, "'track' cannot be drawn"),
+    "field of names": ({"contours": True}, "contours need numbers at particles as color"),
+    "field of bonds": ({"color": "broken_step", "filled": True}, "contours need numbers at"),
+    "dots and contours": ({"color": "pe1", "filled": False, "contours": True}, "to be dots"),
+    "range": ({"color": "pe1", "range": (2.0, 1.0)}, "range: from 2 to 1 is none; give LOW HIGH"),
+    "map": ({"color": "pe1", "map": "virids"}, "'virids' is no map of colours; did you mean"),
+    "size": ({"size": (0.0, 3.0)}, "size: is in inches, each above 0 and at most 100"),
+    "no room": ({"size": (0.4, 0.4)}, "size: 0.4 by 0.4 inches leave no room for 1 panels"),
+    "dpi": ({"dpi": 5}, "dpi: 5 is not between 10 and 2400"),
+    "axes": ({"time": [0, 1], "ax": []}, "2 steps need as many axes; 0 are given"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_picture_is_refused(torn, name):
+    look, message = REFUSED[name]
+    with pytest.raises(ExperimentError) as refused:
+        plot(torn, **look)
+    assert message in str(refused.value)
+
+
+def test_bonds_that_are_not_there_are_refused(tensile):
+    ds = pbdkit.run(tensile | {"fracture": {"type": "none"}, "diagnostics": []}, progress=False)
+    for look in ({"bonds": True}, {"broken": True}):
+        with pytest.raises(ExperimentError, match="there are no bonds to draw"):
+            plot(ds, **look)
+
+
+def test_what_has_no_places_is_refused(torn):
+    with pytest.raises(ExperimentError, match="keep the variable `position`"):
+        torn.drop_vars("position").pbd.plot()
+    with pytest.raises(ExperimentError, match="no particle has a place in what is to be drawn"):
+        torn.assign(position=torn.position * np.nan).pbd.plot()
+
+
+def test_a_variable_that_says_nothing_of_itself_has_its_name(torn):
+    silent = torn.assign(pe1=torn.pe1.assign_attrs(long_name="", units=""))
+    bar = silent.pbd.plot(color="pe1", range=(0.0, 1.0)).figure.axes[1]
+    assert bar.get_ylabel() == "pe1"
+
+
+def test_one_of_several_runs_is_picked_by_who_draws(tensile):
+    swept = pbdkit.sweep(tensile, vary={"rule.type": ["barycentre", "mean-displacement"]})
+    with pytest.raises(ExperimentError) as refused:
+        swept.pbd.plot()
+    dimension = next(d for d in swept.position.dims if d not in ("time", "particle", "axis"))
+    assert f"({dimension}: 2); pick one" in str(refused.value)
+    assert f"ds.isel({dimension}=0).pbd.plot(...)" in str(refused.value)
+    assert swept.isel({dimension: 1}).pbd.plot().get_title().endswith(f"step {swept.time[-1]:d}")
+
+
+def test_part_of_a_dataset_is_drawn(torn):
+    left = torn.isel(particle=torn.reference.sel(axis="x").values < 5, time=[3, 8])
+    ax = left.pbd.plot(color="pe1")
+    assert ax.get_title() == "paper/f2, step 8"
+    assert ax.get_xlim()[1] < 12
+    assert torn.isel(time=8).pbd.plot(color="broken_step").get_title() == "paper/f2, step 8"
+
+
+def test_axes_are_drawn_into(torn):
+    figure = Figure((8, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
+    assert plot(torn, [0, 400], "pe1", ax=axes)[0] is axes[0]
+    assert torn.pbd.plot(time=8, ax=Figure().add_subplot()).get_title() == "paper/f2, step 8"
+    assert isinstance(torn.pbd.plot(time=[0, 8]), Figure)
+
+
+def test_two_runs_side_by_side_have_one_scale_and_one_place(torn):
+    other = pbdkit.run("paper/f1", progress=False)
+    one, two = compare(torn, other, 8, "pe1_intact")
+    assert one.get_xlim() == two.get_xlim()
+    assert one.collections[-1].get_clim() == two.collections[-1].get_clim()
+    assert [ax.get_title() for ax in (one, two)] == ["paper/f2, step 8", "paper/f1, step 8"]
+
+
+def test_a_difference_is_of_particles_of_one_number(bodies):
+    ds = bodies("50 x 50")
+    more = ds.assign(pe1=ds.pe1 + ds.reference.sel(axis="x"))
+    some = ds.isel(particle=ds.reference.sel(axis="x").values < 30)
+    ax = compare(some, more, color="pe1", difference=True, filled=False)
+    dots = ax.collections[-1]
+    body = dots.get_array().compressed()
+    assert len(body) == int((some.role == 0).sum())
+    assert ax.get_title() == "a/plate less a/plate, step 12"
+    np.testing.assert_allclose(body, dots.get_offsets()[~dots.get_array().mask][:, 0], atol=1e-9)
+    moved = compare(ds.isel(time=[0]), ds, difference=True)  # of positions, about the rest
+    assert moved.get_title() == "a/plate less a/plate, step 12"
+    with pytest.raises(ExperimentError, match="no particle in common: no number is in both"):
+        compare(ds.isel(particle=[0]), ds.isel(particle=[1]), color="pe1", difference=True)
+    with pytest.raises(ExperimentError, match="one of particles, and 'broken_step' is of bonds"):
+        compare(ds, ds, color="broken_step", difference=True)
+
+
+def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
+    """Of a linear quantity, on cells larger and smaller than pixels; a cell is left out."""
+    for count in (4, 9, 60, 300):
+        site = np.stack(np.meshgrid(*2 * [np.arange(count + 1)], indexing="ij"), -1).reshape(-1, 2)
+        x = site / count + 0.05 * np.sin(3 * site[:, ::-1] / count)
+        cells = cells_of(site, site.astype(float))
+        assert cells.shape == (count**2, 4)
+        gone = count // 2 * count + count // 2
+        grid = Grid((-0.2, 1.2, -0.2, 1.2), 140, 140)
+        corners, value = grid.places(x), (2 * x[:, 0] - x[:, 1]).astype(np.float32)
+        found = grid.mean(corners[cells], value[cells])
+        row, column = np.nonzero(np.isfinite(found))
+        at = 2 * (column + 0.5) / 100 - 0.4 - (row + 0.5) / 100 + 0.2
+        assert np.abs(found[row, column] - at).max() < 0.03
+        middle = found[40:100, 40:100]
+        assert np.isfinite(middle).all()
+        if count <= 9:
+            kept = np.delete(cells, gone, axis=0)
+            less = grid.mean(corners[kept], value[kept])
+            hole = np.isfinite(found) & np.isnan(less)
+            assert hole.sum() == pytest.approx(1e4 / count**2, rel=0.3)
+
+
+def test_cells_with_a_broken_side_are_left_out_and_the_outline_goes_around_the_rest():
+    site = np.stack(np.meshgrid(*2 * [np.arange(4)], indexing="ij"), -1).reshape(-1, 2)
+    cells = cells_of(site, site.astype(float))
+    kept = cells[whole(cells, np.array([[5, 6]]), 16)]
+    assert len(kept) == 7
+    assert len(outline(cells, 16)) == 12
+    assert len(outline(kept, 16)) == 16
+    leaning = site + np.array([0.5, 0.0]) * site[:, 1:]  # a lattice of triangles
+    assert len(cells_of(site, leaning)) == 18
+
+
+def test_a_file_is_read_as_far_as_it_is_drawn(tmp_path, call, monkeypatch):
+    """Of five steps and three fields, one step of one."""
+    given = {"name": "some", "lattice": SQUARE, "body": {"type": "grid", "columns": 30, "rows": 30}}
+    more = {"rule": {"type": "barycentre"}, "steps": 4, "leaders": [HOLD], "neighbours": WHOLE}
+    given |= more | {"diagnostics": [{"type": "pe1"}, {"type": "pe2"}, {"type": "displacement"}]}
+    monkeypatch.chdir(tmp_path)
+    pbdkit.run(given, progress=False).to_netcdf("some.nc")
+    read = []
+    load = xarray.Dataset.load
+    monkeypatch.setattr(
+        xarray.Dataset,
+        "load",
+        lambda ds: read.append((dict(ds.sizes), {*ds.data_vars})) or load(ds),
+    )
+    with xarray.open_dataset("some.nc", decode_times=False) as ds:
+        ds.pbd.plot(time=2, color="u_x")
+    ((sizes, names),) = read
+    assert sizes["time"] == 1
+    assert names == {"position", "kind", "u"}
+
+
+def test_where_pyplot_is_in_use_figures_are_its_own(tmp_path):
+    """So that scripts and notebooks show them; a movie leaves none behind."""
+    plt = pytest.importorskip("matplotlib.pyplot")
+    ds = pbdkit.run(pbdkit.load("paper/a", settings=["steps=3"]), progress=False)
+    before = len(plt.get_fignums())
+    ax = ds.pbd.plot()
+    assert ax.figure.number in plt.get_fignums()
+    assert ds.pbd.history(particle=67).figure.number in plt.get_fignums()
+    ds.pbd.animate(tmp_path / "a.gif", every=2, dpi=40)
+    assert len(plt.get_fignums()) == before + 2

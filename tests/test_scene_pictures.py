@@ -1,0 +1,224 @@
+"""What a notebook shows of an experiment, of an analysis and of a run that goes on."""
+
+import io
+import sys
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from property_cases import LATTICES, experiment, pull_right
+
+import pbdkit
+from pbdkit.drawing import notebook
+from pbdkit.drawing.scene_picture import edge_of, picture_of
+from pbdkit.drawing.svg import Svg
+from pbdkit.drawing.ways import extreme
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.results import progress
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import build_scene
+
+PULLED = {"leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}},
+                      pull_right(0.3, 0.0)]}  # fmt: skip
+
+
+def scene_of(**parts):
+    return build_scene(pbdkit.Experiment(**experiment(**PULLED | parts)))
+
+
+def shapes(html):
+    """The elements of the picture in a page, and the page as XML."""
+    page = ElementTree.fromstring(html)
+    found = page.find(".//{http://www.w3.org/2000/svg}svg")
+    return page, [*found] if found is not None else []
+
+
+def numbers(element):
+    text = element.get("d", "").replace("h0", " ")
+    return np.array("".join(c if c in "0123456789.- " else " " for c in text).split(), float)
+
+
+@pytest.mark.parametrize("name", [n for n in shipped_names() if n != "paper/e-40"])
+def test_pictures_of_shipped_experiments_lie_within_their_edges(name):
+    drawn = picture_of(build_scene(pbdkit.load(name)))
+    picture = ElementTree.fromstring(drawn.svg)
+    width, height = float(picture.get("width")), float(picture.get("height"))
+    assert 0 < width <= 480
+    assert 0 < height <= 400
+    led = [s for s in picture if s.get("stroke") in ("#0072B2", "#D55E00") and "h0" in s.get("d")]
+    for shape in led:
+        x, y = numbers(shape).reshape(-1, 2).T
+        assert 0 <= x.min() <= x.max() <= width
+        assert 0 <= y.min() <= y.max() <= height
+    assert {"body", "edge of the body"} & {said for _, said in drawn.legend}
+
+
+def test_what_the_scene_has_is_in_the_legend():
+    whole = scene_of(
+        neighbours={"type": "chebyshev", "shells": 1},
+        rule={"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1, "core": 2}},
+        frame={"type": "natural"},
+        regions={"core": {"type": "disc", "radius": 1.5, "centre": [2.5, 2.0]}},
+        cuts=[{"from": [-1.0, 2.5], "to": [1.0, 2.5], "at": 3}],
+        loads=[{"select": {"edge": "top"}, "force": [0.0, -1e-3]}],
+        obstacles=[{"shape": {"half_plane": {"point": [0.0, -1.0], "normal": [0.0, 1.0]}},
+                    "motion": {"type": "hold"}}],
+    )  # fmt: skip
+    said = [words for _, words in picture_of(whole).legend]
+    assert {"region core", "obstacle", "body", "cut at step 3", "held", "led", "force"} == {*said}
+    framed = picture_of(scene_of()).legend
+    assert "frame" in [words for _, words in framed]
+
+
+def test_arrows_point_where_leaders_go():
+    drawn = ElementTree.fromstring(picture_of(scene_of()).svg)
+    shafts = [s for s in drawn if s.get("stroke") == "#D55E00" and "L" in s.get("d")]
+    assert shafts
+    for shaft in shafts:
+        x0, y0, x1, y1 = numbers(shaft)
+        assert x1 > x0
+        assert y1 == y0
+
+
+@pytest.mark.parametrize(
+    ("motion", "way"),
+    [
+        ({"type": "velocity", "velocity": [0.1, 0.0], "steps": 5}, [0.5, 0.0]),
+        ({"type": "velocity", "velocity": [0.1, 0.0], "steps": 500}, [3.0, 0.0]),
+        ({"type": "displace", "displacement": [0.0, -2.0]}, [0.0, -2.0]),
+        ({"type": "path", "steps": [2, 4], "displacements": [[0.0, 3.0], [0.0, 0.0]]}, [0.0, 3.0]),
+        ({"type": "oscillation", "amplitude": [1.0, 0.5], "period": 8}, [1.0, 0.5]),
+    ],
+)
+def test_a_motion_is_shown_where_it_goes_farthest(motion, way):
+    made = scene_of(leaders=[{"select": {"edge": "right"}, "motion": motion}])
+    (leading,) = made.leading
+    found = extreme(leading.group.motion, leading.reference, made.experiment.steps)
+    np.testing.assert_allclose(found, np.broadcast_to(way, found.shape), rtol=1e-12)
+
+
+def test_turns_are_shown_by_their_first_step():
+    motion = {"type": "rotation", "centre": [0.0, 0.0], "angle": 90.0, "steps": 4}
+    made = scene_of(leaders=[{"select": {"nearest": [[5.0, 0.0]]}, "motion": motion}])
+    (leading,) = made.leading
+    found = extreme(leading.group.motion, leading.reference, 4)
+    np.testing.assert_allclose(found, [[-5.0, 5.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_the_edge_of_a_large_body_is_its_own(lattice):
+    made = scene_of(lattice=lattice, columns=12, rows=11)
+    raster, rows = made.raster, edge_of(made.raster)
+    assert (raster.table_kind[rows] == FOLLOWER).all()
+    assert len(np.unique(rows)) == len(rows) < (raster.table_kind == FOLLOWER).sum()
+    X = raster.reference()
+    body = X[raster.table_kind == FOLLOWER]
+    for end in (body.min(axis=0), body.max(axis=0)):
+        assert (np.isclose(X[rows], end).any(axis=0)).all()
+
+
+def test_large_bodies_are_small_pages():
+    made = pbdkit.load("paper/a", settings=["body.columns=300", "body.rows=300"])
+    page = made._repr_html_()
+    assert len(page) < 60_000
+    assert "edge of the body" in page
+
+
+def test_what_takes_long_is_said_to_be_left_out(monkeypatch):
+    monkeypatch.setattr(notebook, "LARGEST", 10)
+    assert "not looked at for" in pbdkit.load("paper/a")._repr_html_()
+
+
+def test_pages_say_what_check_says(call):
+    page = pbdkit.load("paper/a")._repr_html_()
+    told = call("check", "paper/a", "--verbose").out
+    text = "".join(ElementTree.fromstring(page).itertext())
+    for said in ("144, of which", "stable"):
+        assert said in told.replace("spectrum", "stability")
+        assert said in text
+
+
+def test_a_scene_that_cannot_be_built_is_a_page_with_the_reason():
+    made = pbdkit.Experiment(
+        **experiment(leaders=[{"select": {"box": [90, 90, 91, 91]}, "motion": {"type": "hold"}}])
+    )
+    page, drawn = shapes(made._repr_html_())
+    assert "selects no particle" in "".join(page.itertext())
+    assert not drawn
+
+
+def test_text_is_escaped():
+    hostile = "<script>alert('&\")</script>"
+    page, _ = shapes(notebook._page(hostile, "", [(hostile, hostile)], [hostile]))
+    assert "".join(page.itertext()).count(hostile) == 4
+    assert "<script>" not in Svg(np.zeros(2), np.ones(2), (90.0, 90.0), 9.0).text(hostile)
+
+
+def test_space_has_no_picture():
+    assert picture_of(SimpleNamespace(axes=3)) is None
+
+
+def test_analyses_give_their_verdict():
+    found = pbdkit.analyse("paper/a")
+    text = "".join(ElementTree.fromstring(found._repr_html_()).itertext())
+    assert f"stable: spectral radius {found.spectral_radius:.9g}" in text
+    assert f"{found.smallest_eigenvalue:.6g}" in text
+    wild = pbdkit.analyse(pbdkit.load("paper/a", settings=["solver.relaxation=1.9"]))
+    assert "not stable" in "".join(ElementTree.fromstring(wild._repr_html_()).itertext())
+
+
+def test_identities_say_what_the_rule_is():
+    found = pbdkit.identify("paper/f2")
+    text = "".join(ElementTree.fromstring(found._repr_html_()).itertext())
+    for said in ("isotropic diffusion", "stable below 1.5", *found.notes):
+        assert said in text
+
+
+def test_a_colour_stands_once_in_the_legend():
+    text = "".join(pbdkit.load("modelling/composite-plate")._repr_html_())
+    assert "held along x only, held along y only" in text
+
+
+def test_at_an_equilibrium_no_steps_are_told():
+    page = pbdkit.load("material/bar")._repr_html_()
+    text = "".join(ElementTree.fromstring(page).itertext())
+    assert "goes straight to the equilibrium" in text
+    assert "settles" not in text
+
+
+@pytest.mark.parametrize("of", [pbdkit.analyse, pbdkit.identify])
+def test_without_a_notebook_they_are_short(of):
+    assert len(repr(of("paper/a"))) < 1500
+
+
+def test_nothing_of_it_is_a_field_of_the_experiment():
+    made = pbdkit.load("paper/a")
+    assert "_repr_html_" not in str(made.model_dump())
+    assert not any("repr" in name for name in type(made).model_fields)
+
+
+def test_progress_in_a_notebook_is_a_line_that_changes(monkeypatch, recwarn):
+    shown = io.StringIO()
+    kernel = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=1))
+    monkeypatch.setitem(sys.modules, "IPython", kernel)
+    monkeypatch.setattr(progress, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(progress, "LINE_S", 0.0)
+    monkeypatch.setattr(sys, "stdout", shown)
+    with progress.progress_bar(True) as show:
+        show("step 10 of 100", 0.1)
+        show("step 100 of 100", 1.0)
+    first, second, end = shown.getvalue().split("\r")[1:4]
+    assert first.startswith("step 10 of 100 10% after")
+    assert second.startswith("step 100 of 100 100% after")
+    assert end == " " * len(second)
+    assert "\n" not in shown.getvalue()
+    assert not recwarn.list
+
+
+def test_elsewhere_progress_is_a_bar(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
+    monkeypatch.setattr(progress, "PATIENCE_S", 0.0)
+    with progress.progress_bar(True) as show:
+        show("step 10 of 100", 0.1)
+    assert "after" not in capsys.readouterr().out
