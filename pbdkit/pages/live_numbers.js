@@ -1,0 +1,45 @@
+/** A number that can be turned: a slider, and a field that takes any value. */
+
+import { labelled, make } from "./dom.js";
+
+const APART_MS = 100; // between two values that are handed on
+
+export function numberRow({ name, span: [low, high] }, send) {
+  let last = 0, waiting = null, current = null, touched = 0;
+  const turn = (value) => {
+    if (!Number.isFinite(value)) return show(current);
+    clearTimeout(waiting);
+    touched = performance.now();
+    field.value = shortened(value);
+    const wait = Math.max(0, last + APART_MS - touched);
+    waiting = setTimeout(() => {
+      last = performance.now();
+      send({ do: "turn", name, value });
+    }, wait);
+  };
+  const range = slider(name, low, high, "any", (value) => turn(Number(value.toPrecision(4))));
+  const field = make("input", {
+    type: "text", inputMode: "decimal", spellcheck: false, "aria-label": `${name}, as a number`,
+    onchange: () => turn(Number(field.value.replace(",", "."))),
+  });
+  const show = (value) => {
+    if (value === undefined || value === null) return;
+    current = value;
+    if (performance.now() - touched < 3 * APART_MS) return; // somebody is at it
+    range.value = value;
+    if (document.activeElement !== field) field.value = shortened(value);
+  };
+  const element = make("div", { className: "number" }, labelled(name, field), range);
+  return { name, show, element };
+}
+
+function shortened(value) {
+  return String(Number(value.toPrecision(5)));
+}
+
+/** A slider that hands on where it is moved to; `meaning` is for those who do not see it. */
+export function slider(meaning, min, max, step, act) {
+  const made = make("input", { type: "range", min, max, step, "aria-label": meaning });
+  made.addEventListener("input", () => act(made.valueAsNumber));
+  return made;
+}

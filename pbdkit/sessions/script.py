@@ -1,0 +1,195 @@
+"""What was done by hand, step by step, in the words of an experiment file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pbdkit.errors import ExperimentError, PbdkitError
+from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces.fracture_model import Segment
+from pbdkit.sessions.hand import Hand
+from pbdkit.sessions.numbers import Number, numbers_of, placed
+
+NEVER = 2**62 - 1
+"""The last step of what is stepped until somebody has seen enough."""
+MADE = "-live"
+"""How the names of experiments end that were made by hand: their results lie beside the others."""
+Parts = dict[str, Any]
+
+
+@dataclass
+class Led:
+    """A leader group: as the file says it, `of_file`, or one of the hand's, from a step on.
+
+    `ended` is the last step for which it was let lead. A hand's group may stand in place of one
+    that had not begun to lead, `instead_of`.
+    """
+
+    of_file: Parts
+    hand: Hand | None = None
+    ended: int | None = None
+    instead_of: Led | None = None
+
+    @property
+    def begins(self) -> int:
+        """The first step in which it leads."""
+        return int(self.of_file.get("from", 1))
+
+    def leads(self, step: int) -> bool:
+        """Whether it leads in that step."""
+        ends = [end for end in (self.of_file.get("until"), self.ended) if end is not None]
+        return self.begins <= step <= min(ends, default=step)
+
+    def written(self, motion: bool) -> Parts:
+        """As an experiment file says it; without its `motion` a hand's group rests."""
+        ended = {} if self.ended is None else {"until": self.ended}
+        own = self.hand.motion() if self.hand and motion else {"type": "hold"}
+        return self.of_file | ({"motion": own} if self.hand else {}) | ended
+
+
+@dataclass
+class Script:
+    """An experiment and all that was done to it: groups led by hand, numbers turned, cuts."""
+
+    experiment: Experiment
+    parts: Parts
+    numbers: dict[str, Number]
+    groups: list[Led]
+    cuts: list[Parts] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Script:
+        """Of an experiment whose relaxation and memory are numbers, to which nothing was done."""
+        parts = parts_of(experiment)
+        groups = [Led(_said(group)) for group in parts.get("leaders", ())]
+        return cls(experiment, parts, numbers_of(experiment, parts), groups)
+
+    def grab(self, group: int, step: int) -> int:
+        """Lets the hand lead a group after that step; returns the place of the group that it
+        leads."""
+        found = self.groups[group]
+        if found.hand is not None:
+            return group
+        kept = {key: of for key, of in found.of_file.items() if key not in ("motion", "until")}
+        led = Led(kept | {"from": step + 1}, Hand())
+        if found.begins == step + 1:
+            led.instead_of, self.groups[group] = found, led
+            return group
+        found.ended = step
+        self.groups.append(led)
+        return len(self.groups) - 1
+
+    def pick(self, particle: int, step: int) -> int:
+        """Lets the hand lead the particle of that number after that step."""
+        self.groups.append(Led({"select": {"numbers": [particle]}, "from": step + 1}, Hand()))
+        return len(self.groups) - 1
+
+    def let_go(self, group: int, step: int) -> None:
+        """Lets a group follow after that step."""
+        led = self.groups[group]
+        if led.begins > step:
+            del self.groups[group]
+        else:
+            led.ended = step
+
+    def turn(self, name: str, step: int, value: float) -> None:
+        """Another number after that step. Raises ExperimentError for one that cannot be."""
+        number = self.numbers.get(name)
+        if number is None:
+            raise ExperimentError(f"there is no number '{name}' that can be turned")
+        self.experiment.of_parts(placed(self.playing(step), number, number.turned(value)))
+        number.turn(step, value)
+
+    def cut(self, segments: Sequence[Segment], step: int) -> None:
+        """Cuts at the beginning of the step after that one. Raises ExperimentError where the
+        experiment takes none."""
+        more: list[Parts] = [{"from": list(a), "to": list(b), "at": step + 1} for a, b in segments]
+        playing = self.playing(step)
+        self.experiment.of_parts(playing | {"cuts": [*playing.get("cuts", ()), *more]})
+        self.cuts += more
+
+    def cut_back(self, step: int) -> None:
+        """Forgets all that was done after a step."""
+        for number in self.numbers.values():
+            number.cut_back(step)
+        self.cuts = [cut for cut in self.cuts if cut["at"] <= step]
+        groups = [led.instead_of if _comes_after(led, step) else led for led in self.groups]
+        self.groups = [led for led in groups if led]
+        for led in self.groups:
+            if led.ended is not None and led.ended >= step:
+                led.ended = None
+            if led.hand:
+                led.hand.cut_back(step - led.begins + 1)
+
+    def next_turn(self, step: int) -> int:
+        """The first step after that one after which a number is another."""
+        turns = (when for number in self.numbers.values() for when, _ in number.turns)
+        return min((when for when in turns if when > step), default=NEVER)
+
+    def playing(self, step: int) -> Parts:
+        """What is stepped after a step: its numbers as they are until the next turn, hands at rest,
+        and of the cuts that were made no more than tells that there are some."""
+        parts = dict(self.parts)
+        for number in self.numbers.values():
+            if number.turns:
+                parts = placed(parts, number, number.after(step))
+        cuts = [*parts.get("cuts", ()), *self.cuts]
+        coming = [cut for cut in cuts if cut["at"] > step]
+        parts["cuts"] = coming or cuts[-1:]
+        parts["leaders"] = [led.written(motion=False) for led in self.groups]
+        parts.pop("record", None)
+        parts.pop("diagnostics", None)
+        return parts | {"steps": NEVER}
+
+    def written(self, last: int) -> Parts:
+        """The whole as an experiment of `last` steps."""
+        parts = dict(self.parts)
+        for number in self.numbers.values():
+            if number.turns:
+                parts = placed(parts, number, number.written(last))
+        cuts = [cut for cut in (*parts.get("cuts", ()), *self.cuts) if cut["at"] <= last]
+        name = parts["name"].removesuffix(MADE) + MADE
+        groups = [led.written(motion=True) for led in self.groups if not _comes_after(led, last)]
+        parts |= {"name": name, "steps": last, "leaders": groups}
+        parts = _where(parts, "cuts", cuts)
+        record = parts.get("record", {})
+        if "at" in record:
+            parts["record"] = record | {"at": [at for at in record["at"] if at <= last] or [0]}
+        plain: Parts = json.loads(json.dumps(parts))  # nothing in it is there twice
+        return plain
+
+
+def parts_of(experiment: Experiment) -> Parts:
+    """What an experiment that is stepped is made of, in lattice units, without an end to it; parts
+    that need not be said are left out."""
+    parts: Parts = json.loads(experiment.model_dump_json(by_alias=True))
+    parts["solver"].pop("settle", None)
+    whole = experiment.of_parts(parts)
+    optional = [key for key, part in parts.items() if isinstance(part, dict | list)]
+    for key in [key for key in optional if key != "solver"]:
+        fewer = {name: part for name, part in parts.items() if name != key}
+        try:
+            if experiment.of_parts(fewer) == whole:
+                parts = fewer
+        except PbdkitError:
+            continue
+    return parts
+
+
+def _said(group: Parts) -> Parts:
+    """Without what says nothing."""
+    silent = {"from": 1, "until": None, "clamped": False}
+    return {key: of for key, of in group.items() if key not in silent or of != silent[key]}
+
+
+def _comes_after(led: Led, step: int) -> bool:
+    return led.hand is not None and led.begins > step
+
+
+def _where(parts: Parts, key: str, some: list[Any]) -> Parts:
+    """With what there is of it, without the key where there is nothing."""
+    rest = {name: part for name, part in parts.items() if name != key}
+    return rest | ({key: some} if some else {})

@@ -1,0 +1,59 @@
+"""The same view in a notebook: messages of a widget in place of a socket."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import anywidget
+
+from pbdkit.errors import ExperimentError
+from pbdkit.pages.page import script, source
+from pbdkit.sessions.commands import command_of
+from pbdkit.sessions.conductor import Conductor, Viewer
+from pbdkit.sessions.scenery import Message
+from pbdkit.sessions.session import Session
+
+
+class _Cells(Viewer):
+    """All cells that show one widget."""
+
+    def __init__(self, widget: anywidget.AnyWidget) -> None:
+        self._widget = widget
+
+    def tell(self, message: Message) -> None:
+        self._widget.send(message)
+
+    def show(self, picture: bytes) -> None:
+        self._widget.send({"is": "picture"}, buffers=[picture])
+
+
+class LiveWidget(anywidget.AnyWidget):
+    """A session in a notebook. `session` is what was done, ``close()`` ends it."""
+
+    _esm = script("notebook", exports=True) + "\nexport default { render };\n"
+    _css = source("live.css")
+
+    def __init__(self, session: Session, **more: Any) -> None:
+        super().__init__(**more)
+        self.session = session
+        self._conductor = Conductor(session)
+        self._cells = _Cells(self)
+        self.on_msg(self._hear)
+        self._conductor.start()
+
+    def close(self) -> None:
+        """Ends the session."""
+        self._conductor.close()
+        super().close()
+
+    def _hear(self, widget: Any, message: Any, buffers: Any) -> None:
+        """A cell that joins begins anew: it knows nothing yet."""
+        if message == {"do": "join"}:
+            self._conductor.leave(self._cells)
+            self._cells = _Cells(self)
+            self._conductor.join(self._cells)
+            return
+        try:
+            self._conductor.ask(self._cells, command_of(message))
+        except ExperimentError as error:
+            self._cells.tell({"is": "error", "text": str(error)})

@@ -1,0 +1,56 @@
+"""A browser for tests of pages: Chromium without a window, which draws WebGL in software."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+# Not for the whole session: while it is open its event loop runs in this thread, and nobody else
+# can start one here.
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Playwright's browser; tests that ask for it are skipped where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, NAMES)), None)
+    if path is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed")
+    with playwright.sync_playwright() as driver:
+        found = driver.chromium.launch(executable_path=path, args=OPTIONS)
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """An empty page, 1280 pixels wide. At the end nothing may stand in its console, no script may
+    have failed, and it may have asked nobody for anything but the file that was opened and servers
+    of this machine."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    faults: list[str] = []
+
+    def only_here(route: Any) -> None:
+        url, asked = urlsplit(route.request.url), route.request
+        here = url.scheme in ("data", "blob") or url.hostname in LOOPBACK
+        if here or (url.scheme == "file" and asked.is_navigation_request()):
+            route.continue_()
+        else:
+            faults.append(f"a request for {asked.url}")
+            route.abort()
+
+    context.route("**/*", only_here)
+    found = context.new_page()
+    found.set_default_timeout(8000)
+    found.on("console", lambda said: faults.append(f"{said.type}: {said.text}"))
+    found.on("pageerror", lambda error: faults.append(str(error)))
+    yield found
+    context.close()
+    assert faults == []

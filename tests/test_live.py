@@ -1,0 +1,718 @@
+"""A body that answers to the mouse: what is saved repeats it, and nobody else leads it."""
+
+import asyncio
+import json
+import random
+import re
+import threading
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+import pbdkit
+from pbdkit.cli.live import live
+from pbdkit.experiment.shipped import shipped_names
+from pbdkit.runs.course import Run
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import build_scene
+from pbdkit.sessions import history, saving, stage
+from pbdkit.sessions.access import Access
+from pbdkit.sessions.commands import LONGEST, command_of
+from pbdkit.sessions.conductor import Conductor
+from pbdkit.sessions.judgement import judged
+from pbdkit.sessions.obeying import obey
+from pbdkit.sessions.scenery import scenery, standing
+from pbdkit.sessions.server import Page, SessionServer
+from pbdkit.sessions.session import Session
+from pbdkit.sessions.widget import LiveWidget
+
+CHANGED = {
+    "paper/b": ["solver.memory=0.3"],
+    "paper/f2": ["fracture.thresholds=[1.3, 2.3]"],
+}
+
+
+def session_of(name, tmp_path, settings=(), **more):
+    said = []
+    loaded = pbdkit.load(name, settings=settings)
+    return Session(loaded, tmp_path / "made.yaml", says=said.append, **more), said
+
+
+def do(session, **command):
+    obey(session, command_of(json.dumps(command)))
+
+
+def run_of(path):
+    run = Run(build_scene(pbdkit.load(path)))
+    for _ in run:
+        pass
+    return run.state
+
+
+def assert_same(a, b):
+    assert a.step == b.step
+    np.testing.assert_array_equal(a.u, b.u)
+    np.testing.assert_array_equal(a.previous, b.previous)
+    assert (a.broken_step is None) == (b.broken_step is None)
+    if a.broken_step is not None:
+        np.testing.assert_array_equal(a.broken_step, b.broken_step)
+    for mine, others in zip(a.particle_values, b.particle_values, strict=True):
+        np.testing.assert_array_equal(mine, others)
+
+
+def at_random(session, seed, turns=40):
+    """Whatever a user may do; what cannot be is refused and changes nothing."""
+    dice = random.Random(seed)
+    for _ in range(turns):
+        with suppress(pbdkit.ExperimentError):
+            something(session, dice)
+        for _ in range(dice.randrange(3)):
+            session.advance(dice.choice([1, 1, 2, 7]))
+    followers = np.flatnonzero(session.frame().kinds == FOLLOWER)
+    do(session, do="grab", row=int(followers[len(followers) // 2]))
+    do(session, do="drag", by=[0.1, 0.2])
+    session.advance(3)
+
+
+def something(session, dice):
+    kind = dice.choice(["grab", "drag", "drag", "drag", "release", "turn", "cut", "bond", "rewind"])
+    positions = session.camera.positions(session.state)
+    row = dice.randrange(len(positions))
+    if kind == "grab":
+        do(session, do="grab", row=row)
+    elif kind == "drag":
+        do(session, do="drag", by=[dice.gauss(0, 0.2), dice.gauss(0, 0.2)])
+    elif kind == "release":
+        do(session, do="release")
+    elif kind == "turn":
+        name = dice.choice([*session.script.numbers])
+        now = session.script.numbers[name].at(session.step + 1)
+        do(session, do="turn", name=name, value=now * dice.uniform(0.9, 1.0))
+    elif kind == "cut" and dice.random() < 0.4:
+        begin = positions[row].tolist()
+        end = [x + dice.uniform(-1.5, 1.5) * session.camera.spacing for x in begin]
+        do(session, do="cut", **{"from": begin, "to": end})
+    elif kind == "bond" and len(session.camera.bonds):
+        do(session, do="cut-bond", row=dice.randrange(len(session.camera.bonds)))
+    elif kind == "rewind":
+        do(session, do="rewind", step=dice.randrange(session.end + 1))
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_what_is_saved_repeats_what_was_seen_bit_for_bit(name, tmp_path):
+    session, said = session_of(name, tmp_path, CHANGED.get(name, ()))
+    at_random(session, name, 40 if session.camera.rows.size < 300 else 8)
+    assert session.script.groups[-1].hand
+    do(session, do="save")
+    assert said[-1]["is"] == "saved"
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+def test_a_part_of_what_was_done_is_saved_too(tmp_path):
+    session, _ = session_of("paper/d1", tmp_path)
+    at_random(session, 8)
+    for n, step in enumerate((session.end // 3, session.end // 2, 1)):
+        do(session, do="rewind", step=step)
+        do(session, do="save")
+        file = tmp_path / f"made{f'-{n + 1}' * (n > 0)}.yaml"
+        assert_same(session.state, run_of(file))
+
+
+def test_kernels_repeat_it_too(interpreted, tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "SMALL", 0)
+    session, _ = session_of("paper/a", tmp_path, ["solver.engine=compiled"])
+    assert session.stage.choice.engine == "compiled"
+    at_random(session, 3)
+    do(session, do="save")
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+def test_who_goes_back_finds_the_same_states(tmp_path):
+    session, _ = session_of("paper/d1", tmp_path)
+    at_random(session, 5)
+    seen = {}
+    do(session, do="rewind", step=0)
+    while session.step < session.end:
+        session.advance(1)
+        seen[session.step] = session.state.copy()
+    for step in random.Random(1).sample(sorted(seen), 12):
+        do(session, do="rewind", step=step)
+        assert session.step == step
+        np.testing.assert_array_equal(session.state.u, seen[step].u)
+
+
+def test_who_goes_back_and_does_something_forgets_what_came_after(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(5)
+    do(session, do="turn", name="solver.relaxation", value=0.5)
+    session.advance(5)
+    do(session, do="rewind", step=3)
+    assert session.end == 10
+    do(session, do="turn", name="solver.memory", value=0.25)
+    assert session.end == 3
+    session.advance(3)
+    found = session.script.written(session.step)["solver"]
+    assert found["relaxation"] == 1.0
+    assert found["memory"] == {"steps": [3, 4], "values": [0.0, 0.25]}
+
+
+def test_steps_that_cannot_be_made_forget_the_states_after_them(tmp_path, monkeypatch):
+    session, said = session_of("paper/a", tmp_path)
+    for _ in range(10):
+        session.advance(1)
+    do(session, do="rewind", step=4)
+
+    def refused(state, steps):
+        monkeypatch.undo()
+        raise pbdkit.ExperimentError("leaders cannot go there")
+
+    monkeypatch.setattr(session.stage, "advance", refused)
+    session.advance(8)
+    assert said[-1] == {"is": "error", "text": "leaders cannot go there"}
+    assert session.step == session.end == max(session.history.steps) == 4
+
+
+def test_a_group_goes_where_the_mouse_leads_it_within_a_picture(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(3)
+    left = int(session.stage.scene.leading[0].rows[4])
+    before = session.camera.positions(session.state)
+    do(session, do="grab", row=left)
+    do(session, do="drag", by=[0.5, -0.25])
+    session.advance(4)
+    moved = session.camera.positions(session.state) - before
+    rows = session.stage.scene.leading[0].rows
+    np.testing.assert_allclose(moved[rows], [[0.5, -0.25]] * len(rows), atol=1e-15)
+    do(session, do="release")
+    session.advance(2)
+    assert session.stage.scene.leading[-1].group.leads(session.step + 1)
+
+
+def test_a_follower_follows_again_once_it_is_let_go(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    follower = 67
+    do(session, do="grab", row=follower)
+    do(session, do="drag", by=[1.0, 0.0])
+    session.advance(1)
+    held = session.camera.positions(session.state)[follower]
+    session.advance(3)
+    np.testing.assert_array_equal(session.camera.positions(session.state)[follower], held)
+    do(session, do="release")
+    session.advance(1)
+    assert (session.camera.positions(session.state)[follower] != held).any()
+    group = session.script.written(session.step)["leaders"][-1]
+    assert (group["from"], group["until"]) == (1, 4)
+
+
+def test_a_line_across_a_moved_body_cuts_what_it_crosses(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(12)
+    ends = session.camera.positions(session.state)[session.camera.bonds.astype(int)]
+    across = (ends[:, 0, 0] < 6.0) != (ends[:, 1, 0] < 6.0)
+    level = (ends[:, :, 1] > 2.5).all(axis=1) & (ends[:, :, 1] < 6.5).all(axis=1)
+    do(session, do="cut", **{"from": [6.0, 2.5], "to": [6.0, 6.5]})
+    session.advance(1)
+    broken = session.frame().broken.astype(bool)
+    assert broken.sum() == (across & level).sum() == 4
+    np.testing.assert_array_equal(np.flatnonzero(broken), np.flatnonzero(across & level))
+
+
+def test_one_bond_is_cut_and_none_that_crosses_it(tmp_path):
+    session, _ = session_of("paper/a-chebyshev", tmp_path)
+    for row in (3, 40, 131, 200):
+        do(session, do="cut-bond", row=row)
+    session.advance(1)
+    np.testing.assert_array_equal(np.flatnonzero(session.frame().broken), [3, 40, 131, 200])
+
+
+def test_long_ways_of_the_mouse_stand_in_a_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(saving, "INLINE", 10)
+    session, said = session_of("paper/a", tmp_path)
+    do(session, do="grab", row=int(session.stage.scene.leading[0].rows[0]))
+    for n in range(20):
+        do(session, do="drag", by=[0.01 * n, 1e-17 + 0.1 * n])
+        session.advance(2)
+    do(session, do="save")
+    assert said[-1]["text"] is None
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["made-0.csv", "made.yaml"]
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+    (tmp_path / "made.yaml").unlink()  # its table is still there
+    do(session, do="save")
+    assert Path(said[-1]["path"]).name == "made-2.yaml"
+    assert_same(session.state, run_of(tmp_path / "made-2.yaml"))
+
+
+def test_nothing_is_overwritten(tmp_path):
+    session, said = session_of("paper/a", tmp_path)
+    with pytest.raises(pbdkit.ExperimentError, match="nothing has been stepped yet"):
+        do(session, do="save")
+    session.advance(1)
+    do(session, do="save")
+    do(session, do="save")
+    assert [Path(message["path"]).name for message in said] == ["made.yaml", "made-2.yaml"]
+
+
+def test_leaders_that_cannot_go_there_stay_and_it_is_said(tmp_path):
+    overlap = {
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {"select": {"edge": "bottom"}, "motion": {"type": "hold"}},
+        ]
+    }
+    parts = pbdkit.load("paper/a").model_dump(mode="json", by_alias=True) | overlap
+    said = []
+    session = Session(pbdkit.Experiment(**parts), tmp_path / "made.yaml", said.append)
+    session.advance(2)
+    before = session.state.copy()
+    do(session, do="grab", row=int(session.stage.scene.leading[0].rows[5]))
+    do(session, do="drag", by=[1.0, 1.0])
+    session.advance(3)
+    assert "two groups move particle" in said[-1]["text"]
+    assert_same(session.state, before)
+    session.advance(1)
+    assert session.step == 3
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        ({"do": "turn", "name": "rule.K", "value": 1.0}, "no number 'rule.K'"),
+        ({"do": "turn", "name": "solver.relaxation", "value": -1.0}, "greater than 0"),
+        ({"do": "grab", "row": 5000}, "no particle 5000"),
+        ({"do": "grab", "row": 0}, "points of the frame"),
+        ({"do": "cut-bond", "row": 9999}, "no bond 9999"),
+        ({"do": "cut", "from": [90.0, 0.0], "to": [91.0, 0.0]}, "beside the body"),
+        ({"do": "sing"}, "no command"),
+        ({"do": "play"}, "no command: play.on"),
+        ({"do": "speed", "steps": 0}, "greater than or equal to 1"),
+        ({"do": "drag", "by": [float("nan"), 0.0]}, "finite"),
+        ({"do": "step", "count": 1, "more": 2}, "unknown key"),
+        ([], "no command"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_nothing_done(command, told, tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    with pytest.raises(pbdkit.ExperimentError, match=re.escape(told)):
+        obey(session, command_of(json.dumps(command)))
+    session.advance(1)
+    fresh, _ = session_of("paper/a", tmp_path)
+    assert session.script.written(1) == fresh.script.written(1)
+
+
+def test_numbers_from_which_others_are_drawn_are_not_turned(tmp_path):
+    session, _ = session_of("modelling/ageing", tmp_path)
+    assert "fracture.failure" in session.script.numbers
+    with pytest.raises(pbdkit.ExperimentError, match=r"no number 'fracture\.scatter'"):
+        do(session, do="turn", name="fracture.scatter", value=0.1)
+
+
+def test_cuts_are_refused_where_the_rule_takes_none(tmp_path):
+    session, _ = session_of("material/gradient-layer", tmp_path)
+    line = {"from": [0.3, -1.0], "to": [0.3, 5.0]}
+    with pytest.raises(pbdkit.ExperimentError, match="does not go with such cuts"):
+        do(session, do="cut", **line)
+    session.advance(1)
+    assert not session.script.cuts
+
+
+def test_states_that_are_kept_take_no_more_room_than_they_may(tmp_path, monkeypatch):
+    session, _ = session_of("paper/a", tmp_path)
+    monkeypatch.setattr(history, "MOST", 16)
+    kept = history.History(session.state)
+    for step in range(1, 1000):
+        session.state.step = step
+        kept.keep(session.state)
+        assert len(kept.steps) <= 16
+    assert kept.steps[0] == 0
+    assert kept.steps[-1] > 900
+    monkeypatch.setattr(history, "ROOM", 7 * history._size(session.state))
+    kept.keep(replace(session.state, step=5000))
+    assert len(kept.steps) <= 7
+
+
+@pytest.mark.parametrize(
+    ("settings", "word", "told"),
+    [
+        ([], "stable", "shrinks to a thousandth in"),
+        (["solver.relaxation=1.3"], "diverging", "relaxation below 1"),
+        (["body.columns=60", "body.rows=60"], "slow", "memory"),
+        (["body.columns=90", "body.rows=90"], "unknown", "more than 4000 particles"),
+        (["leaders=[]", "frame.type=none"], "slow", "nothing holds it"),
+        (["neighbours={type: euclidean, radius: 1.1, reevaluate: true}"], "unknown", "spectrum"),
+    ],
+)
+def test_the_judgement_says_why(settings, word, told):
+    found = judged(pbdkit.load("paper/a", settings=settings))
+    assert (found.word, told in found.why) == (word, True), found
+
+
+def until(holds, seconds=20.0):
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it never came to that"
+        time.sleep(0.01)
+
+
+class Onlooker:
+    """A page without a browser, over a socket."""
+
+    def __init__(self, address):
+        self.line = connect(socket_of(address), origin=origin_of(address))
+
+    def __enter__(self):
+        self.socket = self.line.__enter__()
+        return self
+
+    def __exit__(self, *why):
+        self.line.__exit__(*why)
+
+    def do(self, **command):
+        self.socket.send(json.dumps(command))
+
+    def hear(self, kind, seconds=10.0):
+        while True:
+            message = self.socket.recv(timeout=seconds)
+            if isinstance(message, bytes):
+                if kind == "picture":
+                    return message
+            elif json.loads(message)["is"] == kind:
+                return json.loads(message)
+
+
+def socket_of(address):
+    return address.replace("http://", "ws://").replace("/?", "/socket?")
+
+
+def origin_of(address):
+    return address.split("/?")[0]
+
+
+@contextmanager
+def served(session):
+    conductor = Conductor(session)
+    conductor.start()
+    address, ends = [], []
+    known = threading.Event()
+
+    async def serve():
+        end = asyncio.Event()
+        ends.append((asyncio.get_running_loop(), end))
+        await SessionServer(conductor, "a body").run(
+            lambda found: (address.append(found), known.set()), end
+        )
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    assert known.wait(20)
+    try:
+        yield address[0]
+    finally:
+        loop, end = ends[0]
+        loop.call_soon_threadsafe(end.set)
+        thread.join()
+        conductor.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    session, _ = session_of("paper/a", tmp_path_factory.mktemp("live"))
+    with served(session) as found:
+        yield found
+
+
+def asked(address, headers=()):
+    """The status of a page."""
+    request = urllib.request.Request(address, headers=dict(headers))
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+STRANGERS = {
+    "no token": ("", {}),
+    "a wrong token": ("token=" + "A" * 43, {}),
+    "two tokens": ("token={token}&token={token}", {}),
+    "a foreign origin": ("token={token}", {"Origin": "http://evil.example"}),
+    "no origin at all": ("token={token}", {"Origin": "null"}),
+    "another port": ("token={token}", {"Origin": "http://127.0.0.1:1"}),
+    "https": ("token={token}", {"Origin": "https://{host}"}),
+    "a rebound host": ("token={token}", {"Host": "evil.example:{port}"}),
+    "a rebound host of its own origin": (
+        "token={token}",
+        {"Host": "evil.example:{port}", "Origin": "http://evil.example:{port}"},
+    ),
+    "a host without its port": ("token={token}", {"Host": "127.0.0.1"}),
+}
+
+
+def strange(address, query, headers):
+    host, token = origin_of(address).split("//")[1], address.split("token=")[1]
+    known = {"token": token, "host": host, "port": host.split(":")[1]}
+    there = f"{origin_of(address)}/?{query.format(**known)}"
+    return there, {name: value.format(**known) for name, value in headers.items()}
+
+
+@pytest.mark.parametrize("who", STRANGERS)
+def test_strangers_get_no_page(address, who):
+    assert asked(*strange(address, *STRANGERS[who])) == 403
+
+
+@pytest.mark.parametrize("who", [*STRANGERS, "no page at all"])
+def test_strangers_get_no_socket(address, who):
+    query, headers = STRANGERS.get(who, ("token={token}", {}))
+    there, headers = strange(address, query, headers)
+    if who != "no page at all":
+        headers = {"Origin": origin_of(address)} | headers
+    with pytest.raises(InvalidStatus) as refused, raw_socket(there, headers) as socket:
+        socket.recv(timeout=5)
+    assert refused.value.response.status_code == 403
+
+
+@contextmanager
+def raw_socket(address, headers):
+    """With the headers as they are given; the library would add a Host of its own."""
+    import websockets.sync.client as client
+
+    class Strange(client.ClientProtocol):
+        def connect(self):
+            request = super().connect()
+            for name, value in headers.items():
+                if name in request.headers:
+                    del request.headers[name]
+                request.headers[name] = value
+            return request
+
+    before, client.ClientProtocol = client.ClientProtocol, Strange
+    try:
+        with connect(socket_of(address)) as socket:
+            yield socket
+    finally:
+        client.ClientProtocol = before
+
+
+def test_who_knows_the_address_gets_the_page_and_nothing_else(address):
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        text, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
+    assert "http" not in re.sub(r"http://www.w3.org/2000/svg", "", text)
+    nonce = re.search(r"script-src 'nonce-([^']+)'", policy)[1]
+    assert f'nonce="{nonce}"' in text
+    assert "default-src 'none'" in policy
+    assert asked(address.replace("127.0.0.1", "localhost")) == 200
+    assert asked(address.replace("/?", "/etc/passwd?")) == 404
+
+
+def test_a_port_that_is_taken_is_said(address, tmp_path):
+    port = int(re.search(r":(\d+)/", address)[1])
+    with pytest.raises(pbdkit.ExperimentError, match=f"--port {port}: cannot be served at"):
+        live.main(["paper/a", "--no-browser", "--port", str(port)], standalone_mode=False)
+
+
+def test_nobody_looks_on_and_the_body_rests(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    with served(session) as there:
+        with Onlooker(there) as page:
+            page.do(do="play", on=True)
+            until(lambda: session.step > 3)
+        until(lambda: not session.running)
+
+
+class Gone:
+    """A socket whose other end has been left."""
+
+    async def send(self, message):
+        raise ConnectionClosed(None, None)
+
+
+def test_who_is_gone_is_told_nothing_and_nobody_minds():
+    async def told():
+        page = Page(asyncio.get_running_loop())
+        page.tell({"is": "note"})
+        await page.send(Gone())
+        return page
+
+    page = asyncio.run(told())
+    page.tell({"is": "note"})  # the loop is closed by now
+    assert page._waiting.empty()
+
+
+def test_tokens_are_never_the_same():
+    tokens = {Access(1).token for _ in range(20)}
+    assert len(tokens) == 20
+    assert min(map(len, tokens)) >= 43
+    assert Access(1).token not in repr(Access(1))
+
+
+def test_pages_that_say_nonsense_are_told_so_and_the_session_goes_on(address):
+    with Onlooker(address) as page, Onlooker(address) as other:
+        assert page.hear("scene")["count"] == 144
+        for nonsense in (
+            "",
+            "{",
+            "[]",
+            "\x00",
+            '{"do": []}',
+            "[" * 4000,
+            '{"do": "sing"}',
+            b"\xff",
+        ):
+            page.socket.send(nonsense)
+            assert "no command" in page.hear("error")["text"]
+        other.socket.send("x" * (LONGEST + 1))
+        with pytest.raises(ConnectionClosed, match="1009"):
+            other.hear("nothing")
+        page.do(do="seen")
+        page.do(do="step")
+        assert len(page.hear("picture")) >= 48 + 8 * 144
+
+
+def test_a_page_gets_the_newest_picture_and_only_when_it_is_ready(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    with served(session) as there, Onlooker(there) as page:
+        first = page.hear("picture")
+        page.do(do="play", on=True)
+        time.sleep(0.5)
+        page.do(do="seen")
+        second = page.hear("picture")
+        made = [int.from_bytes(picture[12:16], "little") for picture in (first, second)]
+        assert made[1] - made[0] > 5
+
+
+def test_a_notebook_sends_and_hears_what_a_page_does(monkeypatch, tmp_path):
+    sent = []
+    monkeypatch.setattr(
+        LiveWidget, "send", lambda self, message, buffers=None: sent.append((message, buffers))
+    )
+    widget = pbdkit.live("paper/a", output=tmp_path / "made.yaml")
+    assert "class LatticeView" in widget._esm
+    assert "export default { render }" in widget._esm
+    assert "import " not in re.sub(r"//.*|/\*.*?\*/", "", widget._esm, flags=re.S)
+    hear = widget._handle_custom_msg
+
+    def wait(kind):
+        until(lambda: any(one[0]["is"] == kind for one in sent))
+        return next(one for one in reversed(sent) if one[0]["is"] == kind)
+
+    hear({"do": "join"}, [])
+    assert wait("scene")[0]["name"] == "paper/a"
+    assert len(wait("picture")[1][0]) == 48 + 8 * 144 + 144 + len(widget.session.camera.bonds)
+    hear({"do": "step", "count": 3}, [])
+    until(lambda: widget.session.step == 3)
+    hear({"do": "save"}, [])
+    wait("saved")
+    hear({"do": "nonsense"}, [])
+    assert "no command" in wait("error")[0]["text"]
+    widget.close()
+    assert widget.session.step == 3
+
+
+CELL = """async ([esm, messages, picture]) => {
+  const address = URL.createObjectURL(new Blob([esm], { type: 'text/javascript' }));
+  const { default: widget } = await import(address);
+  const el = document.body.appendChild(document.createElement('div'));
+  let hear;
+  const asked = [];
+  const send = (message) => asked.push(message.do);
+  const model = { on: (name, act) => { hear = act; }, off: () => {}, send };
+  const close = widget.render({ model, el });
+  el.firstChild.style.height = '300px';
+  for (const message of messages) hear(message, []);
+  hear({ is: 'picture' }, [new DataView(Uint8Array.from(picture).buffer)]);
+  await new Promise((done) => setTimeout(done, 300));
+  const step = el.querySelector('.step').textContent;
+  close();
+  return [asked, step, el.childElementCount];
+}"""
+
+
+def test_the_module_of_a_notebook_shows_a_body_and_goes_again(page, tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(7)
+    messages = json.loads(json.dumps([scenery(session), standing(session)]))
+    picture = list(session.frame().encoded(None))
+    found = page.evaluate(CELL, [LiveWidget._esm, messages, picture])
+    assert found == [["join", "seen"], "step 7", 0]
+
+
+def test_what_is_missing_is_said_with_the_remedy(monkeypatch):
+    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda name: None)
+    for call in (lambda: pbdkit.live("paper/a"), lambda: live.main(["paper/a", "--no-browser"])):
+        with pytest.raises(pbdkit.ExperimentError, match=re.escape("pip install 'pbdkit[live]'")):
+            call()
+
+
+def until_page(page, expression):
+    """As `wait_for_function`, which the page's policy does not let evaluate."""
+    until(lambda: page.evaluate(expression))
+
+
+PLACE = """row => { const { view } = pbdkitLive;
+  return view.toClient(...view.positions.subarray(2 * row, 2 * row + 2)); }"""
+
+
+def test_a_page_in_a_browser_leads_turns_cuts_and_saves(page, tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    with served(session) as address:
+        page.goto(address)
+        until_page(page, "globalThis.pbdkitLive?.received >= 1 && pbdkitLive.step === 0")
+        page.get_by_role("button", name="Play").click()
+        until_page(page, "pbdkitLive.step > 20")
+        row = int(session.stage.scene.leading[0].rows[4])
+        leads_to(page, row, by=(60, -40))
+        turns(page, "solver.memory", 0.25)
+        assert page.locator(".judgement strong").inner_text() == "stable"
+        cuts(page)
+        page.get_by_role("button", name="Pause").click()
+        until_page(page, "!pbdkitLive.running")
+        page.get_by_role("button", name="Save as experiment").click()
+        until_page(page, "pbdkitLive.said.textContent.includes('made.yaml')")
+        with page.expect_download() as download:
+            page.get_by_role("link", name="Download").click()
+        assert Path(download.value.path()).read_text() == (tmp_path / "made.yaml").read_text()
+        page.keyboard.press("Home")
+        until_page(page, "pbdkitLive.step === 0")
+        page.goto("about:blank")
+    steps = pbdkit.load(tmp_path / "made.yaml").steps
+    session.rewind(steps)
+    assert session.step == steps
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+def leads_to(page, row, by):
+    x, y = page.evaluate(PLACE, row)
+    page.mouse.move(x, y)
+    assert page.evaluate("pbdkitLive.root.dataset.over") == "leader"
+    page.mouse.down()
+    page.mouse.move(x + by[0], y + by[1], steps=6)
+    close = f"""() => {{ const at = ({PLACE})({row});
+      return Math.hypot(at[0] - {x + by[0]}, at[1] - {y + by[1]}) < 1; }}"""
+    until_page(page, close)
+    page.mouse.up()
+
+
+def turns(page, name, value):
+    page.get_by_role("slider", name=name, exact=True).evaluate(
+        "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input')); }",
+        value,
+    )
+    until_page(page, f"Math.abs(pbdkitLive.now.numbers['{name}'] - {value}) < 1e-9")
+    until_page(page, "pbdkitLive.word.textContent !== '…'")
+
+
+def cuts(page):
+    page.get_by_role("button", name="Cut").click()
+    ends = [page.evaluate(PLACE, row) for row in (64, 91)]
+    page.mouse.move(*ends[0])
+    page.mouse.down()
+    page.mouse.move(*ends[1], steps=3)
+    page.mouse.up()
+    until_page(page, "pbdkitLive.view.broken.some((bit) => bit === 1)")
