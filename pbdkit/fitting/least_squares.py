@@ -1,0 +1,174 @@
+"""The parameters that fit best, how well they are known, and which of them the data cannot tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pbdkit.equilibrium.certificate import UnconvergedError
+from pbdkit.fitting.problem import At, Problem
+from pbdkit.stepping.state import Floats
+
+Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
+TELLS = 0.25
+"""A direction is told where its standard error is a smaller share of the way between bounds."""
+PART = 0.3
+"""A parameter belongs to a direction that has more of it."""
+AT_BOUND = 1e-6
+"""The share of the way between bounds by which a value stands on one."""
+MOST_TURNS, SMALLEST, SLACK = 30, 1e-3, 1e-9
+"""Of Gauss and Newton; the smallest share of a step that is taken; what rounding does to costs."""
+MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-13
+"""Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
+largest singular value below which one is none."""
+SETTLED = 1e-3
+"""The share of its standard error by which no unknown moves any more."""
+OUTLIERS = 1.345
+"""Residuals beyond so many times their noise count less, where a loss says so (Huber)."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best z with the problem there, the covariance of z, how much larger residuals are than
+    their noise, and by name the parameters that the data cannot tell, and those on their bounds."""
+
+    z: Floats
+    at: At
+    covariance: Floats
+    ratio: float
+    untold: tuple[str, ...]
+    on_bounds: tuple[str, ...]
+    evaluations: int
+
+    @property
+    def errors(self) -> Floats:
+        """The standard error of each z."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
+    """By Gauss and Newton with exact derivatives: the problem as it is linear at z is solved
+    between bounds, with its loss, until z stays where it is.
+
+    The covariance is (JᵀJ)⁻¹, or with a loss that of M-estimators (Huber), times the square of the
+    ratio where residuals are larger than their noise says (Birge). Raises UnconvergedError.
+    """
+    low, high = problem.bounds()
+    z = np.clip(start, low, high)
+    at, count = problem.at(z), 1
+    for _ in range(MOST_TURNS):
+        step = _linear_step(at, low - z, high - z, loss)
+        share = 1.0
+        while True:
+            there = problem.at(z + share * step)
+            count += 1
+            if _cost(there.residuals, loss) <= _cost(at.residuals, loss) * (1.0 + SLACK):
+                break
+            share /= 4.0
+            if share < SMALLEST:
+                raise UnconvergedError("the fit finds no way to fit better, and none to stay")
+        z, at = z + share * step, there
+        covariance, untold = _known(problem, at, loss)
+        if (np.abs(share * step) <= SETTLED * np.sqrt(np.diag(covariance))).all():
+            break
+    else:
+        raise UnconvergedError(f"the fit still moves after {MOST_TURNS} turns")
+    ratio = _spread(at.residuals, problem.size, loss)
+    covariance *= max(1.0, ratio) ** 2
+    return Solution(z, at, covariance, ratio, untold, _on_bounds(problem, z), count)
+
+
+def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
+    """What would fit best if residuals stayed linear: by least squares between bounds, weighted
+    anew until weights stay."""
+    from scipy.optimize import lsq_linear
+
+    size = np.linalg.norm(at.jacobian, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    scaled, y = at.jacobian / size, np.zeros(len(size))
+    for _ in range(1 if loss == "linear" else MOST_WEIGHTINGS):
+        weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
+        basis, triangle = np.linalg.qr(scaled * weight[:, None])
+        right = basis.T @ (at.residuals * weight)
+        before, y = y, np.linalg.lstsq(triangle, right, rcond=RANK)[0]
+        if (y < low * size).any() or (y > high * size).any():
+            y = lsq_linear(triangle, right, (low * size, high * size), tol=1e-14).x
+        if (np.abs(y - before) <= STEADY).all():
+            break
+    return np.asarray(y / size)
+
+
+def _weight(residuals: Floats, loss: Loss) -> Floats:
+    """How much each residual counts."""
+    z = np.square(residuals / OUTLIERS)
+    if loss == "linear":
+        return np.ones(len(z))
+    if loss == "huber":
+        return np.asarray(1.0 / np.sqrt(np.maximum(z, 1.0)))
+    return np.asarray(1.0 / np.sqrt(1.0 + z) if loss == "soft_l1" else 1.0 / (1.0 + z))
+
+
+def _cost(residuals: Floats, loss: Loss) -> float:
+    z = np.square(residuals / OUTLIERS)
+    if loss == "linear":
+        return float(z.sum())
+    if loss == "huber":
+        return float(np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0).sum())
+    return float((2.0 * (np.sqrt(1.0 + z) - 1.0) if loss == "soft_l1" else np.log1p(z)).sum())
+
+
+def _spread(residuals: Floats, unknowns: int, loss: Loss) -> float:
+    """The residuals' standard deviation in units of their noise; with a loss, by their median."""
+    if loss == "linear":
+        return float(np.sqrt(residuals @ residuals / max(1, len(residuals) - unknowns)))
+    return float(1.4826 * np.median(np.abs(residuals)))
+
+
+def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...]]:
+    """The covariance of z for residuals as large as their noise, and whom the data cannot tell.
+
+    Parameters count in the way between their bounds; what cannot be told is left at that way.
+    """
+    count = len(problem.unknowns)
+    scale = np.ones(problem.size)
+    scale[:count] = [u.span for u in problem.unknowns]
+    jacobian = at.jacobian * scale
+    rest = np.linalg.norm(jacobian[:, count:], axis=0)
+    jacobian[:, count:] /= np.where(rest > 0.0, rest, 1.0)
+    scale[count:] /= np.where(rest > 0.0, rest, 1.0)
+    _, sizes, ways = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    least = sizes.max(initial=0.0) * RANK
+    variance = np.array([1.0 / s**2 if s > least else np.inf for s in sizes])
+    variance *= _of_loss(at.residuals, loss)
+    own = ways[:, :count]
+    unsure = (variance > TELLS**2) & (np.abs(own).max(axis=1, initial=0.0) > PART)
+    untold = {n for row in own[unsure] for n in np.flatnonzero(np.abs(row) > PART).tolist()}
+    variance = np.minimum(variance, 1e12)
+    covariance = (ways.T * variance) @ ways * np.outer(scale, scale)
+    spread = np.sqrt(np.diag(covariance))[:count]
+    untold |= {n for n, u in enumerate(problem.unknowns) if spread[n] > TELLS * u.span}
+    return covariance, tuple(problem.unknowns[n].parameter.path for n in sorted(untold))
+
+
+def _of_loss(residuals: Floats, loss: Loss) -> float:
+    """By how much a loss makes the variance larger: mean ψ² / (mean ψ')², in units of the noise."""
+    if loss == "linear":
+        return 1.0
+    z = residuals / max(_spread(residuals, 0, loss), 1e-300) / OUTLIERS
+    if loss == "huber":
+        psi, slope = np.clip(z, -1.0, 1.0), np.abs(z) <= 1.0
+    elif loss == "soft_l1":
+        psi, slope = z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
+    else:
+        psi, slope = z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
+    return float(np.mean(psi**2) * OUTLIERS**2 / np.mean(slope) ** 2)
+
+
+def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:
+    found = []
+    for unknown, value in zip(problem.unknowns, z, strict=False):
+        if min(value - unknown.low, unknown.high - value) <= AT_BOUND * unknown.span:
+            found.append(unknown.parameter.path)
+    return tuple(found)

@@ -1,0 +1,142 @@
+"""The fit file: an experiment, what is unknown of it, and what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, model_validator
+
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.base import Base, base_source
+from pbdkit.experiment.columns import read_columns
+from pbdkit.experiment.kinds import FIT, of_kind
+from pbdkit.experiment.names import Version
+from pbdkit.experiment.parts import report
+from pbdkit.experiment.source import Source, read_file
+from pbdkit.interfaces.component import Strict, did_you_mean
+from pbdkit.stepping.state import Floats
+
+FOLDER = Path(__file__).parent.parent / "fits"
+Positive = Annotated[float, Field(gt=0.0)]
+Term = Annotated[
+    tuple[Annotated[int, Field(ge=0, le=4)], Annotated[int, Field(ge=0, le=4)]],
+    Field(strict=False),
+]
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+
+
+def _two(bounds: Pair) -> Pair:
+    if not bounds[0] < bounds[1]:
+        raise ValueError(f"needs two bounds, the lower first; got {list(bounds)}")
+    return bounds
+
+
+Bounds = Annotated[Pair, AfterValidator(_two)]
+
+
+class Distortion(Strict):
+    """What the measurement shows beside the displacement of the body, in its plane: polynomials of
+    x and y, by their exponents, each as much as fits. A camera that turns, a lens, and bending out
+    of the plane are such: `ux: [[2, 0]]` is a strain that rises evenly along x."""
+
+    ux: Annotated[tuple[Term, ...], Field(strict=False)] = ()
+    uy: Annotated[tuple[Term, ...], Field(strict=False)] = ()
+
+
+class MeasuredField(Strict):
+    """Displacements at scattered points, in lattice units or, with `units` in the experiment, in
+    what they say: the `columns` of a CSV `file` beside this one.
+
+    `noise` is the standard deviation of a displacement; without it that of the residuals is taken.
+    Points nearer to the outline of the body than `margin` are left out.
+    """
+
+    file: str
+    columns: Annotated[tuple[str, str, str, str], Field(strict=False)] = ("x", "y", "ux", "uy")
+    noise: Positive | None = None
+    margin: Annotated[float, Field(ge=0.0)] = 0.0
+    distortion: Distortion = Field(default_factory=Distortion)
+    _rows: Any = None
+
+    @model_validator(mode="after")
+    def _read(self, info: ValidationInfo) -> Self:
+        object.__setattr__(self, "_rows", np.array(read_columns(self.file, info, self.columns)))
+        return self
+
+    @property
+    def points(self) -> Floats:
+        """(point, axis)."""
+        return np.asarray(self._rows[:, :2])
+
+    @property
+    def displacements(self) -> Floats:
+        """(point, axis)."""
+        return np.asarray(self._rows[:, 2:])
+
+
+class Force(Strict):
+    """What a leader group carries, and how thick the body is: Young's modulus follows, in the unit
+    of the force over those of thickness and lattice."""
+
+    group: Annotated[int, Field(ge=0)]
+    value: Pair
+    thickness: Positive = 1.0
+    noise: Annotated[float, Field(ge=0.0)] = 0.0
+
+
+class Fit(Strict):
+    """Looks for the `unknown` parameters, between bounds, with which the equilibrium of an
+    experiment is nearest to what was measured.
+
+    Groups that move by `measured` are given `modes` smooth displacements along each axis, which
+    are estimated too; 0 takes what was measured there as it is. `loss` says how residuals count:
+    all but `linear` let outliers count less.
+    """
+
+    version: Version = 1
+    experiment: Base
+    unknown: Annotated[dict[str, Bounds], Field(min_length=1)]
+    measured: MeasuredField
+    force: Force | None = None
+    modes: Annotated[int, Field(ge=0, le=40)] = 6
+    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+
+
+def described_fit(
+    description: Mapping[str, Any] | str | Path, *, given: bool
+) -> tuple[Fit, Source]:
+    """The fit in a file, of a shipped name or in a dict, and the source of its experiment; none is
+    looked for where one is `given`. Raises ExperimentError."""
+    if isinstance(description, Mapping):
+        path, source = Path("fit"), Source("fit", dict(description), {}, Path())
+    else:
+        path = _file(str(description))
+        source = of_kind(FIT, read_file(path))
+    if given and isinstance(source.data, dict):
+        source = Source(
+            source.name, {"experiment": "", **source.data}, source.places, source.folder
+        )
+    try:
+        fit = Fit.model_validate(source.data, context={"folder": source.folder})
+    except ValidationError as error:
+        raise report(error, source) from None
+    return fit, source if given else base_source(path, fit.experiment, source)
+
+
+def shipped_fits() -> list[str]:
+    """The names of the fits that come along, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def _file(name: str) -> Path:
+    path = Path(name)
+    if path.is_file():
+        return path
+    if name in (names := shipped_fits()):
+        return FOLDER / f"{name}.yaml"
+    near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    hint = did_you_mean(name, [*near, *names])
+    raise ExperimentError(f"{name}: is no file and no shipped fit{hint} ({', '.join(names)})")

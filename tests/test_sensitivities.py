@@ -1,0 +1,229 @@
+"""How equilibria change with parameters: against complex steps, differences and closed forms."""
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium.system import one_thread
+from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.sensitivity import Resting
+from pbdkit.scene import homes
+from pbdkit.scene.guides import kinds_of_places
+from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.scene import build_scene, renumbered
+from pbdkit.stepping.followers import SlotFollowers
+
+H = 1e-30
+EIGHT = {"type": "chebyshev", "shells": 1}
+SHEET = {
+    "name": "sheet",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 6, "rows": 5},
+    "neighbours": EIGHT,
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+        {
+            "select": {"edge": "right"},
+            "motion": {"type": "rotation", "centre": [4.0, 1.0], "angle": 6.0, "steps": 1},
+        },
+    ],
+    "steps": 1,
+    "solver": {"type": "equilibrium", "tolerance": 1e-10},
+}
+ELASTIC = {"type": "elastic", "poisson_ratio": 0.3}
+RULES = {
+    "elastic": (ELASTIC, "rule.poisson_ratio", {}),
+    "plane strain": (ELASTIC | {"plane": "strain"}, "rule.poisson_ratio", {}),
+    "hexagonal": (
+        ELASTIC,
+        "rule.poisson_ratio",
+        {"lattice": {"type": "hexagonal", "a": 1.0}, "neighbours": {"type": "coordination"}},
+    ),
+    "orthotropic": (
+        {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.4, "shear_ratio": 0.3},
+        "rule.modulus_ratio",
+        {},
+    ),
+    "shear": (
+        {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.4, "shear_ratio": 0.3},
+        "rule.shear_ratio",
+        {},
+    ),
+    "mixed-coordinate": (
+        {"type": "mixed-coordinate", "K": -0.01},
+        "rule.K",
+        {"neighbours": {"type": "coordination"}},
+    ),
+}
+FRAMES = ("natural", "mean", "first", "none")
+
+
+class Complex(complex):
+    """A complex number that is compared, and judged finite, by its real part, as code for real
+    numbers does."""
+
+    def __float__(self):
+        return self.real
+
+
+def _wrapped(name):
+    def method(self, other):
+        found = getattr(complex, name)(self, other)
+        return Complex(found) if isinstance(found, complex) else found
+
+    return method
+
+
+for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv", "pow"):
+    setattr(Complex, f"__{_name}__", _wrapped(f"__{_name}__"))
+for _name in ("gt", "ge", "lt", "le"):
+    setattr(
+        Complex, f"__{_name}__", lambda self, other, n=_name: getattr(operator, n)(self.real, other)
+    )
+
+
+def by_complex_step(experiment, path, monkeypatch):
+    """∂u/∂θ from the functions of the rule alone, at θ + ih, and a dense matrix of their moves."""
+    scene = build_scene(experiment)
+    _, name = path.split(".")
+    resting = Resting.of(experiment)
+    state, frame = resting.state, scene.frame
+    place = np.flatnonzero(
+        kinds_of_places(scene.raster, scene.leading, experiment.steps) == FOLLOWER
+    )
+
+    def moves(scene, u):
+        flat = u.reshape(len(u), -1)
+        if frame and not np.iscomplexobj(u):  # else in line already
+            frame.follow(flat, flat)
+        found = SlotFollowers(scene).moves(u, state)
+        return found.reshape(len(u), -1)[:, place].ravel()
+
+    with np.errstate(all="ignore"):
+        here = moves(scene, state.u.copy())
+        columns = []
+        for n in range(2 * len(place)):
+            u = state.u.copy()
+            u.reshape(2, -1)[n // len(place), place[n % len(place)]] += 1.0
+            columns.append(here - moves(scene, u))
+        with monkeypatch.context() as patch:
+            patch.setattr(homes, "float", Complex, raising=False)
+            rule = experiment.rule.model_copy(
+                update={name: getattr(experiment.rule, name) + Complex(0.0, H)}
+            )
+            other = renumbered(scene, experiment.model_copy(update={"rule": rule}))
+            changed = moves(other, state.u.astype(complex)).imag / H
+    return np.linalg.solve(np.stack(columns, axis=1), changed), place
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("name", RULES)
+def test_derivatives_are_those_of_complex_steps(name, frame, monkeypatch):
+    rule, path, more = RULES[name]
+    calibrated = rule["type"] in ("elastic", "orthotropic")
+    if frame == "natural" and not calibrated:
+        frame = "mirror"
+    given = SHEET | {"rule": rule, "frame": {"type": frame}} | more
+    experiment = pbdkit.Experiment(**given)
+    with one_thread():
+        expected, place = by_complex_step(experiment, path, monkeypatch)
+    found = Resting.of(experiment).change(Parameter(path)).reshape(2, -1)[:, place].ravel()
+    assert np.abs(expected).max() > 1e-6
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 * np.abs(expected).max())
+
+
+LINEAR = {
+    "force": (
+        {"leaders": SHEET["leaders"][:1], "rule": ELASTIC, "frame": {"type": "natural"},
+         "loads": [{"select": {"edge": "right"}, "force": [0.01, -0.02]}]},
+        "loads.0.force.1",
+    ),
+    "displacement": (
+        {"leaders": [SHEET["leaders"][0], {"select": {"edge": "right"}, "motion":
+            {"type": "displace", "displacement": [0.1, 0.2]}}],
+         "rule": ELASTIC, "frame": {"type": "natural"}},
+        "leaders.1.motion.displacement.0",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_what_equilibria_are_linear_in_has_the_derivative_of_its_differences(name):
+    parts, path = LINEAR[name]
+    experiment = pbdkit.Experiment(**SHEET | parts)
+    parameter = Parameter(path)
+    here = Resting.of(experiment)
+    there = Resting.of(parameter.put(experiment, parameter.value_in(experiment) + 0.5))
+    difference = (there.state.u - here.state.u) / 0.5
+    np.testing.assert_allclose(here.change(parameter), difference, atol=1e-9)
+
+
+SMOOTH = {
+    "stiffness of a region": (
+        {"regions": {"core": {"type": "disc", "radius": 1.6, "centre": [3.2, 2.1]}},
+         "rule": ELASTIC | {"stiffness": {"otherwise": 1.0, "core": 4.0}},
+         "frame": {"type": "natural"}},
+        "rule.stiffness.core",
+    ),
+    "length": (
+        {"rule": {"type": "strain-gradient", "poisson_ratio": 0.2, "length": 0.6}},
+        "rule.length",
+    ),
+    "angle, springs": (
+        {"rule": {"type": "springs"}, "frame": {"type": "natural"}}, "leaders.1.motion.angle",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_derivatives_are_those_of_differences_of_equilibria(name):
+    parts, path = SMOOTH[name]
+    experiment, parameter = pbdkit.Experiment(**SHEET | parts), Parameter(path)
+    found = Resting.of(experiment).change(parameter)
+    expected = parameter.derivative(experiment, lambda e: Resting.of(e).state.u)
+    size = np.abs(expected).max()
+    assert size > 1e-5
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * size)
+
+
+def test_bonds_that_change_and_obstacles_are_refused():
+    torn = {"rule": ELASTIC, "frame": {"type": "natural"},
+            "fracture": {"type": "strain", "failure": 0.01}}  # fmt: skip
+    with pytest.raises(pbdkit.ExperimentError, match="bonds break or soften on the way"):
+        Resting.of(pbdkit.Experiment(**SHEET | torn))
+    indented = pbdkit.load("modelling/indentation", settings=["solver={type: equilibrium}"])
+    with pytest.raises(pbdkit.ExperimentError, match="leave the obstacles out"):
+        Resting.of(indented)
+
+
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        ("rule.poison_ratio", "there is no 'poison_ratio'"),
+        ("rule", "'rule' is no number"),
+        ("leaders.7.motion", "there is no '7'"),
+        ("rule.type", "is no number"),
+    ],
+)
+def test_what_is_no_number_of_the_experiment_is_refused(path, told):
+    experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC})
+    with pytest.raises(pbdkit.ExperimentError, match=told):
+        Parameter(path).value_in(experiment)
+
+
+def test_a_number_on_its_bound_has_no_derivative():
+    experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC | {"poisson_ratio": 0.5}})
+    with pytest.raises(pbdkit.ExperimentError, match="stands on its bound"):
+        Resting.of(experiment).change(Parameter("rule.poisson_ratio"))
+
+
+def test_a_number_that_decides_who_is_there_has_no_derivative():
+    experiment = pbdkit.Experiment(
+        **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
+    )
+    with pytest.raises(pbdkit.ExperimentError, match="which particles there are"):
+        Resting.of(experiment).change(Parameter("body.width"))
