@@ -41,7 +41,9 @@ write_scripts(SCRIPTS)
 sphinx_gallery_conf = {
     "examples_dirs": str(SCRIPTS),
     "gallery_dirs": "gallery",
-    "matplotlib_animations": True,
+    "matplotlib_animations": (True, "html5"),
+    "reset_modules": ("matplotlib", "gallery_scripts.with_ffmpeg"),
+    "capture_repr": (),
     "remove_config_comments": True,
     "show_memory": False,
     "download_all_examples": False,

@@ -7,6 +7,10 @@ import shlex
 import textwrap
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from imageio_ffmpeg import get_ffmpeg_exe
 
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 
@@ -74,6 +78,11 @@ def script_of(name: str) -> str:
         movie=MOVIE.format(color=f'color="{color}"' if color else "") if records else "",
         file=textwrap.indent(given, "#     ", lambda _: True).rstrip(),
     )
+
+
+def with_ffmpeg(gallery_conf: dict[str, Any], script: str) -> None:
+    """Tells matplotlib, whose settings are new for each script, what codes movies."""
+    mpl.rcParams["animation.ffmpeg_path"] = get_ffmpeg_exe()
 
 
 def asked(text: str) -> tuple[str, list[int]]:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     # `as`: type checkers of those who say `import pbdkit` then find the names.
     from pbdkit.api import (
         analyse as analyse,
+        fit as fit,
         identify as identify,
         load as load,
         rerun as rerun,
@@ -86,8 +87,10 @@ if TYPE_CHECKING:
         squared_length as squared_length,
         where as where,
     )
+    from pbdkit.pages.report import report as report
     from pbdkit.registry.discovery import hookimpl as hookimpl
-    from pbdkit.results.accessor import open as open
+    from pbdkit.results.result_file import open as open
+    from pbdkit.sessions.calling import live as live
     from pbdkit.sweeps.concatenation import concat as concat
 
 _HOME = {
@@ -104,10 +107,12 @@ _HOME = {
         "StartsCracked Stiffness StoresEnergy TurnsParticles Variable Vector dot length "
         "squared_length where"
     ),
+    "pbdkit.pages.report": "report",
     "pbdkit.registry.discovery": "hookimpl",
-    "pbdkit.results.accessor": "open",
+    "pbdkit.results.result_file": "open",
+    "pbdkit.sessions.calling": "live",
     "pbdkit.sweeps.concatenation": "concat",
-    "pbdkit.api": "analyse identify load rerun resume run sweep",
+    "pbdkit.api": "analyse fit identify load rerun resume run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 

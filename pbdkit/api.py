@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.errors import DivergedError, PbdkitWarning
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
@@ -18,6 +18,7 @@ from pbdkit.prediction.analysis import Analysis
 from pbdkit.prediction.forecast import refuse_too_much_output
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.carried import carried
+from pbdkit.results.carried import experiment_of as experiment_of
 from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
@@ -27,6 +28,7 @@ from pbdkit.scene.scene import build_scene
 if TYPE_CHECKING:
     import xarray
 
+    from pbdkit.fitting.fitted import Fitted
     from pbdkit.identity.identity import Identity
 
 Components = Iterable[type[Component]]
@@ -57,7 +59,7 @@ def run(experiment: Given, *, components: Components = (), progress: bool = True
     with pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
     diverge, and a last state that is inside out.
     """
-    return _run(_experiment(experiment, components), progress)
+    return _run(as_experiment(experiment, components), progress)
 
 
 def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
@@ -83,7 +85,7 @@ def _warn(texts: Iterable[str]) -> None:
 def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
-    return Analysis(tuned(build_scene(_experiment(experiment, components))))
+    return Analysis(tuned(build_scene(as_experiment(experiment, components))))
 
 
 def identify(experiment: Given, *, components: Components = ()) -> Identity:
@@ -95,7 +97,7 @@ def identify(experiment: Given, *, components: Components = ()) -> Identity:
     """
     from pbdkit.identity.identification import identified
 
-    first = next(iter(_experiment(experiment, components).materials().values()))
+    first = next(iter(as_experiment(experiment, components).materials().values()))
     return identified(tuned(build_scene(first)))
 
 
@@ -122,7 +124,7 @@ def resume(
     and, unless `anyway`, where the experiment, pbdkit or a plugin changed since; StorageError for a
     damaged store or disk; DivergedError, as `run` does, with no dataset: the file holds it.
     """
-    from pbdkit.results.accessor import open
+    from pbdkit.results.result_file import open
     from pbdkit.runs.resumption import resumption
 
     path = Path(output)
@@ -171,28 +173,37 @@ def sweep(
     """
     from pbdkit.sweeps.calling import called
 
-    given = _experiment(experiment, ())
+    given = as_experiment(experiment, ())
     parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
     return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
 
 
-def experiment_of(dataset: xarray.Dataset, components: Components = ()) -> Experiment:
-    """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
-    it wants components that are not there."""
-    parts = carried(dataset, "experiment")
-    if not parts:
-        raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")
-    source = Source("dataset", parts)
+def fit(
+    description: Mapping[str, Any] | str | Path,
+    *,
+    experiment: Given | None = None,
+    components: Components = (),
+) -> Fitted:
+    """Parameters of an experiment from what was measured, with their uncertainty.
+
+    `description` is a fit file, the name of a shipped one, or a dict of the same; `experiment`
+    takes the place of its own. Raises ExperimentError and PluginError, and DivergedError where no
+    fit is found.
+    """
+    from pbdkit.equilibrium.certificate import UnconvergedError
+    from pbdkit.fitting.calling import fit_experiment
+    from pbdkit.fitting.specification import described_fit
+
+    asked, source = described_fit(description, given=experiment is not None)
+    found = as_experiment(experiment, components) if experiment is not None else None
     try:
-        return Experiment.build(source, components)
-    except ExperimentError as error:
-        given = carried(dataset, "plugins").get(GIVEN)
-        if given is None or components:
-            raise
-        raise ExperimentError(f"{error}; it was run with components=[...]: {given}") from None
+        return fit_experiment(asked, found or Experiment.build(source, components))
+    except UnconvergedError as error:
+        raise DivergedError(str(error)) from None
 
 
-def _experiment(given: Given, components: Components) -> Experiment:
+def as_experiment(given: Given, components: Components) -> Experiment:
+    """The experiment that is given in one of these ways."""
     if isinstance(given, Experiment):
         Registry(components)  # what is handed over is checked, needed or not
         return given

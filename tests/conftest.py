@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from browser import browser, page  # noqa: F401  # fixtures
 from hypothesis import settings
 from interpreted_kernels import interpreting
 
@@ -54,6 +55,14 @@ class Result(NamedTuple):
 
 
 Call = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True)
+def _figures_are_closed() -> Iterator[None]:
+    """pyplot keeps its figures, and warns of many."""
+    yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
 
 
 @pytest.fixture

@@ -23,9 +23,14 @@ ORDER = [
     "prediction",
     "runs",
     "sweeps",
+    "fitting",
+    "drawing",
+    "accessor",
     "api",
     "bench",
     "testing",
+    "pages",
+    "sessions",
     "cli",
 ]
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)

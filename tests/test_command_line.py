@@ -17,7 +17,7 @@ import pytest
 import xarray
 
 import pbdkit
-from pbdkit.cli import COMMANDS
+from pbdkit.cli import COMMANDS, FIRST, GROUPS
 
 Call = Callable[..., Any]
 Probing = Callable[..., None]
@@ -38,6 +38,23 @@ PROBED = ("run", "e.json", "--set", "diagnostics=[{type: probe}]")
 def test_every_command_explains_itself(call: Call) -> None:
     listed = python("-m", "pbdkit", "--help").stdout
     assert [c for c in COMMANDS if c not in listed or call(c, "--help").code] == []
+
+
+def test_alone_it_says_what_to_type_first(call: Call) -> None:
+    result = call()
+    assert (result.code, result.err) == (0, "")
+    assert [name for name in COMMANDS if f"\n  {name} " not in result.out] == []
+    for group in GROUPS:
+        assert f"\n{group}:\n" in result.out
+    assert max(map(len, result.out.splitlines())) <= 80
+    sentences = [one.does for group in GROUPS.values() for one in group]
+    assert [does for does in sentences if does[0].islower() or does[-1] != "."] == []
+
+
+def test_what_is_to_be_typed_first_works(call: Call) -> None:
+    for typed in FIRST:
+        assert call(*typed.removeprefix("pbdkit ").split()).code == 0
+    assert left() == ["experiment.yaml", "paper-a.nc", "paper-a.png"]
 
 
 def test_run_writes_the_file_it_names(call: Call) -> None:
@@ -76,6 +93,78 @@ def test_check_warns_and_is_content(call: Call) -> None:
     assert (result.code, "warning: leaders: there are none" in result.out) == (0, True)
 
 
+def said_by_check(call: Call, *arguments: str) -> dict[str, str]:
+    """The lines by their first word, after the first."""
+    lines = call("check", *arguments).out.splitlines()[1:]
+    return {title: text for title, _, text in (line.strip().partition(" ") for line in lines)}
+
+
+def test_check_says_first_who_is_held_and_led_and_what_will_happen(call: Call) -> None:
+    said = {title: text.strip() for title, text in said_by_check(call, "e.json").items()}
+    assert said["body"] == "12 particles over 3 × 2 lattice units, and 18 of the frame"
+    assert said["supports"] == "leaders.0, 3 particles (edge left)"
+    assert said["leaders"] == "leaders.1, 3 particles (edge right) by velocity until step 3"
+    assert said["stable"].startswith("yes (spectral radius 0.")
+    assert said["settles"].endswith(" steps; the 10 asked for reach neither")
+    assert said["takes"].startswith("less than a second of stepping, ")
+    assert len(call("check", "e.json").out.splitlines()) <= 12
+    whole = call("check", "e.json", "--verbose").out
+    assert call("check", "e.json").out.splitlines() == whole.splitlines()[: len(said) + 1]
+    assert "bonds      31" in whole
+
+
+def test_check_says_what_is_loaded_and_what_regions_hold(call: Call) -> None:
+    said = said_by_check(call, "modelling/composite-plate")
+    assert said["regions"].strip() == "steel, 197 particles"
+    assert said["loads"].strip().startswith("loads.0, 41 particles (edge right) force [")
+    assert said["supports"].strip() == (
+        "leaders.0, 41 particles (edge left) along x; leaders.1, 1 particle along y"
+    )
+    assert "stable" not in said  # no steps are made
+    assert said["solver"].strip().startswith("goes straight to the equilibrium")
+
+
+def test_check_names_few_of_many_groups(call: Call) -> None:
+    held = ", ".join(
+        f"{{select: {{numbers: [{n}]}}, motion: {{type: hold}}}}" for n in (7, 8, 9, 12, 13)
+    )
+    setting = f"leaders=[{held}]"
+    said = said_by_check(call, "e.json", "--set", setting)["supports"]
+    assert said.strip().endswith("leaders.2, 1 particle; and 2 more")
+    assert "leaders.4" in said_by_check(call, "e.json", "--verbose", "--set", setting)["supports"]
+
+
+def test_check_says_that_a_run_diverges_or_is_long_enough(call: Call) -> None:
+    said = said_by_check(call, "e.json", "--set", "solver.relaxation=3")
+    assert said["stable"].strip().startswith("NO, some modes grow (spectral radius ")
+    assert "settles" not in said
+    said = said_by_check(call, "e.json", "--set", "steps=100000")
+    assert said["settles"].endswith("the 100000 asked for reach 1e-6")
+    said = said_by_check(call, "e.json", "--set", "solver.settle.tolerance=1e-3")
+    assert said["settles"].endswith("when it has settled, after 10 at the latest")
+
+
+def test_identify_says_the_verdict_and_the_constants_first(call: Call) -> None:
+    settings = ("--set", "rule={type: springs}", "--set", "neighbours.type=chebyshev")
+    lines = call("identify", "e.json", *settings).out.splitlines()
+    titles = [line[:22].strip() for line in lines[1:] if line.strip() and "note" not in line]
+    constants = ["elastic constants", "Poisson's ratio", "relaxation"]
+    assert titles == ["it is", "spacing h", *constants]
+    whole = call("identify", "e.json", "--verbose", *settings).out
+    assert {*lines} < {*whole.splitlines()}
+    for title in ("fast long waves", "gradient length²", "eigenvalues", "rests at free edges"):
+        assert f" {title} " in whole
+
+
+def test_identify_says_what_materials_have_in_common_once(call: Call) -> None:
+    other = call("identify", "modelling/composite-plate").out
+    assert (other.count("it is"), other.count("note")) == (2, 1)
+    alike = "rule.poisson_ratio={otherwise: 0.3, steel: 0.3}"
+    result = call("identify", "modelling/composite-plate", "--set", alike).out
+    assert result.startswith("modelling/composite-plate: elastic (otherwise, steel), square")
+    assert result.count("it is") == 1
+
+
 def test_an_existing_output_is_kept_unless_forced(call: Call) -> None:
     OUT.write_text("mine")
     message = "pbdkit: tensile.nc: exists; --force replaces it, -o names another file\n"
@@ -86,6 +175,8 @@ def test_an_existing_output_is_kept_unless_forced(call: Call) -> None:
 
 
 WRONG = {
+    "an experiment as command": (2, ["paper/a"], "there is no command 'paper/a'; `pbdkit run paper/a` runs it"),
+    "no command at all": (2, ["qqqqqq"], "there is no command 'qqqqqq'; `pbdkit` alone lists them"),
     "unknown command": (2, ["rnu"], "there is no command 'rnu'; did you mean 'run'?"),
     "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
     "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "--set steps=0: steps: "),
@@ -303,6 +394,18 @@ def test_the_shells_of_the_documentation_are_known() -> None:
         command = [sys.executable, "-m", "pbdkit"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
         assert (done.returncode, "_pbdkit_completion" in done.stdout) == (0, True)
+
+
+def test_titles_of_experiments_are_whole_sentences(call: Call) -> None:
+    listed = call("experiments").out.splitlines()
+    assert "paper/a                        A square sheet is pulled at" in "\n".join(listed)
+    assert all(line.endswith(".") and len(line) < 160 for line in listed)
+
+
+def test_a_group_alone_shows_its_help(call: Call) -> None:
+    result = call("plugins")
+    assert (result.code, result.err) == (0, "")
+    assert result.out.startswith("Usage: pbdkit plugins")
 
 
 def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:

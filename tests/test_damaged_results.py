@@ -73,7 +73,7 @@ def test_a_crafted_file_is_drawn_or_refused_in_a_line(name: str, sound: Path, ca
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:
         CRAFTED[name](file)
-    for arguments in (["explain"], ["plot", "--color", "pe1"]):
+    for arguments in (["explain"], ["plot", "--color", "pe1"], ["report", "--force"]):
         result = call(arguments[0], "crafted.nc", *arguments[1:])
         assert result.code in (0, 2, 6), result.err
         assert len(result.err) < 1000

@@ -2,15 +2,18 @@
 
 import re
 import shlex
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from click import Context
 from click.testing import CliRunner
 
 import pbdkit
-from pbdkit.cli import program
+from pbdkit.cli import COMMANDS, program
 from pbdkit.experiment.source import read_text
 
 ROOT = Path(__file__).parent.parent
@@ -83,16 +86,27 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
     (experiment,) = (c for p, c in (b.values for b in blocks("yaml")) if p.name == "README.md")
     Path("tensile.yaml").write_text(experiment)
     save_experiments(page)
-    if "plot" in code:
+    if "$ pbdkit plot" in code:
         assert "pbdkit run" in code
     for line in code.splitlines():
         if not line.startswith("$ pbdkit "):
+            continue
+        if line.startswith("$ pbdkit live "):
+            assert_served_until_interrupted(line.removeprefix("$ "))
             continue
         result = CliRunner().invoke(program, shlex.split(line.removeprefix("$ pbdkit ")))
         if "barycenter" in line:
             assert "did you mean 'barycentre'?" in str(result.exception)
         else:
             assert result.exit_code == 0, (line, result.output, result.exception)
+
+
+def assert_served_until_interrupted(line):
+    command = [sys.executable, "-m", *shlex.split(line)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
+        assert "http://127.0.0.1:" in served.stdout.readline()
+        served.send_signal(signal.SIGINT)
+        assert served.wait(20) == 0
 
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
@@ -109,3 +123,76 @@ def test_readme_lists_the_two_commands_that_ci_runs():
         ".venv/bin/pbdkit run paper/a",
         ".venv/bin/pytest -n auto --dist worksteal",
     ]
+
+
+FENCES = {"python", "yaml", "console", "sh", "toml", "{code-cell}", "{toctree}", "{eval-rst}",
+          "{glossary}", "text"}  # fmt: skip
+"""The kinds of blocks. The first three run above; `toml` is read by `test_extending`, those in
+braces by the builder of the site, cells above too. `text` is what a terminal shows of a run that
+others stop: `test_resume` has it."""
+SHELL = [
+    *PAGES,
+    *NOTEBOOKS,
+    ROOT / "CONTRIBUTING.md",
+    *sorted(ROOT.glob("plugins/*/README.md")),
+]
+ELSEWHERE = {
+    "python3 -m venv .venv": "`.ci/run` runs both of the README",
+    "bash .ci/run": "it runs this test",
+    "pytest": "this is a test; sessions of nox run those of plugins",
+    "ruff": "the session `lint` of nox",
+    "mypy": "the session `lint` of nox",
+    "nox": "`.ci/run` calls its sessions",
+    "pre-commit": "writes into the repository's own hooks",
+    "pip install": "`test_new_plugin` and the session `plugins` of nox install so",
+    "python tests/reliability/": "`test_reliability` runs short samples",
+    "python tests/benchmarks": "takes an hour; `test_bench` runs what it is made of",
+    "python docs/reproduction": "takes half an hour; `test_reproduction` runs what it measures",
+    "python experiments/": "minutes each; the tests of the plugins run what they show",
+    "python -m build": "`test_distribution` builds",
+    "twine upload": "publishes",
+    "pbdkit plugins new": "`test_new_plugin`",
+    "pbdkit run pbdkit-mine/example.yaml": "`test_new_plugin`",
+    "pbdkit plugins check pbdkit-lazy": "`test_extending`",
+    "pbdkit run paper/a --set 'rule={type: lazy}'": "`test_extending`",
+    "pbdkit run experiments/": "the tests of the plugins",
+    "pbdkit plot kagome-tensile.nc": "the tests of the plugins",
+    "pbdkit explain weibull-sheet.nc": "the tests of the plugins",
+    "pbdkit bench": "minutes each; `test_bench` and `test_equilibrium_bench` run smaller ones",
+    "#SBATCH": "a line for the queue",
+    "pbdkit resume sheet.nc || pbdkit run sheet.yaml": "`test_resume`",
+    'eval "$(_PBDKIT_COMPLETE': "`test_command_line` asks for completions",
+}
+"""What commands in pages are not run here begin with, and who runs them, or why nobody does."""
+COMMAND = re.compile(r"^ {4}((?:pbdkit|python3?|pip|pytest|nox|bash|eval|ruff|mypy|pre-commit) .*)")
+
+
+def commands(page):
+    """The lines of shell blocks, and of indented ones that begin with a program's name."""
+    text = page.read_text()
+    fenced = re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+    outside = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    indented = (found[1] for line in outside.splitlines() if (found := COMMAND.match(line)))
+    return [*"\n".join(fenced).splitlines(), *indented]
+
+
+@pytest.mark.parametrize("page", SHELL, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_every_block_is_run_somewhere(page):
+    fences = re.findall(r"^ *```(\S*)", page.read_text(), re.M)
+    assert {fence for fence in fences if fence} <= FENCES
+    assert len(fences) % 2 == 0
+    assert all(fences[::2]), "a block says what it is"
+    left = [c for c in commands(page) if c.strip() and not c.startswith(tuple(ELSEWHERE))]
+    assert left == []
+
+
+@pytest.mark.parametrize("page", SHELL, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_commands_that_are_not_run_here_could_be(page):
+    """Their options are known, and they name files that are there."""
+    for line in commands(page):
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["pbdkit"] and "||" not in words and words[1] in COMMANDS:
+            command = program.get_command(None, words[1])
+            command.make_parser(Context(command)).parse_args(words[2:])
+        if words[:1] == ["python"] and not words[1].startswith("-"):
+            assert any((folder / words[1]).exists() for folder in (ROOT, page.parent)), line

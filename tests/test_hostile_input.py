@@ -255,8 +255,8 @@ def test_points_far_from_the_body_are_warned_of() -> None:
     far = {"select": {"nearest": [[100.0, 100.0], [9.4, 3.0]]}, "motion": {"type": "hold"}}
     (warning,) = [w for w in checked(leaders=[far])[0].warnings if "nearest" in w]
     assert warning == (
-        "leaders.0.select.nearest: (100, 100) lies far from the body; the particle that leads is "
-        "at (9, 9)"
+        "leaders.0.select.nearest: (100, 100) lies 128.7 away from the body; the particle nearest "
+        "to it is 131, at (9, 9)"
     )
 
 

@@ -165,7 +165,7 @@ def test_check_says_the_lag_and_warns_of_a_large_one(call, speed, warned):
     steady, reached = (float(speed) / 0.35 * x for x in (7.0648, 2.0426))
     assert figures["lag"] == pytest.approx(steady, rel=1e-4)
     assert figures["lag_reached"] == pytest.approx(reached, rel=1e-4)
-    said = call(*arguments).out
+    said = call(*arguments, "--verbose").out
     assert (
         f"lag        {steady:.4g} lattice units behind equilibrium if the leaders' fastest steps "
         f"went on, {reached:.4g} when they end"
@@ -189,7 +189,7 @@ def test_the_speed_that_is_advised_keeps_the_lag_below_a_bond():
 def test_check_says_nothing_of_lag_where_there_is_none(call):
     figures = json.loads(call("check", "stability/oscillation", "--json").out)
     assert figures["lag"] is figures["lag_reached"] is None
-    assert "behind equilibrium" not in call("check", "stability/oscillation").out
+    assert "behind equilibrium" not in call("check", "stability/oscillation", "--verbose").out
 
 
 def test_case_22_bonds_of_a_fast_test_stretch_nine_times_as_far_as_in_equilibrium():

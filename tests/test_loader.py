@@ -35,17 +35,24 @@ EVERY_COMMAND = {
     "experiments": ["experiments"],
     "init": ["init", "new.yaml"],
     "plot": ["plot", "made.nc"],
+    "animate": ["animate", "made.nc", "-o", "made.gif", "--every", "10"],
+    "curve": ["curve", "torn.nc", "broken-bonds"],
+    "export": ["export", "torn.nc"],
+    "report": ["report", "torn.nc"],
     "explain": ["explain", "torn.nc"],
     "verify": ["verify", "torn.nc"],
     "identify": ["identify", "e.json", HEALTHY],
     "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
+    "live": ["live", "--help"],  # else it serves until somebody ends it
+    "fit": ["fit", "--help"],  # `test_fit` carries some out
     "plugins": ["plugins", "list"],
     "schema": ["schema", "experiment"],
     "schema dataset": ["schema", "dataset"],
     "plugins new": ["plugins", "new", "pbdkit-fresh"],
     "plugins json": ["plugins", "list", "--json"],
 }
-CHEAP = [name for name in EVERY_COMMAND if name not in ("bench", "plot")]
+DEAR = {"bench", "plot", "animate", "curve", "report"}
+CHEAP = [name for name in EVERY_COMMAND if name not in DEAR]
 """Those that take no second, for each kind of fault."""
 
 

@@ -43,7 +43,7 @@ OUT = Path("out.nc")
     [
         "kill_runs.py --trials 8 --kinds breaking",
         "two_writers.py --trials 3 --kinds small",
-        "mutate_stores.py --trials 4 --kinds breaking",
+        "mutate_stores.py --trials 2 --kinds breaking",
         "equilibria.py fracture --trials 3",
         "equilibria.py certificates --trials 5",
     ],

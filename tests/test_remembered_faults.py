@@ -243,7 +243,7 @@ def test_nothing_is_kept_where_nothing_is_remembered():
     assert state.bond_values == state.particle_values == ()
 
 
-def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch):
+def test_bonds_that_never_come_to_rest_are_no_equilibrium(monkeypatch, interpreted):
     class Restless(Weakest):
         type: Literal["restless"] = "restless"
 

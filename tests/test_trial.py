@@ -29,7 +29,6 @@ def bare(folder):
 
 NO_RESULTS = {
     "picture.jpeg": b"\x89PNG\r\n\x1a\n" + bytes(100),
-    "notes.txt": b"name: x\n",
     "empty.nc": b"",
     "short.nc": BEGINNINGS[0][:5],
 }
@@ -50,7 +49,7 @@ def test_an_experiment_a_folder_and_nothing_are_no_results(call):
     result = call("verify", "e.json", "kept", "gone.nc", "/dev/null")
     assert result.code == 6
     assert result.out.splitlines() == [
-        "e.json: is no result of pbdkit: it begins as no netCDF file does",
+        "e.json: is an experiment; `pbdkit run e.json` makes a result of it, and says where",
         "kept: is a folder, no result of pbdkit",
         "gone.nc: there is no such file",
         "/dev/null: is no plain file, and no result of pbdkit",

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.drawing.labels import counted_in
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import units as units_module
@@ -18,7 +19,6 @@ from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Units
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
 from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.snapshot import counted_in
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
 

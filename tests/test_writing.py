@@ -74,6 +74,18 @@ def test_large_values_are_written_in_order_by_one_other_thread():
     assert len(inner.threads - {threading.main_thread()}) == 1
 
 
+def test_what_is_known_at_the_end_may_be_large():
+    """As when every bond of a large body broke is."""
+    inner = Noting()
+    sink = OverlappingSink(inner)
+    sink.begin([], {}, {})
+    sink.put({"a": LARGE})
+    sink.note_end(None)
+    sink.put({"b": LARGE})
+    sink.finish({})
+    assert inner.calls == ["begin", "a", "end", "b", "finish"]
+
+
 def test_memory_stays_bounded_when_the_disk_is_slow():
     inner = Noting()
     inner.gate.clear()

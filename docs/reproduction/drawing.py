@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -18,14 +18,42 @@ from matplotlib.tri import Triangulation
 from PIL import Image
 from runs import Floats, Sheet
 
-from pbdkit.results.picture import INK, KINDS, LINE
-from pbdkit.results.snapshot import Snapshot, take_snapshots
+from pbdkit.drawing.layers import INK, LINE
+from pbdkit.drawing.mesh import triangles_of, whole
+from pbdkit.drawing.palette import KINDS
+from pbdkit.drawing.recording import Recording
 
 FOLDER = Path(__file__).parent.parent / "pictures" / "reproduction"
 DPI, PAGE_IN, COLOURS = 130, 7.4, 128
 CONTOURS, DETAILED = "YlOrRd", 1000
 MEANINGS = {"pe1": "PE1", "pe2": "PE2", "pe1_intact": "PE1, intact bonds", "u": "|u|"}
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One step: positions, kinds and values of particles, the rows of both ends of whole bonds, and
+    of the corners of triangles without a broken side."""
+
+    position: Floats
+    kind: np.ndarray
+    values: Floats
+    bonds: np.ndarray
+    triangles: np.ndarray
+
+
+def shots_of(sheet: Sheet, steps: Sequence[int], color: str) -> list[Shot]:
+    """Recorded steps, with that variable."""
+    recording = Recording(sheet.ds, color)
+    body = recording.body
+    rows = np.flatnonzero(body.inside)
+    triangles = rows[triangles_of(body.reference[rows])]
+    shots = []
+    for now in recording.snapshots([recording.row(step) for step in steps]):
+        kept = whole(triangles[:, [0, 1, 2, 2]], body.ends[now.broken], len(body.reference))
+        bonds = body.ends[~now.broken]
+        shots.append(Shot(now.position, now.kind, now.values, bonds, triangles[kept]))
+    return shots
 
 
 def save(figure: Figure, name: str, folder: Path = FOLDER) -> str:
@@ -43,7 +71,7 @@ def configurations(
 ) -> str:
     """Panels of the steps paper time - 1, each with its own scale of the variable. Its contours
     lie over the sheet as it is; where that folds, over it at `rest`, or over `nothing`."""
-    shots = take_snapshots(sheet.ds, [time - 1 for time in times], color, True)
+    shots = shots_of(sheet, [time - 1 for time in times], color)
     low = np.min([s.position.min(axis=0) for s in shots], axis=0) - 0.8
     high = np.max([s.position.max(axis=0) for s in shots], axis=0) + 0.8
     width, height = high - low
@@ -70,12 +98,10 @@ def configurations(
     return save(figure, name)
 
 
-def _configuration(ax: Axes, shot: Snapshot, color: str) -> None:
+def _configuration(ax: Axes, shot: Shot, color: str) -> None:
     """One panel: contours over the unbroken body, bonds, kinds, a scale where it is not flat."""
-    values = shot.shown_values()
+    values = shot.values[np.unique(shot.triangles)]
     top = float(values.max()) if len(values) else 0.0
-    assert shot.values is not None
-    assert shot.triangles is not None
     if top > 1e-12:
         levels = ticker.MaxNLocator(8).tick_values(0.0, top)
         norm = BoundaryNorm(levels, 256)
@@ -104,7 +130,7 @@ def abreast(
     box: tuple[float, float, float, float],
 ) -> str:
     """One recorded step of several runs, side by side in one box, each with its own scale."""
-    shots = [take_snapshots(sheet.ds, [step], color, True)[0] for sheet in sheets.values()]
+    shots = [shots_of(sheet, [step], color)[0] for sheet in sheets.values()]
     left, right, bottom, top = box
     wide = PAGE_IN / len(shots)
     tall = (wide - 0.8) * (top - bottom) / (right - left) + 0.55

@@ -7,6 +7,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -16,15 +17,68 @@ from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.scene.memory import refuse_little_memory
 
-MODULES = {
-    "run": "run resume",
-    "sweep": "sweep",
-    "experiments": "check identify experiments init schema bench",
-    "result": "plot explain status verify",
-    "plugins": "plugins",
+COMPLETING = "_PBDKIT_COMPLETE"
+"""The variable in which a shell asks how a line goes on."""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A command, the module of pbdkit.cli in which it stands, and what it does, in a sentence."""
+
+    name: str
+    module: str
+    does: str
+
+
+GROUPS = {
+    "Start": (
+        Listed("init", "experiments", "Writes a commented experiment to start from."),
+        Listed("experiments", "experiments", "Lists the experiments that come along."),
+    ),
+    "Run": (
+        Listed("run", "run", "Runs an experiment, and writes its result to a file."),
+        Listed("resume", "run", "Goes on with an interrupted run, or makes one longer."),
+        Listed("status", "result", "Says how far a run is, and when it will end."),
+        Listed("live", "live", "Steps an experiment in the browser, led by the mouse."),
+    ),
+    "Look": (
+        Listed("plot", "picture", "Draws a result: kinds of particles, or any variable."),
+        Listed("animate", "picture", "Makes a movie of a result."),
+        Listed("curve", "curve", "Draws what changes: a curve, a history, the crack."),
+        Listed("report", "report", "Makes one page to share: its motion, curves, all else."),
+        Listed("export", "export", "Writes a result for ParaView."),
+        Listed("explain", "result", "Says which bonds broke, when and why."),
+        Listed("verify", "result", "Says whether results are as they were written."),
+    ),
+    "Understand": (
+        Listed("check", "check", "Says before a run whether it is stable, and how long it takes."),
+        Listed("identify", "identify", "Says what a rule is physically, with its constants."),
+        Listed("bench", "bench", "Measures speed against error, to choose a solver."),
+    ),
+    "Vary and fit": (
+        Listed("sweep", "sweep", "Runs an experiment over many values of its parameters."),
+        Listed("fit", "fit", "Finds the parameters that meet what was measured, with errors."),
+    ),
+    "Extend": (
+        Listed("plugins", "plugins", "Lists, checks and begins components of your own."),
+        Listed("schema", "experiments", "Prints the JSON Schema, for completion in an editor."),
+    ),
 }
-COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
-"""Every command with the module of pbdkit.cli in which it stands."""
+"""Every command, by what somebody wants; a new one is a line here."""
+COMMANDS = {one.name: one.module for group in GROUPS.values() for one in group}
+"""Every command with its module."""
+FIRST = {
+    "pbdkit run paper/a": "Runs a case, and writes paper-a.nc.",
+    "pbdkit plot paper-a.nc --color pe1": "Draws it into paper-a.png.",
+    "pbdkit init": "Writes experiment.yaml to be changed.",
+}
+"""What to type first, and what it does."""
+WELCOME = """\
+pbdkit deforms bodies on lattices. Particles follow their neighbours by rules
+instead of forces. A file says what is to be done; the result is a dataset.
+"""
+MORE = """\
+`pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
 
 
 class Commands(click.Group):
@@ -39,11 +93,20 @@ class Commands(click.Group):
         if name not in COMMANDS:
             if ctx.resilient_parsing:  # a shell asks how to go on
                 return None
+            from pbdkit.experiment.shipped import shipped_names
             from pbdkit.interfaces.component import did_you_mean
 
-            ctx.fail(f"there is no command '{name}'{did_you_mean(name, COMMANDS)}")
+            run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
+            near = run or did_you_mean(name, COMMANDS) or "; `pbdkit` alone lists them"
+            ctx.fail(f"there is no command '{name}'{near}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
         return with_no_plugins(command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """By what somebody wants; no command is imported for its line."""
+        for wanted, group in GROUPS.items():
+            with formatter.section(wanted):
+                formatter.write_dl([(f"{one.name:<12}", one.does) for one in group])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Ends quietly where whoever reads the output has had enough of it, as `head` has."""
@@ -62,7 +125,8 @@ class Commands(click.Group):
     cls=Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
     invoke_without_command=True,
-    epilog="Start with `pbdkit run paper/a`, or `pbdkit init` for an experiment of your own.",
+    epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` lets the tabulator key '
+    "complete commands, settings, variables and steps; docs/experiments.md has zsh and fish.",
 )
 @click.option("--debug", is_flag=True, help="Show a traceback where something fails.")
 @click.version_option(package_name="pbdkit")
@@ -70,7 +134,16 @@ class Commands(click.Group):
 def program(context: click.Context, debug: bool) -> None:
     """Position-based dynamics of deformable bodies on lattices: rules instead of forces."""
     if context.invoked_subcommand is None:
-        click.echo(context.get_help())
+        click.echo(_welcome())
+
+
+def _welcome() -> str:
+    """What there is to type first, and what for."""
+    lines = [WELCOME, "Type this first:"]
+    lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
+    for wanted, group in GROUPS.items():
+        lines += [f"\n{wanted}:", *(f"  {one.name:<12} {one.does}" for one in group)]
+    return "\n".join([*lines, "", MORE])
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -87,6 +160,8 @@ def main(arguments: list[str] | None = None) -> None:
             warnings.simplefilter("always", errors.PbdkitWarning)
             warnings.showwarning = _warn
             refuse_little_memory()
+            if COMPLETING in os.environ:
+                import_module("pbdkit.cli.completion").speak_bash()
             code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         where = getattr(error.__cause__, "args", error.args)
@@ -94,7 +169,7 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as error:
         code = _failed(error.format_message(), error.exit_code)
     except (Exception, SystemExit) as error:  # pbdkit itself exits below
-        if isinstance(error, SystemExit) and "_PBDKIT_COMPLETE" in os.environ:
+        if isinstance(error, SystemExit) and COMPLETING in os.environ:
             raise  # click has told a shell how the line goes on
         if debug:
             traceback.print_exc()

@@ -3,44 +3,68 @@
 from __future__ import annotations
 
 import os
-from glob import escape
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
+    from pbdkit.cli.completion import Completer
+
+PATH = click.Path(path_type=Path)
 C = TypeVar("C", bound=click.Command)
-SUFFIXES = (".yaml", ".yml", ".json")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _completed(
-    context: click.Context, parameter: click.Parameter, begun: str
-) -> list[CompletionItem]:
-    """The shipped experiments and the experiment files here that begin so; where no shipped one
-    does, whatever the shell itself offers as files."""
-    from click.shell_completion import CompletionItem
+def completed_by(name: str) -> Completer:
+    """The completer of that name in `completion`, which is imported when a shell asks."""
 
-    from pbdkit.experiment.shipped import shipped_names
+    def complete(
+        context: click.Context, parameter: click.Parameter, begun: str
+    ) -> list[CompletionItem]:
+        completer: Completer = getattr(import_module("pbdkit.cli.completion"), name)
+        return completer(context, parameter, begun)
 
-    names = [name for name in shipped_names() if name.startswith(begun)]
-    if not names:
-        return [CompletionItem(begun, type="file")]
-    files = sorted(p.name for p in Path().glob(f"{escape(begun)}*") if p.suffix in SUFFIXES)
-    return [CompletionItem(name) for name in [*names, *files]]
+    return complete
 
 
-experiment_argument = click.argument("experiment", metavar="EXPERIMENT", shell_complete=_completed)
+def result_argument(name: str, metavar: str = "OUT.nc", **more: Any) -> Callable[[F], F]:
+    """The argument of that name: a result, or several."""
+    completed = completed_by("results")
+    return click.argument(name, metavar=metavar, type=PATH, shell_complete=completed, **more)
+
+
+experiment_argument = click.argument(
+    "experiment", metavar="EXPERIMENT", shell_complete=completed_by("experiments")
+)
+color_option = click.option(
+    "--color",
+    metavar="VARIABLE",
+    help="Colour by a variable, e.g. pe1, u, u_x; a wrong one lists all.",
+    shell_complete=completed_by("variables"),
+)
+times_option = click.option(
+    "--time",
+    "times",
+    type=int,
+    multiple=True,
+    help="Draw this recorded step, else the last; again for a panel more.",
+    shell_complete=completed_by("times"),
+)
 set_option = click.option(
     "--set",
     "settings",
     multiple=True,
     metavar="PATH=VALUE",
+    shell_complete=completed_by("settings"),
     help="Change a value, e.g. rule.K=-0.002 or leaders.1.until=20.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+verbose_option = click.option("--verbose", is_flag=True, help="Say all that is known.")
 
 
 def _disable_plugins(context: click.Context, option: click.Parameter, given: bool) -> None:

@@ -8,19 +8,19 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from pbdkit.errors import ExperimentError, StorageError
-from pbdkit.scene.scene import Scene
-from pbdkit.scene.sizes import MIB, sizes_of
+from pbdkit.registry.extras import refuse_no_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
+
+    from pbdkit.scene.scene import Scene
 
 KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
 """What may be at a path and no plain file, by the type that the system gives it."""
@@ -90,6 +90,8 @@ def refuse_unfinished(path: Path, *, force: bool) -> None:
 
 def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """What is to be said where the output may not fit on its disk."""
+    from pbdkit.scene.sizes import MIB, sizes_of
+
     output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output
     with suppress(OSError):  # no such folder: said when the file is opened
         if output > (free := shutil.disk_usage(path.parent).free):
@@ -112,8 +114,8 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
     """ExperimentError or StorageError where a picture or another file cannot be written there."""
     if picture and picture.suffix not in FORMATS:
         raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
-    if picture and find_spec("matplotlib") is None:
-        raise ExperimentError("a picture needs matplotlib: pip install 'pbdkit[plot]'")
+    if picture:
+        refuse_no_matplotlib()
     for path in (picture, *others):
         if path and path.is_dir():
             raise ExperimentError(f"{path}: is a folder; name a file")

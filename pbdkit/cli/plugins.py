@@ -21,9 +21,12 @@ INTERFACES = (
 """The open interfaces by name, here so that `--help` imports none of them."""
 
 
-@click.group()
-def plugins() -> None:
+@click.group(invoke_without_command=True)
+@click.pass_context
+def plugins(context: click.Context) -> None:
     """What is installed, and in which state."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 @plugins.command("list")
@@ -52,7 +55,7 @@ def list_(as_json: bool) -> None:
     show_table(table)
 
 
-@plugins.command()
+@plugins.command(short_help="Write a plugin project that installs and runs.")
 @click.argument("name")
 @click.option(
     "--interface",
@@ -81,7 +84,7 @@ def new(name: str, interface: str, parent: Path) -> None:
     )
 
 
-@plugins.command()
+@plugins.command(short_help="Try every property on each component of a plugin.")
 @click.argument("distributions", metavar="[DISTRIBUTION]...", nargs=-1)
 @click.option("--verbose", is_flag=True, help="Show every property, held, failed and skipped.")
 @json_option

@@ -1,4 +1,4 @@
-"""``pbdkit plot``, ``explain``, ``status`` and ``verify``: a result, or a run, looked at."""
+"""``pbdkit explain``, ``status`` and ``verify``: a result, or a run, looked at."""
 
 from __future__ import annotations
 
@@ -11,53 +11,27 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import json_option
+from pbdkit.cli.options import json_option, result_argument
 
 if TYPE_CHECKING:
     from pbdkit.results.explanation import Explained, Standing
 
-PATH = click.Path(path_type=Path)
 SHOWN = 20
 """So many broken bonds are listed in words; --json has all."""
 
 
 @click.command()
-@click.argument("file", metavar="OUT.nc", type=PATH)
-@click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
-@click.option("--time", "times", type=int, multiple=True, help="A recorded step; several panels.")
-@click.option("--color", metavar="VARIABLE", help="Colour by a variable, e.g. pe1.")
-@click.option("--contours", is_flag=True, help="Fill contours of the variable.")
-@click.option("--numbers", is_flag=True, help="Write the particles' numbers.")
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
-def plot(
-    file: Path,
-    output: Path | None,
-    times: tuple[int, ...],
-    color: str | None,
-    contours: bool,
-    numbers: bool,
-    force: bool,
-) -> None:
-    """Draw configurations of a result: kinds, numbers, any diagnostic in colour."""
-    from pbdkit.cli.output import refuse_output, refuse_unwritable, save
-    from pbdkit.results.accessor import reading
-    from pbdkit.results.picture import draw
-
-    path = output or file.with_suffix(".png")
-    refuse_output(path, force=force)
-    refuse_unwritable(path)
-    with reading(file) as dataset:
-        axes = draw(dataset, times or [None], color=color, contours=contours, numbers=numbers)
-        whole = axes[0].get_figure(root=True)
-        assert whole is not None
-        save(path, whole)
-
-
-@click.command()
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=PATH)
+@result_argument("files", "FILE...", nargs=-1, required=True)
 def verify(files: tuple[Path, ...]) -> int:
     """Recompute the digests of results and say, a line a file, which are as they were written."""
-    faults = [fault for file in files if (fault := _verified(file))]
+    from pbdkit.cli.waiting import waiting
+
+    faults = []
+    for file in files:
+        with waiting(f"reading {file}"):
+            fault = _verified(file)
+        click.echo(fault or f"{file}: is as it was written")
+        faults += [fault] if fault else []
     return 6 if faults else 0
 
 
@@ -65,12 +39,15 @@ def _verified(file: Path) -> str:
     """What a file's line says against it, if anything."""
     from pbdkit.cli.output import refusals_as
     from pbdkit.errors import StorageError
-    from pbdkit.results.accessor import UNSEALED, refuse_no_file
+    from pbdkit.results.other_files import other_file
+    from pbdkit.results.result_file import UNSEALED, refuse_no_file
     from pbdkit.results.trial import refuse_no_result
     from pbdkit.storage.seal import SealedFile
 
     fault = ""
     try:
+        if told := other_file(file):
+            raise StorageError(f"{file}: {told}")
         refuse_no_file(file)
         with refusals_as(str(file)), SealedFile(file) as content:
             content.check()
@@ -79,20 +56,22 @@ def _verified(file: Path) -> str:
                 fault = f"{file}: {UNSEALED}"
     except StorageError as error:
         fault = str(error)
-    click.echo(fault or f"{file}: is as it was written")
     return fault
 
 
 @click.command()
-@click.argument("output", metavar="OUT.nc", type=PATH)
+@result_argument("output")
 @json_option
 def status(output: Path, as_json: bool) -> None:
     """Say of an unfinished run how far it is, at which rate, and when it will end."""
     from pbdkit.errors import ExperimentError
+    from pbdkit.results.other_files import refuse_other_file, refuse_store
     from pbdkit.storage.run_status import status_of
 
+    refuse_store(output)
     found = status_of(output)
     if found is None:
+        refuse_other_file(output)
         what = "is finished" if output.exists() else "there is no such run"
         raise ExperimentError(f"{output}: {what}; runs of less than a second leave no trace")
     if as_json:
@@ -113,18 +92,19 @@ def _duration(seconds: float) -> str:
 
 
 @click.command()
-@click.argument("file", metavar="OUT.nc", type=PATH)
+@result_argument("file")
 @click.option("--bond", nargs=2, type=int, metavar="A B", help="The bond between two numbers.")
 @json_option
 def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
     is, or was, from breaking, and what happened around it."""
-    from pbdkit.api import experiment_of
-    from pbdkit.results.accessor import reading
+    from pbdkit.cli.waiting import waiting
+    from pbdkit.results.carried import experiment_of
     from pbdkit.results.explanation import Explained
+    from pbdkit.results.result_file import reading
     from pbdkit.scene.scene import build_scene
 
-    with reading(file) as dataset:
+    with waiting(f"reading {file}", silent=as_json), reading(file) as dataset:
         explained = Explained(dataset, build_scene(experiment_of(dataset)))
         found = _of_one(explained, *bond) if bond else _of_all(explained)
         words = _bond_in_words(found) if bond else _run_in_words(found)

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import experiment_argument, json_option, set_option
+from pbdkit.cli.options import (
+    PATH,
+    experiment_argument,
+    json_option,
+    result_argument,
+    set_option,
+)
 from pbdkit.cli.stopping import Stop, asked_to_stop
 
 if TYPE_CHECKING:
@@ -19,7 +25,6 @@ if TYPE_CHECKING:
     from pbdkit.results.progress import Watch
     from pbdkit.runs.course import Report, Run
 
-PATH = click.Path(path_type=Path)
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
 
@@ -64,7 +69,7 @@ def run(
 
 
 @click.command()
-@click.argument("output", metavar="OUT.nc", type=PATH)
+@result_argument("output")
 @click.option("--steps", type=click.IntRange(min=1), help="Continue a finished run to this step.")
 @click.option("--anyway", is_flag=True, help="Also where the experiment or a version changed.")
 @quiet_option
@@ -152,7 +157,8 @@ def _tell(
 def _say(report: Report, path: Path, *, settling: bool) -> None:
     outcome = report.outcome
     made = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
-    size = f"{report.particles} particles, {made} steps in {report.wall_s:.2g} s"
+    steps = "step" if made == 1 else "steps"
+    size = f"{report.particles} particles, {made} {steps} in {report.wall_s:.2g} s"
     click.echo(f"{outcome.status}: {size}, written to {path}")
     if outcome.certificate:
         click.echo(f"{outcome.certificate['method']}: {outcome.stop_reason}")

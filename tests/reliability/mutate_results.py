@@ -27,9 +27,9 @@ from isolation import Outcome, outcomes, report, serve
 
 import pbdkit
 from pbdkit.cli import main as program
+from pbdkit.drawing.recording import Recording
 from pbdkit.errors import PbdkitError
-from pbdkit.results.accessor import reading
-from pbdkit.results.snapshot import take_snapshots
+from pbdkit.results.result_file import reading
 
 PATIENCE_S, LONGEST_S = 120.0, 20.0
 """After so many seconds a case is ended, and so many it may take."""
@@ -60,7 +60,8 @@ def read_subject(path: Path) -> dict[str, Any]:
         dataset.load()
         seen = {name: variable.values.tobytes() for name, variable in dataset.variables.items()}
         seen |= {f"attribute {name}": str(value) for name, value in dataset.attrs.items()}
-        seen["snapshot"] = repr(take_snapshots(dataset, [None], "pe1", False))
+        recording = Recording(dataset, "pe1")
+        seen["snapshot"] = repr([*recording.snapshots([recording.row(None)])])
     return seen
 
 

@@ -24,7 +24,7 @@ import xarray  # noqa: F401  # as above
 import pbdkit
 import pbdkit.cli.run
 import pbdkit.prediction.forecast
-import pbdkit.results.accessor
+import pbdkit.results.result_file
 import pbdkit.runs.resumption
 import pbdkit.storage.run_status
 from pbdkit.cli import main

@@ -1,0 +1,199 @@
+"""``pbdkit check``: what will happen, before it does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from pbdkit.cli.options import experiment_argument, json_option, set_option, verbose_option
+
+if TYPE_CHECKING:
+    from pbdkit.experiment.leaders import Driven, LeaderGroup
+    from pbdkit.experiment.loads import Load
+    from pbdkit.experiment.model import Experiment
+    from pbdkit.prediction.forecast import Forecast
+    from pbdkit.scene.scene import Scene
+
+Row = tuple[str, str]
+SHOWN = 3
+"""So many groups are named in a line; --verbose names all."""
+
+
+@click.command()
+@experiment_argument
+@set_option
+@verbose_option
+@json_option
+def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
+    """Say what will happen, without running it: who is held and who leads, whether it is stable,
+    in how many steps it settles, what it takes in time and memory."""
+    from pbdkit.api import load
+    from pbdkit.cli.waiting import waiting
+    from pbdkit.prediction.forecast import forecast
+    from pbdkit.runs.course import rehearse
+    from pbdkit.runs.tuning import tuned
+    from pbdkit.scene.scene import build_scene
+
+    loaded = load(experiment, settings=settings)
+    with waiting(f"checking {loaded.name}", silent=as_json):
+        scene = tuned(build_scene(loaded))
+        rehearse(scene)
+        found = forecast(scene)
+    if as_json:
+        click.echo(json.dumps(found.as_dict()))
+        return
+    click.echo(f"{loaded.name}: valid")
+    rows = [*_who(scene, found, SHOWN if not verbose else None), *_what(loaded, scene, found)]
+    for title, text in [*rows, *_more(scene, found)] if verbose else rows:
+        click.echo(f"  {title:<10} {text}")
+    for warning in dict.fromkeys(found.warnings):
+        click.echo(f"warning: {warning}")
+
+
+def _who(scene: Scene, found: Forecast, most: int | None) -> Iterator[Row]:
+    """The body, and who is held, led and loaded; of groups the first `most`."""
+    if found.size_mm:
+        yield "size", f"{' × '.join(f'{side:.6g}' for side in found.size_mm)} mm"
+    raster = scene.raster
+    sides = np.ptp(raster.reference(raster.body_rows), axis=0)
+    count, extent = len(raster.body_rows), " × ".join(f"{side:.6g}" for side in sides)
+    frame = f", and {found.particles - count} of the frame" * (found.particles > count)
+    yield "body", f"{count} particles over {extent} lattice units{frame}"
+    groups = [(f"leaders.{n}", len(one.rows), one.group) for n, one in enumerate(scene.leading)]
+    held = [one for one in groups if one[2].motion.type == "hold"]
+    yield from _listed("supports", (f"{_words(*one)}{_when(one[2])}" for one in held), most)
+    moving = (f"{_words(*one)} {_motion(one[2])}" for one in groups if one not in held)
+    yield from _listed("leaders", moving, most)
+    each = scene.loads.each if scene.loads else ()
+    loads = ((f"loads.{n}", len(one.rows), one.load) for n, one in enumerate(each))
+    yield from _listed("loads", (f"{_words(*one)} {_force(one[2])}" for one in loads), most)
+    obstacles = enumerate(barrier.group for barrier in scene.barriers)
+    yield from _listed("obstacles", (f"obstacles.{n} {_motion(one)}" for n, one in obstacles), most)
+    yield from _listed("regions", _in_regions(scene), most)
+
+
+def _what(loaded: Experiment, scene: Scene, found: Forecast) -> Iterator[Row]:
+    """What will happen, and what it takes."""
+    if loaded.stepping.is_open:
+        why = "the rule is not linear or bonds can break"
+        near = "" if found.exact else f", of the step linearised at rest: {why}"
+        yield "chosen", f"relaxation {found.relaxation:.6g}, memory {found.memory:.6g}{near}"
+    if loaded.solver.makes_steps:
+        yield from _stability(found)
+        yield from _settling(scene, found)
+        if found.period is not None:
+            shrinks = f"shrinking by a factor of {found.decay:.4g} a step"
+            yield "oscillates", f"slowest period {found.period:.4g} steps, {shrinks}"
+    else:
+        yield "solver", "goes straight to the equilibrium, to where steps would lead"
+    time = "" if found.seconds is None else f"{_seconds(found.seconds)} of stepping, "
+    memory = f"{found.memory_mib:.3g} MiB of memory, {found.output_mib:.3g} MiB of output"
+    yield "takes", f"{time}{memory} (estimates)"
+
+
+def _listed(title: str, each: Iterable[str], most: int | None) -> Iterator[Row]:
+    """A line of groups."""
+    listed = [*each]
+    more = len(listed) - (most or len(listed))
+    if listed:
+        yield title, "; ".join([*listed[:most], *([f"and {more} more"] if more > 0 else [])])
+
+
+def _words(name: str, count: int, group: LeaderGroup | Load) -> str:
+    ((how, which),) = group.select.model_dump().items()
+    where = f" ({how} {which})" if isinstance(which, str) else ""
+    return f"{name}, {_particles(count)}{where}"
+
+
+def _particles(count: int) -> str:
+    return f"{count} particle{'s' * (count != 1)}"
+
+
+def _motion(group: Driven) -> str:
+    return f"by {group.motion.type}{_when(group)}"
+
+
+def _when(group: Driven) -> str:
+    """Along which axes, and in which steps, if not along all and always."""
+    axes, until = "".join(getattr(group, "axes", None) or ()), group.until
+    begins = f" from step {group.from_}" * (group.from_ > 1)
+    return f" along {axes}" * bool(axes) + begins + f" until step {until}" * (until is not None)
+
+
+def _force(load: Load) -> str:
+    force = ", ".join(f"{one:.6g}" for one in load.force_at(max(load.from_, 1)).tolist())
+    kind = "force" if load.force else "body force"
+    return f"{kind} [{force}]"
+
+
+def _in_regions(scene: Scene) -> Iterator[str]:
+    """How many particles of the body lie in each region."""
+    from pbdkit.scene.field_values import signed_distance
+
+    raster = scene.raster
+    x = raster.reference(raster.body_rows)
+    for name, region in scene.experiment.regions.items():
+        inside = signed_distance(region, raster.lattice.cell(), *x.T) <= 0.0
+        yield f"{name}, {_particles(int(inside.sum()))}"
+
+
+def _stability(found: Forecast) -> Iterator[Row]:
+    if found.spectral_radius is None:
+        yield "stable", "not known beforehand"
+        return
+    verdict = "yes" if found.stable else "NO, some modes grow"
+    near = ", linearised at the start" * (not found.exact) + ", estimated" * found.estimated
+    bound = found.largest_stable_relaxation
+    below = f"; stable with relaxations below {bound:.6g}" if bound else ""
+    yield "stable", f"{verdict} (spectral radius {found.spectral_radius:.6g}{near}){below}"
+
+
+def _settling(scene: Scene, found: Forecast) -> Iterator[Row]:
+    steps = {t: n for t in ("1e-3", "1e-6") if (n := found.steps_to.get(t)) is not None}
+    if not (steps and found.stable):
+        return
+    told, asked = ", ".join(f"to {t} in {n}" for t, n in steps.items()), scene.experiment.steps
+    reached = [t for t, n in steps.items() if n <= asked]
+    verdict = f"the {asked} asked for reach {reached[-1] if reached else 'neither'}"
+    if scene.experiment.stepping.settle is not None:
+        verdict = f"the run ends when it has settled, after {asked} at the latest"
+    whole = "" if scene.experiment.fracture.type == "none" else ", as long as no bond breaks"
+    yield "settles", f"{told} steps{whole}; {verdict}"
+
+
+def _seconds(seconds: float) -> str:
+    if seconds < 1.0:
+        return "less than a second"
+    if seconds < 100.0:
+        return f"about {seconds:.1g} s" if seconds < 10.0 else f"about {seconds:.0f} s"
+    return f"about {seconds / 60:.0f} min" if seconds < 6000.0 else f"about {seconds / 3600:.3g} h"
+
+
+def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
+    """The rest of what is known."""
+    from pbdkit.interfaces import RenewsParticles
+
+    experiment = scene.experiment
+    records = experiment.recording.count(experiment.steps)
+    yield "records", f"{records} states in {experiment.steps} steps, that of time 0 included"
+    yield "particles", f"{found.particles}, of which {found.followers} follow in step 1"
+    yield "bonds", f"{found.bonds}"
+    yield "weights", f"relaxation {found.relaxation:.6g}, memory {found.memory:.6g}"
+    if found.spectral_radius is not None:
+        near = "exact" if found.exact else "linearised at the start"
+        if isinstance(experiment.rule, RenewsParticles):
+            near += ", what particles remember held as it is there"
+        near += ", estimated: the steps to 1 %" if found.estimated else ""
+        least = found.smallest_eigenvalue
+        ends = "" if least is None else f"; smallest eigenvalue of the rule's own step {least:.9g}"
+        yield "spectrum", f"radius {found.spectral_radius:.9g}, {near}{ends}"
+        told = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
+        yield from [("steps", f"settle to {told}")] if told else []
+    if found.lag is not None:
+        reached = "" if found.lag_reached is None else f", {found.lag_reached:.4g} when they end"
+        told = f"{found.lag:.4g} lattice units behind equilibrium if the leaders' fastest steps"
+        yield "lag", f"{told} went on{reached}"

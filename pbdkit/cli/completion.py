@@ -1,0 +1,189 @@
+"""What the tabulator key offers: experiments, settings, results, and what is in them.
+
+What cannot be found out is not offered: a shell has no place for messages.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from glob import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import (
+    BashComplete,
+    CompletionItem,
+    add_completion_class,
+    split_arg_string,
+)
+
+SUFFIXES = (".yaml", ".yml", ".json")
+RESULT = ".nc"
+MOST_TIMES = 200
+"""So many steps are offered at once: the first and the last, and some between."""
+Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem]]
+Finder = Callable[[click.Context, str], Iterable[str | CompletionItem]]
+
+
+def _completer(find: Finder) -> Completer:
+    """Offers what is found that begins as what is there, and nothing where finding fails."""
+
+    def complete(context: click.Context, _: click.Parameter, begun: str) -> list[CompletionItem]:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = [*find(context, begun)]
+        except (Exception, SystemExit):
+            return []
+        items = [one if isinstance(one, CompletionItem) else CompletionItem(one) for one in found]
+        return [item for item in items if item.value.startswith(begun)]
+
+    return complete
+
+
+def _experiments(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
+    """The shipped experiments and the experiment files here; where no shipped one begins so,
+    whatever the shell itself offers as files."""
+    from pbdkit.experiment.shipped import shipped_names
+
+    names = [name for name in shipped_names() if name.startswith(begun)]
+    if not names:
+        yield CompletionItem(begun, type="file")
+        return
+    yield from names
+    yield from sorted(p.name for p in Path().glob(f"{escape(begun)}*") if p.suffix in SUFFIXES)
+
+
+def _results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
+    """The results in a folder, those of runs that are not finished, and the folders in it."""
+    from pbdkit.storage.run_files import STORE
+
+    folder = begun[: begun.rfind("/") + 1]
+    start, found = begun[len(folder) :], False
+    for path in sorted(Path(folder).glob(f"{escape(start)}*")):
+        if path.name.startswith(".") and not start:
+            continue
+        name = path.name.removesuffix(STORE)
+        if path.is_dir() or name.endswith(RESULT):
+            found = True
+            yield f"{folder}{name}{'/' * path.is_dir()}"
+    if not found:
+        yield CompletionItem(begun, type="file")
+
+
+def _settings(context: click.Context, begun: str) -> Iterator[str]:
+    """The paths of the experiment on the line, with the settings before; behind `=` the words that
+    can stand there, and the present value."""
+    from pbdkit.cli.setting_paths import SettingPaths
+    from pbdkit.experiment.schema import experiment_schema
+    from pbdkit.registry.registry import Registry
+
+    path, asks_value, _ = begun.partition("=")
+    # Plugins are loaded where their types are asked for.
+    schema = experiment_schema(Registry(), installed=bool(asks_value))
+    known = SettingPaths(_data(context), schema)
+    if asks_value:
+        yield from (f"{path}={value}" for value in known.values(path))
+    else:
+        yield from (f"{one}=" for one in known.paths())
+
+
+def _data(context: click.Context) -> dict[str, Any]:
+    from pbdkit.experiment.model import Experiment
+    from pbdkit.experiment.settings import with_setting
+    from pbdkit.experiment.shipped import read_experiment
+    from pbdkit.experiment.source import Source
+
+    # The option that waits for its value keeps click from giving arguments their names.
+    name = context.params.get("experiment") or next(iter(context.args), None)
+    defaults = Experiment.defaults()
+    source = read_experiment(name) if name else Source(data={})
+    for setting in context.params.get("settings") or ():
+        source = with_setting(source, setting, defaults)
+    return {**defaults, **source.data}
+
+
+def _variables(context: click.Context, begun: str) -> Iterator[str]:
+    """What particles or bonds of the result on the line can be coloured by, the components of
+    vectors too."""
+    with _content(context) as content:
+        variables = dict(content.variables)
+        listed = (some.attrs.get("coordinates", "") for some in (content, *variables.values()))
+        coordinates = {*" ".join(listed).split()}
+        for name, variable in variables.items():
+            dims = {*variable.dimensions} - {"time"}
+            if name in coordinates | dims or dims - {"axis"} not in ({"particle"}, {"bond"}):
+                continue
+            yield name
+            axes = variables["axis"][...] if "axis" in dims else ()
+            yield from (f"{name}_{axis}" for axis in axes)
+
+
+def _times(context: click.Context, begun: str) -> Iterator[str]:
+    """The recorded steps of the result on the line."""
+    with _content(context) as content:
+        times = [f"{time}" for time in content.variables["time"][...].tolist()]
+    times = [time for time in times if time.startswith(begun)]
+    stride = -(-len(times) // MOST_TIMES)
+    yield from dict.fromkeys([*times[:: stride or 1], *times[-1:]])
+
+
+@contextmanager
+def _content(context: click.Context) -> Iterator[Any]:
+    """The first result among what is on the line, opened without xarray."""
+    from pbdkit.storage.seal import opened
+
+    given = [v for v in context.params.values() if isinstance(v, Path)]
+    given += [Path(word) for word in context.args]
+    file = opened(next(path for path in given if path.is_file()))
+    try:
+        yield file
+    finally:
+        file.close()
+
+
+experiments = _completer(_experiments)
+results = _completer(_results)
+settings = _completer(_settings)
+variables = _completer(_variables)
+times = _completer(_times)
+
+
+class _Bash(BashComplete):
+    """Bash parts words at `=`, and puts a space behind what it completes. Here `--set rule.K=1` has
+    one value, and no space comes behind `=`."""
+
+    source_template = BashComplete.source_template.replace(
+        "COMPREPLY+=($value)",
+        "COMPREPLY+=($value); [[ $value == *[=/] ]] && compopt -o nospace",
+    )
+    _known = 0
+
+    def get_completion_args(self) -> tuple[list[str], str]:
+        """The words before, and that which is to be completed."""
+        parts, at = split_arg_string(os.environ["COMP_WORDS"]), int(os.environ["COMP_CWORD"])
+        parts = [*parts, ""][: at + 1]
+        words = parts[:1]
+        for before, part in pairwise(parts):
+            if "=" in (before, part) and len(words) > 1:
+                words[-1] += part
+            else:
+                words.append(part)
+        _, equals, value = words[-1].partition("=")
+        value = value if equals and words[-1].startswith("-") else words[-1]
+        self._known = max(0, len(value) - len(parts[-1].removeprefix("=")))
+        return words[1:-1], words[-1]
+
+    def format_completion(self, item: CompletionItem) -> str:
+        """Without what stands before the part that bash completes."""
+        return f"{item.type},{item.value[self._known :]}"
+
+
+def speak_bash() -> None:
+    """From now on this is what click takes for bash."""
+    add_completion_class(_Bash)

@@ -1,0 +1,41 @@
+"""``pbdkit fit``: parameters from measurements."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("file", metavar="FIT")
+@click.option("-o", "--output", type=PATH, help="JSON; else the name of FIT with .json.")
+@click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF: measured, fitted, left.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
+    """Find the parameters that fit a measured field best, with their errors."""
+    import pbdkit
+    from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
+    from pbdkit.cli.waiting import waiting
+
+    path = output or Path(Path(file).name).with_suffix(".json")
+    refuse_output(path, force=force, experiment=Path(file))
+    if picture:
+        refuse_output(picture, force=force)
+    refuse_unwritable(picture, path)
+    with waiting(f"fitting {file}", silent=quiet):
+        found = pbdkit.fit(file)
+    with refusals_as(f"{path}: cannot be written"):
+        path.write_text(json.dumps(found.as_dict(), indent=2) + "\n", encoding="utf-8")
+    if not quiet:
+        for line in found.lines():
+            click.echo(line)
+        click.echo(f"{path} written")
+    if picture:
+        from pbdkit.drawing.fit import draw_fit
+
+        save(picture, draw_fit(found))

@@ -1,0 +1,101 @@
+"""``pbdkit plot`` and ``animate``: a result as a picture, and as a movie."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pbdkit.cli.options import PATH, color_option, result_argument, times_option
+
+LOOK = [
+    color_option,
+    click.option(
+        "--field/--dots",
+        "filled",
+        default=None,
+        help="Fill the body with the variable, or a dot a particle; by default what is legible.",
+    ),
+    click.option("--contours", is_flag=True, help="Fill in steps at round levels."),
+    click.option("--bonds/--no-bonds", default=None, help="Draw bonds; by default if legible."),
+    click.option("--broken", is_flag=True, help="Draw broken bonds too, dashed."),
+    click.option("--outline", is_flag=True, help="Draw the outline at rest."),
+    click.option(
+        "--range",
+        nargs=2,
+        type=float,
+        metavar="LOW HIGH",
+        default=None,
+        help="The values of the first and the last colour.",
+    ),
+    click.option("--map", metavar="NAME", help="A colour map of matplotlib, e.g. magma."),
+    click.option(
+        "--size", nargs=2, type=float, metavar="WIDTH HEIGHT", default=None, help="In inches."
+    ),
+]
+force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+
+
+def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What pictures and movies have in common, in the order of the help."""
+    for option in reversed(LOOK):
+        command = option(command)
+    return command
+
+
+@click.command()
+@result_argument("file")
+@click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
+@times_option
+@look_options
+@click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
+@click.option("--dpi", type=int, default=200, show_default=True, help="Pixels an inch.")
+@force_option
+def plot(file: Path, output: Path | None, times: tuple[int, ...], force: bool, **look: Any) -> None:
+    """Draw configurations of a result: kinds, or a variable as dots, bonds or a field."""
+    from pbdkit.cli.output import refuse_output, refuse_unwritable, save
+    from pbdkit.drawing.picture import plot as draw
+    from pbdkit.results.other_files import refuse_other_file
+    from pbdkit.results.result_file import reading
+
+    refuse_other_file(file)
+    path = output or file.with_suffix(".png")
+    refuse_output(path, force=force)
+    refuse_unwritable(path)
+    with reading(file) as dataset:
+        axes = draw(dataset, times if len(times) > 1 else times[0] if times else None, **look)
+        from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
+
+        save(path, figure_of(axes[0] if isinstance(axes, list) else axes))
+
+
+@click.command()
+@result_argument("file")
+@click.option("-o", "--output", type=PATH, help="MP4 or GIF; default OUT.mp4.")
+@look_options
+@click.option("--fps", type=float, default=25.0, show_default=True, help="Steps a second.")
+@click.option(
+    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Only each N-th step."
+)
+@click.option("--dpi", type=int, default=120, show_default=True, help="Pixels an inch.")
+@force_option
+def animate(file: Path, output: Path | None, force: bool, **look: Any) -> None:
+    """Make a movie of a result: every recorded step, with the same colours all along."""
+    from pbdkit.cli.output import refuse_output, refuse_unwritable
+    from pbdkit.drawing.movie import animate as write
+    from pbdkit.drawing.movie import refuse_no_movie
+    from pbdkit.results.other_files import refuse_other_file
+    from pbdkit.results.progress import progress_bar
+    from pbdkit.results.result_file import reading
+
+    refuse_other_file(file)
+    path = output or file.with_suffix(".mp4")
+    refuse_no_movie(path)
+    refuse_output(path, force=force)
+    refuse_unwritable(None, path)
+    with reading(file) as dataset, progress_bar(sys.stderr.isatty()) as show:
+        write(dataset, path, show=show, **look)
+    click.echo(f"{path} written")

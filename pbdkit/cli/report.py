@@ -1,0 +1,33 @@
+"""``pbdkit report``: a result as one page of HTML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from pbdkit.cli.options import PATH, result_argument
+
+
+@click.command()
+@result_argument("file")
+@click.option("-o", "--output", type=PATH, help="The page; OUT.html if left out.")
+@click.option("--bench", type=PATH, help="What `pbdkit bench --json` wrote, shown in the page.")
+@click.option("--force", is_flag=True, help="Replace an existing page.")
+def report(file: Path, output: Path | None, bench: Path | None, force: bool) -> None:
+    """Write one page to share: the moving lattice, histories, curves, what was predicted, what
+    broke, how to run it again; of a sweep its map and its members. It needs no network."""
+    from pbdkit.cli.output import refuse_output, refuse_unwritable
+    from pbdkit.pages.report import BUDGET
+    from pbdkit.pages.report import report as write
+    from pbdkit.results.other_files import refuse_other_file
+
+    refuse_other_file(file)
+    path = output or file.with_suffix(".html")
+    refuse_output(path, force=force)
+    refuse_unwritable(None, path)
+    write(file, path, bench=bench)
+    size = path.stat().st_size
+    click.echo(f"{path} written, {size / 1e6:.2g} MB; open it in a browser")
+    if size > BUDGET:
+        click.echo(f"it is larger than {BUDGET / 1e6:.2g} MB: what it holds cannot be thinned more")

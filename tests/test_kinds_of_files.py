@@ -1,0 +1,134 @@
+"""A file where another was wanted is recognised by its content, and the right command is named."""
+
+# ruff: noqa: E501  (a row of a table is a line)
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pbdkit
+from pbdkit.experiment.kinds import EXPERIMENT, FIT, PARTS, SWEEP, kind_of
+from pbdkit.experiment.shipped import read_experiment, shipped_names
+
+TAKES_EXPERIMENTS = ["run", "check", "identify", "bench"]
+TAKES_RESULTS = ["plot", "explain", "status", "verify", "resume"]
+SWEEP_FILE = "experiment: e.json\nvary: {solver.memory: [0.1, 0.2]}\n"
+FIT_FILE = "experiment: e.json\nunknown: {rule.K: [-1, 0]}\nmeasured: {file: d.csv}\n"
+
+
+@pytest.fixture
+def told(call: Any) -> Any:
+    """What a command answers where files of all kinds lie, by names that say nothing."""
+    assert call("run", "e.json", "-o", "result.yaml", "--quiet").code == 0
+    Path("sweep.nc").write_text(SWEEP_FILE)
+    Path("fit.nc").write_text(FIT_FILE)
+    Path("experiment.nc").write_text(Path("e.json").read_text())
+    Path("other.yaml").write_text("services: {web: 1}\nvolumes: []\n")
+    Path("picture.yaml").write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
+    Path("left.nc.run").write_bytes(b"SQLite format 3\0" + bytes(100))
+    before = sorted(Path().iterdir())
+
+    def of(*arguments: str) -> str:
+        result = call(*arguments)
+        assert (result.code, "Traceback" in result.err) in ((2, False), (6, False))
+        assert sorted(Path().iterdir()) == before
+        return str(result.err or result.out).strip().removeprefix("pbdkit: ")
+
+    return of
+
+
+NO_EXPERIMENT = {
+    "result.yaml": "result.yaml: is a result, no experiment; `pbdkit plot result.yaml` draws it",
+    "sweep.nc": "sweep.nc: is a sweep, not an experiment; `pbdkit sweep sweep.nc` runs it",
+    "fit.nc": "fit.nc: is a fit, not an experiment; `pbdkit fit fit.nc` carries it out",
+    "other.yaml": "other.yaml: is not an experiment, it has `services`, `volumes`; one has `lattice`, `body`, `rule` and `steps`; `pbdkit init` writes one",
+    "picture.yaml": "picture.yaml: is no text, and no experiment",
+    "left.nc.run": "left.nc.run: is what was kept of an unfinished run or of a sweep, no experiment; `pbdkit resume OUT.nc` goes on with a run",
+}  # fmt: skip
+NO_SWEEP = {
+    "result.yaml": NO_EXPERIMENT["result.yaml"],
+    "experiment.nc": "experiment.nc: is an experiment, not a sweep; `pbdkit run experiment.nc` runs it; a sweep names it under `experiment`",
+    "fit.nc": "fit.nc: is a fit, not a sweep",
+    "paper/a": "paper/a: is an experiment, not a sweep; `pbdkit run paper/a` runs it; a sweep names it under `experiment`",
+    "other.yaml": "other.yaml: is not a sweep, it has `services`, `volumes`; one has `experiment` and `vary`",
+}  # fmt: skip
+NO_RESULT = {
+    "experiment.nc": "experiment.nc: is an experiment; `pbdkit run experiment.nc` makes a result of it",
+    "e.json": "e.json: is an experiment; `pbdkit run e.json` makes a result of it",
+    "sweep.nc": "sweep.nc: is a sweep, no result; `pbdkit sweep sweep.nc` runs it",
+    "fit.nc": "fit.nc: is a fit, no result; `pbdkit fit fit.nc` carries it out",
+    "other.yaml": "other.yaml: is no result: those end in .nc",
+    "picture.yaml": "picture.yaml: is no result, by its name an experiment",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", TAKES_EXPERIMENTS)
+def test_where_an_experiment_is_wanted(told: Any, command: str) -> None:
+    for file, message in NO_EXPERIMENT.items():
+        assert told(command, file).startswith(message)
+
+
+def test_where_a_sweep_is_wanted(told: Any) -> None:
+    for file, message in NO_SWEEP.items():
+        assert told("sweep", file).startswith(message)
+
+
+@pytest.mark.parametrize("command", TAKES_RESULTS)
+def test_where_a_result_is_wanted(told: Any, command: str) -> None:
+    for file, message in NO_RESULT.items():
+        assert told(command, file).startswith(message)
+
+
+@pytest.mark.parametrize("command", ["plot", "animate", "curve", "export", "report", "explain"])
+def test_a_folder_is_no_result(call: Any, command: str) -> None:
+    assert call(command, ".").err == "pbdkit: .: is a folder, no result of pbdkit\n"
+
+
+def test_a_result_is_one_under_any_name(call: Any) -> None:
+    call("run", "e.json", "-o", "result.yaml", "--quiet")
+    assert call("verify", "result.yaml").out == "result.yaml: is as it was written\n"
+    assert pbdkit.open("result.yaml").attrs["status"] == "complete"
+
+
+@pytest.mark.parametrize("command", ["status", "resume"])
+def test_the_store_of_a_run_names_its_output(told: Any, command: str) -> None:
+    message = "left.nc.run: is what was kept of an unfinished run; name left.nc"
+    assert told(command, "left.nc.run") == message
+
+
+def test_the_folder_of_a_sweep_names_its_dataset(call: Any) -> None:
+    Path("sweep").mkdir()
+    Path("sweep/sweep.nc").touch()
+    for command in TAKES_RESULTS:
+        result = call(command, "sweep")
+        said = result.out + result.err
+        assert "sweep: is the folder of a sweep; its dataset is sweep/sweep.nc" in said
+
+
+def test_a_shipped_experiment_is_no_result(call: Any) -> None:
+    told = "paper/a: is a shipped experiment; `pbdkit run paper/a` makes a result of it"
+    for command in ("explain", "plot", "status", "resume"):
+        assert told in call(command, "paper/a").err
+
+
+def test_a_sweep_of_a_sweep_is_refused(call: Any) -> None:
+    Path("one.yaml").write_text(SWEEP_FILE)
+    Path("two.yaml").write_text("experiment: one.yaml\nvary: {seed: [1, 2]}\n")
+    assert "one.yaml: is a sweep, not an experiment" in call("sweep", "two.yaml").err
+
+
+def test_what_a_file_with_faults_is_meant_to_be() -> None:
+    assert {kind_of(read_experiment(name).data) for name in shipped_names()} == {EXPERIMENT}
+    assert kind_of({"latice": {}, "body": {}}) == EXPERIMENT
+    assert kind_of({"name": "begun"}) == EXPERIMENT
+    assert kind_of({"experiment": "paper/a", "varry": {}}) == SWEEP
+    assert kind_of({"unknown": {}, "measured": {}, "steps": 3}) == FIT
+    assert kind_of(json.loads('{"name": "x", "version": "1", "jobs": []}')) == ""
+
+
+def test_every_key_of_an_experiment_is_known() -> None:
+    assert {*pbdkit.Experiment.known_keys()} == PARTS
