@@ -53,16 +53,18 @@ def unfinished(kind: str, folder: Path) -> None:
     folder.mkdir()
     os.chdir(folder)
     write_experiment(EXPERIMENTS[kind], folder)
+    wait_s = 0.15
     while True:
         pid = called("run", "e.json", "-o", OUTPUT, log=Path("log"))
         end = time.monotonic() + 20.0
         while not Path(OUTPUT + ".run-wal").exists() and time.monotonic() < end:
             time.sleep(0.002)
-        time.sleep(0.15)
+        time.sleep(wait_s)
         os.kill(pid, signal.SIGKILL)
         ended(pid)
         if done("status", OUTPUT, log=Path("log"))[0] == 0:
             return
+        wait_s *= 0.5 if Path(OUTPUT).exists() else 1.5  # it was done already, or had hardly begun
         for path in folder.glob("*out.nc*"):
             path.unlink()
 
