@@ -129,6 +129,7 @@ def test_errors_are_those_of_repeats():
     from pbdkit.fitting.least_squares import solved
     from pbdkit.fitting.parameter import Parameter
     from pbdkit.fitting.problem import Problem, Unknown
+    from pbdkit.fitting.resting_field import FieldObservation
 
     coarse = {"lattice": {"type": "square", "a": 2.0}}
     resting = Resting.of(pbdkit.Experiment(**plate(**coarse)))
@@ -140,9 +141,10 @@ def test_errors_are_those_of_repeats():
         noisy = pbdkit.Experiment(**plate(noise=NOISE, generator=generator, **coarse))
         scene = build_scene(noisy)
         field = true + NOISE * generator.normal(size=true.shape)
-        evidence = FieldEvidence.of(scene, points, field, NOISE)
+        evidence = FieldEvidence.of(scene, points, field)
+        observation = FieldObservation.of(scene, evidence, NOISE, modes=4)
         unknown = Unknown(Parameter("rule.poisson_ratio"), 0.0, 0.49)
-        problem = Problem.of(scene, (unknown,), (evidence,), modes=4)
+        problem = Problem((unknown,), (observation,))
         solution = solved(problem, problem.start())
         off.append((solution.z[0] - 0.3) / solution.errors[0])
     # The sum of 8 squares of normal numbers lies between these in 999 of 1 000 cases.
@@ -239,7 +241,7 @@ WRONG = {
     "nothing unknown": ({"unknown": {}}, "unknown"),
     "no such file": ({"measured": {"file": "none.csv"}}, "is no regular file"),
     "no such column": ({"measured": {"columns": ["x", "y", "u", "v"]}}, "no 'u'"),
-    "points elsewhere": ({"measured": {"margin": 100.0}}, "0 points lie within the body"),
+    "points elsewhere": ({"measured": {"margin": 100.0}}, "0 numbers of what was measured"),
     "no such group": ({"force": {"group": 7, "value": [1.0, 0.0]}}, "no leader group 7"),
 }
 

@@ -46,7 +46,7 @@ def draw_fit(fitted: Fitted) -> Figure:
             (f"{name} residual / noise", left / fitted.noise, (-WITHIN, WITHIN), "RdBu_r"),
         ]
         for path, told in information.items():
-            share = told[:, row] / max(t.max() for t in information.values())
+            share = told.reshape(2, -1)[row] / max(t.max() for t in information.values())
             shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
         for ax, (title, values, limits, colours) in zip(axes[row], shown, strict=True):
             _scatter(ax, field.points, values, limits, colours, size)

@@ -1,8 +1,7 @@
-"""What was measured, and what an equilibrium has to say of it."""
+"""What an equilibrium shows: displacements at points, and what leader groups carry."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -18,36 +17,13 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats
 
 
-class Evidence(ABC):
-    """Numbers that were measured, with their noise, and what a scene at rest predicts of them."""
-
-    measured: Floats
-    noise: float
-
-    @cached_property
-    def distortions(self) -> Floats:
-        """(number, strength): what the measurement may show beside what the scene does, as much of
-        each as fits."""
-        return np.zeros((len(self.measured), 0))
-
-    @abstractmethod
-    def predicted(self, resting: Resting) -> Floats:
-        """(number,)."""
-
-    @abstractmethod
-    def change(self, resting: Resting, du: Floats, parameter: Parameter | None) -> Floats:
-        """How these change, (number,), where displacements change by du and, if one is named, a
-        parameter by 1 with them."""
-
-
 @dataclass(frozen=True)
-class FieldEvidence(Evidence):
-    """Displacements at points within the body, (point, axis): x of all, then y of all. `terms` are
-    the exponents of x and y of what the measurement shows besides, of ux and of uy."""
+class FieldEvidence:
+    """Displacements measured at points within the body (point, axis): x of all, then y of all.
+    `terms` are the exponents of x and y of what the measurement shows besides, of ux and of uy."""
 
     points: Floats
     measured: Floats
-    noise: float
     interpolation: Interpolation = field(repr=False)
     terms: tuple[tuple[tuple[int, int], ...], ...] = ((), ())
 
@@ -57,13 +33,12 @@ class FieldEvidence(Evidence):
         scene: Scene,
         points: Floats,
         displacements: Floats,
-        noise: float,
         terms: tuple[tuple[tuple[int, int], ...], ...] = ((), ()),
     ) -> FieldEvidence:
         """Of scattered points (point, axis); those outside of the body are left out."""
         found = Interpolation.at(scene, points)
         inside = found.inside
-        return cls(points[inside], displacements[inside].T.ravel(), noise, found, terms)
+        return cls(points[inside], displacements[inside].T.ravel(), found, terms)
 
     @cached_property
     def distortions(self) -> Floats:
@@ -78,29 +53,24 @@ class FieldEvidence(Evidence):
                 columns.append(column)
         return np.stack(columns, axis=1) if columns else np.zeros((2 * n, 0))
 
-    def predicted(self, resting: Resting) -> Floats:
-        """u there."""
-        return self.interpolation.of(resting.state.u, resting.scene).T.ravel()
-
-    def change(self, resting: Resting, du: Floats, parameter: Parameter | None) -> Floats:
-        """du there: parameters act on it alone."""
-        return self.interpolation.of(du, resting.scene).T.ravel()
+    def seen(self, planes: Floats, resting: Resting) -> Floats:
+        """Displacements that are given as planes, there."""
+        return self.interpolation.of(planes, resting.scene).T.ravel()
 
 
 @dataclass(frozen=True)
-class ForceEvidence(Evidence):
-    """What a leader group carries along each axis, over Young's modulus and thickness."""
+class Carried:
+    """What a leader group carries at rest along each axis, over Young's modulus and thickness."""
 
     group: int
-    measured: Floats
-    noise: float
 
     def predicted(self, resting: Resting) -> Floats:
         """(axis,)."""
         return self._reaction(resting, resting.scene, resting.state.u)
 
     def change(self, resting: Resting, du: Floats, parameter: Parameter | None) -> Floats:
-        """Of followers that go on, and of rules that pull otherwise."""
+        """How that changes, (axis,), where displacements change by du and, if one is named, a
+        parameter by 1 with them."""
         u = resting.state.u
 
         def at(u: Floats) -> Floats:

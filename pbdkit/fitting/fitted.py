@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from pbdkit.fitting.evidence import FieldEvidence, ForceEvidence
-from pbdkit.fitting.least_squares import Solution
+from pbdkit.fitting.evidence import Carried
+from pbdkit.fitting.least_squares import TELLS, Solution
+from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
+from pbdkit.fitting.resting_field import FieldObservation, FieldSeen
 from pbdkit.fitting.specification import Fit, Force
 from pbdkit.stepping.state import Floats
 
@@ -44,24 +46,43 @@ class FittedField:
 
 
 @dataclass(frozen=True)
+class Met:
+    """How well one measurement is met: its kind, the noise of its numbers, how much larger its
+    residuals are, how many numbers count and how many rows are left out."""
+
+    kind: str
+    noise: float
+    ratio: float
+    numbers: int
+    left_out: int
+
+
+@dataclass(frozen=True)
 class Fitted:
     """The answer of a fit.
 
     `values` by path, `correlations` (parameter, parameter), `youngs_modulus` where a force was
     given. Residuals are measured - fitted; `ratio` is how much larger they are than the noise,
-    which standard errors take into account. `left_out` points lie outside of the body or in the
-    margin. `solution` and `problem` have all else.
+    which standard errors take into account; `met` says so of each measurement. `solution` and
+    `problem` have all else.
     """
 
     values: Mapping[str, Estimate]
     correlations: Floats
     youngs_modulus: Estimate | None
-    noise: float
-    ratio: float
-    points: int
-    left_out: int
+    met: tuple[Met, ...]
     problem: Problem = field(repr=False)
     solution: Solution = field(repr=False)
+
+    @property
+    def ratio(self) -> float:
+        """The standard deviation of all residuals over their noise."""
+        return self.solution.ratio
+
+    @property
+    def noise(self) -> float:
+        """Of the first measurement."""
+        return self.met[0].noise
 
     def as_dict(self) -> dict[str, Any]:
         """All of it in plain values, as the JSON file holds it."""
@@ -74,37 +95,35 @@ class Fitted:
                 for n, one in enumerate(named)
             },
             "youngs_modulus": None if modulus is None else _plain(modulus),
-            "noise": self.noise,
             "residual_over_noise": self.ratio,
-            "points": self.points,
-            "left_out": self.left_out,
+            "measured": [asdict(met) for met in self.met],
             "evaluations": self.solution.evaluations,
         }
 
-    def field(self) -> FittedField:
-        """What was measured at each point, and what the fit leaves."""
-        evidence = self._evidence
-        strengths = self.solution.z[self.problem.size - self.problem.extra :]
+    def field(self, n: int = 0) -> FittedField:
+        """What was measured at each point of measurement n, a field, and what the fit leaves.
+        Raises ValueError for another kind."""
+        observation, rows = [*self.problem.rows()][n]
+        if not isinstance(observation, FieldObservation):
+            raise ValueError(f"measurement {n} is no field: {observation.kind}")
+        own = self.solution.z[[*self.problem.owned()][n][1]]
+        evidence = observation.evidence
+        strengths = own[len(own) - evidence.distortions.shape[1] :]
         measured = evidence.measured - evidence.distortions @ strengths
-        left = self.solution.at.residuals * evidence.noise
+        left = self.solution.at.residuals[rows] * observation.noise
         return FittedField(
             evidence.points, measured.reshape(2, -1).T, np.asarray(left.reshape(2, -1).T)
         )
 
-    def information(self) -> dict[str, Floats]:
-        """By parameter, how much each point and axis tells of it, (point, axis): the square of what
-        its derivative has that no other unknown can make up for."""
+    def information(self, n: int = 0) -> dict[str, Floats]:
+        """By parameter, how much each number of measurement n tells of it, (number,): the square of
+        what its derivative has that no other unknown can make up for."""
         jacobian, found = self.solution.at.jacobian, dict[str, Floats]()
-        for n, path in enumerate(self.values):
-            others, *_ = np.linalg.qr(np.delete(jacobian, n, axis=1))
-            own = jacobian[:, n] - others @ (others.T @ jacobian[:, n])
-            found[path] = np.asarray((own**2).reshape(2, -1).T)
-        return found
-
-    @property
-    def _evidence(self) -> FieldEvidence:
-        (found,) = self.problem.evidence
-        assert isinstance(found, FieldEvidence)
+        _, rows = [*self.problem.rows()][n]
+        for column, path in enumerate(self.values):
+            others, *_ = np.linalg.qr(np.delete(jacobian, column, axis=1))
+            own = jacobian[:, column] - others @ (others.T @ jacobian[:, column])
+            found[path] = np.asarray(own[rows] ** 2)
         return found
 
     def lines(self) -> Iterator[str]:
@@ -117,24 +136,21 @@ class Fitted:
             for m, other in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {one} and {other}: {self.correlations[n, m]:.2f}"
-        yield (
-            f"residual: {self.ratio:.2f} times the noise of {self.noise:.3g}, over {self.points} "
-            f"points" + (f"; {self.left_out} were left out" if self.left_out else "")
-        )
+        for met in self.met:
+            yield (
+                f"residual of the {met.kind}: {met.ratio:.2f} times the noise of {met.noise:.3g}, "
+                f"over {met.numbers} numbers"
+                + (f"; {met.left_out} rows were left out" if met.left_out else "")
+            )
 
 
 def _plain(estimate: Estimate) -> dict[str, Any]:
     if not estimate.told:
         return {"value": None, "error": None, "told": False}
-    return {
-        "value": estimate.value,
-        "error": estimate.error,
-        "told": True,
-        "on_bound": estimate.on_bound,
-    }
+    return asdict(estimate)
 
 
-def fitted(fit: Fit, problem: Problem, solution: Solution, left_out: int, noise: float) -> Fitted:
+def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     """The answer in words of the fit file."""
     count = len(problem.unknowns)
     errors = solution.errors[:count]
@@ -149,29 +165,43 @@ def fitted(fit: Fit, problem: Problem, solution: Solution, left_out: int, noise:
     }
     covariance = solution.covariance[:count, :count]
     correlations = covariance / np.outer(errors, errors)
-    modulus = _modulus(fit.force, problem, solution) if fit.force else None
-    points = sum(len(e.measured) for e in problem.evidence) // 2
-    return Fitted(
-        values, correlations, modulus, noise, solution.ratio, points, left_out, problem, solution
+    met = tuple(
+        _met(observation, solution.at.residuals[rows]) for observation, rows in problem.rows()
     )
+    return Fitted(values, correlations, _modulus(fit, problem, solution), met, problem, solution)
 
 
-def _modulus(force: Force, problem: Problem, solution: Solution) -> Estimate:
+def _met(observation: Observation, residuals: Floats) -> Met:
+    ratio = float(np.sqrt(np.mean(residuals**2)))
+    noise = observation.noise * observation.unit
+    return Met(observation.kind, noise, ratio, len(residuals), observation.left_out)
+
+
+def _modulus(fit: Fit, problem: Problem, solution: Solution) -> Estimate | None:
+    count = len(problem.unknowns)
+    if problem.with_modulus:
+        value, error = float(solution.z[count]), float(solution.errors[count])
+        return Estimate(value, error, told=error < TELLS * abs(value))
+    return _carried_modulus(fit.force, problem, solution) if fit.force else None
+
+
+def _carried_modulus(force: Force, problem: Problem, solution: Solution) -> Estimate:
     """Force over thickness and what the group carries over Young's modulus, along the force."""
     way = np.array(force.value) / np.hypot(*force.value)
-    evidence = ForceEvidence(force.group, np.zeros(2), 1.0)
-    resting, count = solution.at.resting, len(problem.unknowns)
-    carried = float(way @ evidence.predicted(resting))
+    carried, count = Carried(force.group), len(problem.unknowns)
+    seen = solution.at.seen[0]
+    assert isinstance(seen, FieldSeen)
+    unit = float(way @ carried.predicted(seen.resting))
     parameters = [*(u.parameter for u in problem.unknowns)]
-    names = [*parameters, *[None] * (len(solution.at.changes) - count)]
+    names = [*parameters, *[None] * (len(seen.changes) - count)]
     gradient = np.zeros(problem.size)
-    for n, (du, parameter) in enumerate(zip(solution.at.changes, names, strict=True)):
-        gradient[n] = way @ evidence.change(resting, du, parameter)
+    for n, (du, parameter) in enumerate(zip(seen.changes, names, strict=True)):
+        gradient[n] = way @ carried.change(seen.resting, du, parameter)
     told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
     known = [*told, *range(count, problem.size)]
     part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])
     size = float(np.hypot(*force.value))
-    value = size / force.thickness / carried
-    error = abs(value) * np.hypot(part / carried, force.noise / size)
-    matters = any(abs(gradient[n]) > 1e-9 * abs(carried) for n in range(count) if n not in told)
+    value = size / force.thickness / unit
+    error = abs(value) * np.hypot(part / unit, force.noise / size)
+    matters = any(abs(gradient[n]) > 1e-9 * abs(unit) for n in range(count) if n not in told)
     return Estimate(value, float(error), told=not matters)

@@ -62,9 +62,10 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         step = _linear_step(at, low - z, high - z, loss)
         share = 1.0
         while True:
-            there = problem.at(z + share * step)
+            there = _at(problem, z + share * step, share)
             count += 1
-            if _cost(there.residuals, loss) <= _cost(at.residuals, loss) * (1.0 + SLACK):
+            most = _cost(at.residuals, loss) * (1.0 + SLACK)
+            if there is not None and _cost(there.residuals, loss) <= most:
                 break
             share /= 4.0
             if share < SMALLEST:
@@ -78,6 +79,16 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     ratio = _spread(at.residuals, problem.size, loss)
     covariance *= max(1.0, ratio) ** 2
     return Solution(z, at, covariance, ratio, untold, _on_bounds(problem, z), count)
+
+
+def _at(problem: Problem, z: Floats, share: float) -> At | None:
+    """None where nothing is predicted there, as long as a smaller step may be taken."""
+    try:
+        return problem.at(z)
+    except UnconvergedError:
+        if share < 4.0 * SMALLEST:
+            raise
+        return None
 
 
 def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:

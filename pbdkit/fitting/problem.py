@@ -3,21 +3,17 @@ unknown."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.fitting.boundary import Boundary, boundaries
-from pbdkit.fitting.evidence import Evidence
+from pbdkit.fitting.observation import Observation, Seen
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting
-from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats
-
-DERIVATIVES = 1e-7
-"""How accurate they are, as a share of the largest: far within any noise."""
 
 
 @dataclass(frozen=True)
@@ -36,56 +32,69 @@ class Unknown:
 
 @dataclass(frozen=True)
 class At:
-    """The problem at some z: the scene at rest, the residuals (measured - predicted) / noise of all
-    evidence, and their derivatives (residual, unknown)."""
+    """The problem at some z: the residuals (measured - predicted) / noise of all observations, one
+    after another, their derivatives (residual, unknown), and each observation by itself."""
 
-    resting: Resting
     residuals: Floats
     jacobian: Floats
-    changes: tuple[Floats, ...] = field(repr=False)
-    """The derivative of the displacements by each unknown, as planes."""
+    seen: tuple[Seen, ...]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """z is the parameters, then the coefficients of the boundaries, then the strengths of what the
-    measurement shows beside the body's displacement."""
+    """z is the parameters, then Young's modulus where an observation needs it, then what each
+    observation has of its own."""
 
-    experiment: Experiment
-    scene: Scene
     unknowns: tuple[Unknown, ...]
-    boundaries: tuple[Boundary, ...]
-    evidence: tuple[Evidence, ...]
-
-    @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        unknowns: tuple[Unknown, ...],
-        evidence: tuple[Evidence, ...],
-        modes: int,
-    ) -> Problem:
-        """With so many modes along each measured boundary."""
-        found = boundaries(scene, modes) if modes else ()
-        return cls(scene.experiment, scene, unknowns, found, evidence)
+    observations: tuple[Observation, ...]
 
     @cached_property
-    def extra(self) -> int:
-        """How many strengths there are."""
-        return sum(e.distortions.shape[1] for e in self.evidence)
+    def with_modulus(self) -> bool:
+        """Whether Young's modulus is unknown too."""
+        return any(o.needs_modulus for o in self.observations)
+
+    @cached_property
+    def shared(self) -> int:
+        """How many unknowns are those of all observations."""
+        return len(self.unknowns) + self.with_modulus
 
     @cached_property
     def size(self) -> int:
         """Of z."""
-        return len(self.unknowns) + sum(b.size for b in self.boundaries) + self.extra
+        return self.shared + sum(o.own for o in self.observations)
+
+    def rows(self) -> Iterator[tuple[Observation, slice]]:
+        """Each observation with its residuals among all."""
+        first = 0
+        for observation in self.observations:
+            yield observation, slice(first, first := first + len(observation.measured))
+
+    def owned(self) -> Iterator[tuple[Observation, slice]]:
+        """Each observation with what it owns of z."""
+        first = self.shared
+        for observation in self.observations:
+            yield observation, slice(first, first := first + observation.own)
 
     def start(self) -> Floats:
         """In the middle between bounds, with boundaries as they were measured."""
-        steps = self.experiment.steps
-        middle = [(u.low + u.high) / 2 for u in self.unknowns]
-        return np.concatenate(
-            [middle, *(b.start(steps) for b in self.boundaries), np.zeros(self.extra)]
-        )
+        z = np.zeros(self.size)
+        z[: len(self.unknowns)] = [(u.low + u.high) / 2 for u in self.unknowns]
+        for observation, own in self.owned():
+            z[own] = observation.start()
+        return self.with_best_modulus(z)
+
+    def with_best_modulus(self, z: Floats) -> Floats:
+        """The same with the modulus that fits best there. Raises ExperimentError where the model
+        exerts no force."""
+        if not self.with_modulus:
+            return z
+        terms = [o.modulus_terms(self.experiment_at(o, z)) for o in self.observations]
+        product, square = np.sum(terms, axis=0)
+        if square == 0.0:
+            raise ExperimentError("the group exerts no force in this experiment", ("measured",))
+        z = z.copy()
+        z[len(self.unknowns)] = product / square
+        return z
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Of parameters; the others have none."""
@@ -94,42 +103,27 @@ class Problem:
             low[n], high[n] = unknown.low, unknown.high
         return low, high
 
-    def experiment_at(self, z: Floats) -> Experiment:
-        """The experiment with these numbers."""
-        found, n = self.experiment, len(self.unknowns)
+    def experiment_at(self, observation: Observation, z: Floats) -> Experiment:
+        """The experiment of an observation with these parameters."""
+        found = observation.experiment
         for unknown, value in zip(self.unknowns, z, strict=False):
             found = unknown.parameter.put(found, float(value))
-        for boundary in self.boundaries:
-            found = boundary.moved(found, z[n : n + boundary.size])
-            n += boundary.size
         return found
 
     def at(self, z: Floats) -> At:
-        """All of it. Raises ExperimentError, and UnconvergedError where there is no equilibrium."""
-        resting = Resting.of(self.experiment_at(z), self.scene, DERIVATIVES)
-        columns, changes = [], []
-        for unknown in self.unknowns:
-            changes.append(resting.change(unknown.parameter))
-            columns.append(self._changed(resting, changes[-1], unknown.parameter))
-        for boundary in self.boundaries:
-            for n in range(boundary.size):
-                changes.append(resting.answer(boundary.planes(resting.scene, n)))
-                columns.append(self._changed(resting, changes[-1], None))
-        beside, strengths = self._distortions(), z[self.size - self.extra :]
-        jacobian = np.column_stack([*columns, beside]) if columns else beside
-        parts = [(e.measured - e.predicted(resting)) / e.noise for e in self.evidence]
-        residuals = np.concatenate(parts) - beside @ strengths
-        return At(resting, residuals, jacobian, tuple(changes))
-
-    def _changed(self, resting: Resting, du: Floats, parameter: Parameter | None) -> Floats:
-        return np.concatenate([e.change(resting, du, parameter) / e.noise for e in self.evidence])
-
-    def _distortions(self) -> Floats:
-        """(residual, strength): over the noise, those of each evidence on its own rows."""
-        whole = np.zeros((sum(len(e.measured) for e in self.evidence), self.extra))
-        row = column = 0
-        for e in self.evidence:
-            rows, columns = e.distortions.shape
-            whole[row : row + rows, column : column + columns] = e.distortions / e.noise
-            row, column = row + rows, column + columns
-        return whole
+        """All of it. Raises ExperimentError, and UnconvergedError where nothing is predicted."""
+        parameters = [u.parameter for u in self.unknowns]
+        count = sum(len(o.measured) for o in self.observations)
+        jacobian, seen, residuals = np.zeros((count, self.size)), [], np.zeros(count)
+        modulus = float(z[len(parameters)]) if self.with_modulus else 1.0
+        pairs = zip(self.rows(), self.owned(), strict=True)
+        for (observation, rows), (_, own) in pairs:
+            experiment = self.experiment_at(observation, z)
+            found = observation.at(experiment, parameters, z[own], modulus)
+            seen.append(found)
+            residuals[rows] = found.residuals
+            jacobian[rows, : len(parameters)] = found.by_parameter
+            jacobian[rows, own] = found.by_own
+            if self.with_modulus:
+                jacobian[rows, len(parameters)] = found.by_modulus
+        return At(residuals, jacobian, tuple(seen))

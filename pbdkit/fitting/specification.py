@@ -6,26 +6,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, model_validator
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.base import Base, base_source
-from pbdkit.experiment.columns import read_columns
 from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import report
 from pbdkit.experiment.source import Source, read_file
+from pbdkit.fitting.measurements import MeasuredField, Measurements, Pair, Positive
 from pbdkit.interfaces.component import Strict, did_you_mean
-from pbdkit.stepping.state import Floats
 
 FOLDER = Path(__file__).parent.parent / "fits"
-Positive = Annotated[float, Field(gt=0.0)]
-Term = Annotated[
-    tuple[Annotated[int, Field(ge=0, le=4)], Annotated[int, Field(ge=0, le=4)]],
-    Field(strict=False),
-]
-Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 def _two(bounds: Pair) -> Pair:
@@ -35,46 +27,6 @@ def _two(bounds: Pair) -> Pair:
 
 
 Bounds = Annotated[Pair, AfterValidator(_two)]
-
-
-class Distortion(Strict):
-    """What the measurement shows beside the displacement of the body, in its plane: polynomials of
-    x and y, by their exponents, each as much as fits. A camera that turns, a lens, and bending out
-    of the plane are such: `ux: [[2, 0]]` is a strain that rises evenly along x."""
-
-    ux: Annotated[tuple[Term, ...], Field(strict=False)] = ()
-    uy: Annotated[tuple[Term, ...], Field(strict=False)] = ()
-
-
-class MeasuredField(Strict):
-    """Displacements at scattered points, in lattice units or, with `units` in the experiment, in
-    what they say: the `columns` of a CSV `file` beside this one.
-
-    `noise` is the standard deviation of a displacement; without it that of the residuals is taken.
-    Points nearer to the outline of the body than `margin` are left out.
-    """
-
-    file: str
-    columns: Annotated[tuple[str, str, str, str], Field(strict=False)] = ("x", "y", "ux", "uy")
-    noise: Positive | None = None
-    margin: Annotated[float, Field(ge=0.0)] = 0.0
-    distortion: Distortion = Field(default_factory=Distortion)
-    _rows: Any = None
-
-    @model_validator(mode="after")
-    def _read(self, info: ValidationInfo) -> Self:
-        object.__setattr__(self, "_rows", np.array(read_columns(self.file, info, self.columns)))
-        return self
-
-    @property
-    def points(self) -> Floats:
-        """(point, axis)."""
-        return np.asarray(self._rows[:, :2])
-
-    @property
-    def displacements(self) -> Floats:
-        """(point, axis)."""
-        return np.asarray(self._rows[:, 2:])
 
 
 class Force(Strict):
@@ -88,8 +40,8 @@ class Force(Strict):
 
 
 class Fit(Strict):
-    """Looks for the `unknown` parameters, between bounds, with which the equilibrium of an
-    experiment is nearest to what was measured.
+    """Looks for the `unknown` parameters, between bounds, with which an experiment is nearest to
+    what was measured of it: a field of its equilibrium, tracks, a curve, or some of these.
 
     Groups that move by `measured` are given `modes` smooth displacements along each axis, which
     are estimated too; 0 takes what was measured there as it is. `loss` says how residuals count:
@@ -99,10 +51,29 @@ class Fit(Strict):
     version: Version = 1
     experiment: Base
     unknown: Annotated[dict[str, Bounds], Field(min_length=1)]
-    measured: MeasuredField
+    measured: Measurements
     force: Force | None = None
     modes: Annotated[int, Field(ge=0, le=40)] = 6
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+
+    _folder: Path = Path()
+
+    @property
+    def folder(self) -> Path:
+        """Where files that it names lie."""
+        return self._folder
+
+    @model_validator(mode="after")
+    def _fits_together(self, info: ValidationInfo) -> Self:
+        object.__setattr__(self, "_folder", Path((info.context or {}).get("folder", "")))
+        if len(self.measured) > 1 and any(m.noise is None for m in self.measured):
+            raise ValueError("several measurements need the `noise` of each, to be weighed by it")
+        if self.force and not isinstance(self.measured[0], MeasuredField):
+            raise ValueError(
+                "`force` is what a group carries at rest while a field is measured; give forces "
+                "over displacement as a curve"
+            )
+        return self
 
 
 def described_fit(

@@ -1,0 +1,69 @@
+"""What was measured of one experiment, and what the experiment has to say of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from pbdkit.experiment.model import Experiment
+from pbdkit.fitting.parameter import Parameter
+from pbdkit.stepping.state import Floats
+
+
+@dataclass(frozen=True)
+class Seen:
+    """At some parameters: the residuals (measured - predicted) / noise, (number,), and how the
+    predictions over their noise change with each parameter, (number, parameter), with each unknown
+    of the observation's own, (number, own), and with Young's modulus, (number,)."""
+
+    residuals: Floats
+    by_parameter: Floats
+    by_own: Floats
+    by_modulus: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation(ABC):
+    """Numbers that were measured of an experiment. `noise` is their standard deviation, over the
+    root of their weight; both come in `unit`s of what was given. `left_out` rows are of no use."""
+
+    kind: ClassVar[str]
+    experiment: Experiment
+    measured: Floats
+    noise: float
+    left_out: int = 0
+    unit: float = 1.0
+
+    @property
+    def needs_modulus(self) -> bool:
+        """Whether it tells Young's modulus."""
+        return False
+
+    @property
+    def own(self) -> int:
+        """How many unknowns it has beside the parameters."""
+        return 0
+
+    def start(self) -> Floats:
+        """Where the search for these begins, (own,)."""
+        return np.zeros(self.own)
+
+    @abstractmethod
+    def at(
+        self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float
+    ) -> Seen:
+        """What there is at an experiment like its own. Raises ExperimentError, and
+        UnconvergedError where nothing can be predicted."""
+
+    def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
+        """Σ measured · p and Σ p² over the noise squared, with the predictions p for a modulus of
+        1: their ratio is where the search for it begins."""
+        return 0.0, 0.0
+
+    def with_noise(self, noise: float) -> Self:
+        """The same with another noise."""
+        return replace(self, noise=noise)

@@ -1,0 +1,98 @@
+"""A field of displacements, measured at rest: of an equilibrium, with boundaries that are unknown
+too, and with what the measurement shows beside the body's displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from pbdkit.experiment.model import Experiment
+from pbdkit.fitting.boundary import Boundary, boundaries
+from pbdkit.fitting.evidence import FieldEvidence
+from pbdkit.fitting.observation import Observation, Seen
+from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.sensitivity import Resting
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import Floats
+
+DERIVATIVES = 1e-7
+"""How accurate they are, as a share of the largest: far within any noise."""
+
+
+@dataclass(frozen=True)
+class FieldSeen(Seen):
+    """With the scene at rest, and the derivative of its displacements by each parameter, then by
+    each coefficient of boundaries, as planes."""
+
+    resting: Resting
+    changes: tuple[Floats, ...] = field(repr=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldObservation(Observation):
+    """Its own unknowns are the coefficients of the boundaries, then the strengths of the
+    distortions."""
+
+    kind: ClassVar[str] = "field"
+    scene: Scene
+    evidence: FieldEvidence
+    boundaries: tuple[Boundary, ...]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, evidence: FieldEvidence, noise: float, modes: int, left_out: int = 0
+    ) -> FieldObservation:
+        """With so many modes along each measured boundary; 0 takes it as it was measured."""
+        return cls(
+            experiment=scene.experiment,
+            measured=evidence.measured,
+            noise=noise,
+            left_out=left_out,
+            scene=scene,
+            evidence=evidence,
+            boundaries=boundaries(scene, modes) if modes else (),
+        )
+
+    @property
+    def own(self) -> int:
+        """Coefficients and strengths."""
+        return self._coefficients + int(self.evidence.distortions.shape[1])
+
+    @property
+    def _coefficients(self) -> int:
+        return sum(b.size for b in self.boundaries)
+
+    def start(self) -> Floats:
+        """Boundaries as they were measured, and no distortion."""
+        known = [b.start(self.experiment.steps) for b in self.boundaries]
+        return np.concatenate([*known, np.zeros(self.own - self._coefficients)])
+
+    def at(
+        self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float
+    ) -> FieldSeen:
+        """At its equilibrium."""
+        n = 0
+        for boundary in self.boundaries:
+            experiment = boundary.moved(experiment, own[n : n + boundary.size])
+            n += boundary.size
+        resting = Resting.of(experiment, self.scene, DERIVATIVES)
+        changes = [resting.change(parameter) for parameter in parameters]
+        for boundary in self.boundaries:
+            planes = (boundary.planes(resting.scene, m) for m in range(boundary.size))
+            changes += [resting.answer(each) for each in planes]
+        by = [self.evidence.seen(du, resting) / self.noise for du in changes]
+        rows, count = len(self.measured), len(parameters)
+        beside = self.evidence.distortions / self.noise
+        predicted = self.evidence.seen(resting.state.u, resting)
+        residuals = (self.measured - predicted) / self.noise - beside @ own[n:]
+        return FieldSeen(
+            residuals,
+            np.array(by[:count]).T.reshape(rows, count),
+            np.column_stack([*by[count:], beside]) if by[count:] else beside,
+            np.zeros(rows),
+            resting,
+            tuple(changes),
+        )
