@@ -23,9 +23,10 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.parts import closed_part
 from pbdkit.experiment.solvers import Equilibrium
 from pbdkit.fitting.evidence import FieldEvidence
+from pbdkit.fitting.force_curve import CurveObservation
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.resting_field import FieldObservation
-from pbdkit.fitting.run_readings import CurveObservation, TracksObservation
+from pbdkit.fitting.tracks import TracksObservation
 from pbdkit.interfaces.component import Component, Strict
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import Floats

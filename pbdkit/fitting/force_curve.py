@@ -1,0 +1,122 @@
+"""The curve of the force that a leader group exerts while an experiment runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from pbdkit.components.forces import reactions
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.model import Experiment
+from pbdkit.fitting.run_observation import RunObservation, read_at
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
+from pbdkit.runs.course import Run
+from pbdkit.stepping.state import Floats, State
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurveObservation(RunObservation):
+    """The force that a leader group exerts along a direction, at displacements of the group along
+    it until it stops or turns, or at times; over the thickness, and over Young's modulus unless
+    that is to be `scaled` by what fits. It is linear between recorded steps."""
+
+    kind: ClassVar[str] = "curve"
+    group: int
+    way: tuple[float, float]
+    at_times: bool
+    scaled: bool
+    places: Floats
+
+    @property
+    def needs_modulus(self) -> bool:
+        """Where it is not known."""
+        return self.scaled
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        places: Floats,
+        forces: Floats,
+        noise: float,
+        group: int,
+        way: tuple[float, float],
+        *,
+        at_times: bool,
+        scaled: bool,
+    ) -> CurveObservation:
+        """Raises ExperimentError for a group that is not there, and for places that the run does
+        not come to."""
+        scene = read_at(experiment)
+        if group >= len(scene.leading):
+            raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
+        found = cls(
+            experiment=experiment,
+            measured=forces,
+            noise=noise,
+            scene=scene,
+            group=group,
+            way=way,
+            at_times=at_times,
+            scaled=scaled,
+            places=places,
+        )
+        come, _ = found.curve(Run(scene))
+        inside = (places >= come.min()) & (places <= come.max())
+        if not inside.any():
+            what = "steps" if at_times else "displacements of the group"
+            raise ExperimentError(
+                f"the curve goes from {places.min():g} to {places.max():g}, and the run's {what} "
+                f"from {come.min():g} to {come.max():g}",
+                ("measured", "file"),
+            )
+        return replace(
+            found,
+            measured=forces[inside],
+            places=places[inside],
+            left_out=int((~inside).sum()),
+        )
+
+    def _read(self, run: Run) -> Floats:
+        come, force = self.curve(run)
+        return np.interp(self.places, come, force)
+
+    def curve(self, run: Run) -> tuple[Floats, Floats]:
+        """At each recorded step, until the group stops or turns, the place (step,) and the force
+        over Young's modulus and thickness (step,)."""
+        tables, places, forces = Tables(run.scene), [], []
+        for state in run:
+            if run.scene.experiment.record.keeps(state.step, run.scene.experiment.steps):
+                moment = StateMoment(state, tables)
+                places.append(state.step if self.at_times else self._gone(state))
+                forces.append(np.dot(self.way, reactions(moment)[self.group]))
+        return _going_on(np.array(places, float), np.array(forces))
+
+    def _gone(self, state: State) -> float:
+        place = self._leading_place
+        flat = state.u.reshape(len(state.u), -1)[:, place]
+        return float(np.dot(self.way, flat.mean(axis=1)))
+
+    @cached_property
+    def _leading_place(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        return np.asarray(self.scene.leading[self.group].place)
+
+
+def _going_on(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
+    """Places as far as they go on one way, rising, and the forces there. Raises ExperimentError
+    where they do not at all."""
+    ways = np.sign(np.diff(places))
+    if not ways.size or ways[0] == 0.0:
+        raise ExperimentError(
+            "the group does not move along the force in its first recorded step, so that a "
+            "displacement names no moment: give `against: time`",
+            ("measured", "against"),
+        )
+    other = np.flatnonzero(ways != ways[0])
+    count = int(other[0]) + 1 if other.size else len(places)
+    order = slice(None) if ways[0] > 0.0 else slice(None, None, -1)
+    return places[:count][order], forces[:count][order]

@@ -1,0 +1,223 @@
+"""Parameters come back from what was measured while an experiment ran: tracks, curves of force."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.fitting.calling import problem_of
+from pbdkit.fitting.specification import described_fit
+
+WIDTH, HEIGHT, STEPS = 8.0, 4.0, 16
+MODULUS, THICKNESS, NOISE = 1000.0, 2.0, 1e-4
+
+
+def bar(**more):
+    return {
+        "name": "bar",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "rectangle", "width": WIDTH, "height": HEIGHT},
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "velocity", "velocity": [0.02, 0.01], "steps": 10},
+            },
+        ],
+        "steps": STEPS,
+        "solver": {"type": "stepping", "relaxation": 0.8, "engine": "numpy"},
+    } | more
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """The files of what a run shows."""
+    folder, generator = tmp_path_factory.mktemp("measured"), np.random.default_rng(5)
+    asked = {"type": "reaction", "youngs_modulus": MODULUS, "thickness": THICKNESS}
+    ds = pbdkit.run(bar(diagnostics=[asked]), progress=False)
+    position, x = ds.position.values, ds.position.values[0, :, 0]
+    inner = np.flatnonzero((x > 0.0) & (x < WIDTH))
+    rows = []
+    for time in (2, 5, 9.25, 15):
+        low, part = int(time), time % 1
+        now = (1 - part) * position[low] + part * position[min(low + 1, STEPS)]
+        u = now - position[0] + NOISE * generator.normal(size=now.shape)
+        rows += [[time, *position[0, k], *u[k]] for k in inner]
+    write(folder / "tracks.csv", ["time", "x", "y", "ux", "uy"], rows)
+    force = ds.reaction.sel(leader_group=1, axis="x").values
+    force = force + 0.01 * generator.normal(size=force.shape)
+    gone = (position - position[0])[:, x == WIDTH, 0].mean(axis=1)
+    write(folder / "curve.csv", ["displacement", "force"], np.c_[gone, force][1:10])
+    write(folder / "force.csv", ["time", "force"], np.c_[ds.time.values, force])
+    return folder
+
+
+def write(path, header, rows):
+    with path.open("w", newline="") as file:
+        lines = csv.writer(file)
+        lines.writerow(header)
+        lines.writerows(np.asarray(rows).tolist())
+
+
+def tracks(folder, **more):
+    return {"type": "tracks", "file": str(folder / "tracks.csv"), "noise": NOISE} | more
+
+
+def curve(folder, **more):
+    given = {"file": str(folder / "curve.csv"), "noise": 0.01, "thickness": THICKNESS}
+    return {"type": "curve", "group": 1} | given | more
+
+
+TOLD = {"rule.poisson_ratio": [0.0, 0.45], "solver.relaxation": [0.3, 0.95]}
+TRUE = {"rule.poisson_ratio": 0.3, "solver.relaxation": 0.8}
+
+
+def within(found, *, of=TRUE):
+    """Within four of their standard errors, which are small."""
+    for path, estimate in found.values.items():
+        assert estimate.told
+        assert estimate.error < 0.01
+        assert estimate.value == pytest.approx(of[path], abs=4 * estimate.error)
+
+
+def test_tracks_in_time_tell_the_material_and_the_relaxation(measured):
+    found = pbdkit.fit({"experiment": bar(), "unknown": TOLD, "measured": tracks(measured)})
+    within(found)
+    assert found.ratio == pytest.approx(1.0, abs=0.2)
+    assert found.met[0].left_out == 0
+
+
+@pytest.mark.parametrize("against", ["displacement", "time"])
+def test_a_curve_of_force_tells_youngs_modulus_too(measured, against):
+    given = curve(measured)
+    if against == "time":
+        given |= {"file": str(measured / "force.csv"), "against": "time"}
+        given |= {"columns": ["time", "force"]}
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    found = pbdkit.fit({"experiment": bar(), "unknown": unknown, "measured": given})
+    within(found)
+    modulus = found.youngs_modulus
+    assert modulus.value == pytest.approx(MODULUS, abs=4 * modulus.error)
+    assert modulus.error < 1.0
+    known = pbdkit.fit(
+        {"experiment": bar(), "unknown": unknown, "measured": given | {"youngs_modulus": MODULUS}}
+    )
+    within(known)
+    assert known.youngs_modulus is None
+    error = {id(f): f.values["rule.poisson_ratio"].error for f in (found, known)}
+    assert error[id(known)] <= error[id(found)]
+
+
+def test_two_measurements_tell_more_than_each(measured):
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    both = [tracks(measured), curve(measured, youngs_modulus=MODULUS)]
+    found = [
+        pbdkit.fit({"experiment": bar(), "unknown": unknown, "measured": given})
+        for given in (*both, both)
+    ]
+    one, other, together = (f.solution.covariance[0, 0] / max(1, f.ratio) ** 2 for f in found)
+    assert 1 / together == pytest.approx(1 / one + 1 / other, rel=0.02)
+    assert [met.kind for met in found[2].met] == ["tracks", "curve"]
+
+
+def test_a_weight_counts_like_a_smaller_noise(measured):
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    weighted, finer = (
+        pbdkit.fit(
+            {
+                "experiment": bar(),
+                "unknown": unknown,
+                "measured": [tracks(measured, **first), curve(measured)],
+            }
+        )
+        for first in ({"weight": 4.0}, {"noise": NOISE / 2})
+    )
+    one, other = (f.values["rule.poisson_ratio"] for f in (weighted, finer))
+    assert one.value == pytest.approx(other.value, rel=1e-12)
+
+
+def test_a_measurement_may_have_settings_of_its_own(measured, tmp_path):
+    """Two tests of one material: the second pulls the other way, and half as far."""
+    back = {"leaders.1.motion.velocity": [-0.01, 0.0]}
+    ds = pbdkit.run(
+        bar(diagnostics=[{"type": "reaction", "youngs_modulus": MODULUS, "thickness": THICKNESS}])
+        | {"leaders": [bar()["leaders"][0], bar()["leaders"][1] | {"motion": {
+            "type": "velocity", "velocity": [-0.01, 0.0], "steps": 10}}]},
+        progress=False,
+    )  # fmt: skip
+    force = ds.reaction.sel(leader_group=1, axis="x").values
+    write(tmp_path / "back.csv", ["time", "force"], np.c_[ds.time.values, force])
+    second = curve(
+        measured,
+        file=str(tmp_path / "back.csv"),
+        against="time",
+        columns=["time", "force"],
+        settings=back,
+    )
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    found = pbdkit.fit(
+        {"experiment": bar(), "unknown": unknown, "measured": [curve(measured), second]}
+    )
+    within(found)
+    assert found.met[1].ratio < 0.5  # it has no noise
+
+
+def test_derivatives_are_those_of_differences(measured):
+    fit = {
+        "experiment": bar(),
+        "unknown": TOLD,
+        "measured": [tracks(measured), curve(measured)],
+    }
+    asked, source = described_fit(fit, given=False)
+    problem = problem_of(asked, pbdkit.Experiment.build(source))
+    z = problem.start()
+    at = problem.at(z)
+    for n in range(problem.size):
+        step = 1e-4 * max(abs(z[n]), 0.1)
+        ends = [problem.at(z + sign * step * np.eye(problem.size)[n]) for sign in (1, -1)]
+        slope = -(ends[0].residuals - ends[1].residuals) / (2 * step)
+        np.testing.assert_allclose(
+            at.jacobian[:, n], slope, rtol=1e-5, atol=1e-6 * abs(slope).max()
+        )
+
+
+WRONG = {
+    "beyond the run": (lambda f: tracks(f), {"steps": 10}, "times go from 2 to 15"),
+    "no such group": (lambda f: curve(f, group=5), {}, "no leader group 5"),
+    "does not move": (lambda f: curve(f, group=0), {}, "against: time"),
+    "another way": (lambda f: curve(f, axis="y", file="force.csv"), {}, "no 'displacement'"),
+    "not the kind": (lambda f: curve(f) | {"type": "curves"}, {}, "did you mean 'curve'"),
+    "no noise": (
+        lambda f: [tracks(f), {k: v for k, v in curve(f).items() if k != "noise"}],
+        {},
+        "need the `noise` of each",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_named(name, measured, monkeypatch):
+    monkeypatch.chdir(measured)
+    make, more, told = WRONG[name]
+    unknown = {"rule.poisson_ratio": [0.0, 0.45]}
+    with pytest.raises(pbdkit.ExperimentError, match=told):
+        pbdkit.fit({"experiment": bar(**more), "unknown": unknown, "measured": make(measured)})
+
+
+def test_bonds_that_break_otherwise_are_refused(measured):
+    """The limit is met at a strain that the parameter decides."""
+    breaking = bar(fracture={"type": "strain", "failure": 0.0125})
+    with pytest.raises(pbdkit.ExperimentError, match="breaks other bonds"):
+        pbdkit.fit(
+            {
+                "experiment": breaking,
+                "unknown": {"rule.poisson_ratio": [0.0, 0.45]},
+                "measured": tracks(measured),
+            }
+        )
