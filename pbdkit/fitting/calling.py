@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
@@ -10,31 +12,62 @@ from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.source import Source
+from pbdkit.fitting.comparison import Candidate, Posed, compared
 from pbdkit.fitting.fitted import Fitted, fitted
 from pbdkit.fitting.least_squares import Solution, solved
 from pbdkit.fitting.measurements import Measured
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import Problem, Unknown
+from pbdkit.fitting.profile import profiled
 from pbdkit.fitting.resting_field import FieldObservation
+from pbdkit.fitting.sampling import sampled
 from pbdkit.fitting.specification import Fit
+
+GIVEN = "as given"
+"""What the experiment of the fit is called among candidates."""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment) -> Fitted:
     """Carries a fit out, on one thread. Raises ExperimentError for what cannot be fitted."""
     with one_thread():
-        problem = problem_of(fit, experiment)
-        return fitted(fit, *_solved(problem, fit))
+        problem, solution = _solved(problem_of(fit, experiment), fit)
+        names = [*fit.unknown]
+        profiles = {
+            path: profiled(problem, solution, names.index(path), fit.loss) for path in fit.profile
+        }
+        sample = sampled(problem, solution, **dict(fit.sampler)) if fit.sampler else None
+        candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution))
+        found = fitted(fit, problem, solution)
+        return replace(found, profiles=profiles, sample=sample, candidates=candidates)
 
 
-def problem_of(fit: Fit, experiment: Experiment) -> Problem:
-    """The problem that a fit file poses. Raises ExperimentError."""
-    unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in fit.unknown.items())
+def _compared(fit: Fit, experiment: Experiment, own: Posed) -> tuple[Candidate, ...]:
+    """The experiment as it is given, and all that the fit names."""
+    if not fit.candidates:
+        return ()
+    posed, noises = [own], [o.noise for o in own.problem.observations]
+    for name, rival in fit.candidates.items():
+        changed = _with_settings(experiment, rival.settings, fit, f"candidates.{name}")
+        problem = problem_of(fit, changed, rival.unknown)
+        pairs = zip(problem.observations, noises, strict=True)
+        problem = replace(problem, observations=tuple(o.with_noise(n) for o, n in pairs))
+        posed.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
+    return compared(posed, fit.folds, fit.loss, seed=0)
+
+
+def problem_of(
+    fit: Fit, experiment: Experiment, asked: Mapping[str, tuple[float, float]] | None = None
+) -> Problem:
+    """The problem that a fit file poses, or that with something else unknown. Raises
+    ExperimentError."""
+    pairs = (asked or fit.unknown).items()
+    unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
     for unknown in unknowns:
         unknown.parameter.value_in(experiment)
     observations = []
     for measured in fit.measured:
-        found = measured.observation(_with_settings(experiment, measured, fit), fit.modes)
+        found = measured.observation(_changed(experiment, measured, fit), fit.modes)
         _refuse_too_few(found, len(unknowns))
         observations.append(found)
     if fit.force and isinstance(observations[0], FieldObservation):
@@ -45,12 +78,19 @@ def problem_of(fit: Fit, experiment: Experiment) -> Problem:
     return Problem(unknowns, tuple(observations))
 
 
-def _with_settings(experiment: Experiment, measured: Measured, fit: Fit) -> Experiment:
+def _changed(experiment: Experiment, measured: Measured, fit: Fit) -> Experiment:
     if not measured.settings:
         return experiment
+    return _with_settings(experiment, measured.settings, fit, "measured")
+
+
+def _with_settings(
+    experiment: Experiment, settings: Mapping[str, Any], fit: Fit, where: str
+) -> Experiment:
     source = Source(experiment.name, experiment.as_written(), {}, fit.folder)
-    for path, value in measured.settings.items():
-        source = with_value(source, path, value, f"settings: {path}", Experiment.defaults())
+    for path, value in settings.items():
+        label = f"{where}.settings: {path}"
+        source = with_value(source, path, value, label, Experiment.defaults())
     return Experiment.build(source, given_classes(experiment))
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.components.forces import reactions
 from pbdkit.fitting.interpolation import Interpolation
@@ -20,12 +21,14 @@ from pbdkit.stepping.state import Floats
 @dataclass(frozen=True)
 class FieldEvidence:
     """Displacements measured at points within the body (point, axis): x of all, then y of all.
-    `terms` are the exponents of x and y of what the measurement shows besides, of ux and of uy."""
+    `terms` are the exponents of x and y of what the measurement shows besides, of ux and of uy,
+    over a `box`, from its lower left to its upper right corner."""
 
     points: Floats
     measured: Floats
     interpolation: Interpolation = field(repr=False)
-    terms: tuple[tuple[tuple[int, int], ...], ...] = ((), ())
+    terms: tuple[tuple[tuple[int, int], ...], ...]
+    box: tuple[Floats, Floats]
 
     @classmethod
     def of(
@@ -38,12 +41,23 @@ class FieldEvidence:
         """Of scattered points (point, axis); those outside of the body are left out."""
         found = Interpolation.at(scene, points)
         inside = found.inside
-        return cls(points[inside], displacements[inside].T.ravel(), found, terms)
+        points = points[inside]
+        box = (points.min(axis=0), points.max(axis=0)) if len(points) else (points[0:1], points)
+        return cls(points, displacements[inside].T.ravel(), found, terms, box)
+
+    def part(self, chosen: NDArray[np.bool_]) -> FieldEvidence:
+        """Of some of the points."""
+        return replace(
+            self,
+            points=self.points[chosen],
+            measured=self.measured.reshape(2, -1)[:, chosen].ravel(),
+            interpolation=self.interpolation.part(chosen),
+        )
 
     @cached_property
     def distortions(self) -> Floats:
-        """The polynomials, over the points' box from -1 to 1."""
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        """The polynomials over the box, from -1 to 1 in it."""
+        low, high = self.box
         x, y = (2.0 * (self.points - low) / np.maximum(high - low, 1e-300) - 1.0).T
         columns, n = [], len(x)
         for axis, terms in enumerate(self.terms):

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.fitting.comparison import Candidate
 from pbdkit.fitting.evidence import Carried
 from pbdkit.fitting.least_squares import TELLS, Solution
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
+from pbdkit.fitting.profile import Profile
 from pbdkit.fitting.resting_field import FieldObservation, FieldSeen
+from pbdkit.fitting.sampling import Sample
 from pbdkit.fitting.specification import Fit, Force
 from pbdkit.stepping.state import Floats
 
@@ -63,8 +66,9 @@ class Fitted:
 
     `values` by path, `correlations` (parameter, parameter), `youngs_modulus` where a force was
     given. Residuals are measured - fitted; `ratio` is how much larger they are than the noise,
-    which standard errors take into account; `met` says so of each measurement. `solution` and
-    `problem` have all else.
+    which standard errors take into account; `met` says so of each measurement. `profiles` by path,
+    `sample` and `candidates`, the best first, where they were asked for. `solution` and `problem`
+    have all else.
     """
 
     values: Mapping[str, Estimate]
@@ -73,6 +77,9 @@ class Fitted:
     met: tuple[Met, ...]
     problem: Problem = field(repr=False)
     solution: Solution = field(repr=False)
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
+    sample: Sample | None = field(default=None, repr=False)
+    candidates: tuple[Candidate, ...] = ()
 
     @property
     def ratio(self) -> float:
@@ -98,7 +105,27 @@ class Fitted:
             "residual_over_noise": self.ratio,
             "measured": [asdict(met) for met in self.met],
             "evaluations": self.solution.evaluations,
-        }
+        } | self._on_request()
+
+    def _on_request(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        if self.profiles:
+            found["profiles"] = {path: each.as_dict() for path, each in self.profiles.items()}
+        if self.sample:
+            words = ("mean", "deviation", "error")
+            found["sample"] = {
+                path: dict(zip(words, numbers, strict=True))
+                for path, *numbers in zip(*self._sampled, strict=True)
+            }
+        if self.candidates:
+            found["candidates"] = [asdict(each) for each in self.candidates]
+        return found
+
+    @property
+    def _sampled(self) -> tuple[list[Any], ...]:
+        assert self.sample is not None
+        numbers = (self.sample.mean, self.sample.deviation, self.sample.error)
+        return [*self.values], *(each.tolist() for each in numbers)
 
     def field(self, n: int = 0) -> FittedField:
         """What was measured at each point of measurement n, a field, and what the fit leaves.
@@ -142,6 +169,13 @@ class Fitted:
                 f"over {met.numbers} numbers"
                 + (f"; {met.left_out} rows were left out" if met.left_out else "")
             )
+        for path, profile in self.profiles.items():
+            yield f"{path}: {profile}, by its profile"
+        if self.sample:
+            numbers = zip(*self._sampled, strict=True)
+            for path, mean, deviation, error in numbers:
+                yield f"{path}: {Estimate(mean, deviation)}, by the sampler, to ± {error:.1g}"
+        yield from map(str, self.candidates)
 
 
 def _plain(estimate: Estimate) -> dict[str, Any]:

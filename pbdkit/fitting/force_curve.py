@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.components.forces import reactions
 from pbdkit.errors import ExperimentError
@@ -29,7 +30,7 @@ class CurveObservation(RunObservation):
     way: tuple[float, float]
     at_times: bool
     scaled: bool
-    places: Floats
+    along: Floats
 
     @property
     def needs_modulus(self) -> bool:
@@ -58,12 +59,13 @@ class CurveObservation(RunObservation):
             experiment=experiment,
             measured=forces,
             noise=noise,
+            rows=np.arange(len(forces)),
             scene=scene,
             group=group,
             way=way,
             at_times=at_times,
             scaled=scaled,
-            places=places,
+            along=places,
         )
         come, _ = found.curve(Run(scene))
         inside = (places >= come.min()) & (places <= come.max())
@@ -77,13 +79,22 @@ class CurveObservation(RunObservation):
         return replace(
             found,
             measured=forces[inside],
-            places=places[inside],
+            along=places[inside],
+            rows=np.flatnonzero(inside),
             left_out=int((~inside).sum()),
         )
 
+    def places(self) -> Floats:
+        """The displacements or times."""
+        return self.along[:, None]
+
+    def part(self, chosen: NDArray[np.bool_]) -> CurveObservation:
+        """Of some of them."""
+        return replace(super().part(chosen), along=self.along[chosen])
+
     def _read(self, run: Run) -> Floats:
         come, force = self.curve(run)
-        return np.interp(self.places, come, force)
+        return np.interp(self.along, come, force)
 
     def curve(self, run: Run) -> tuple[Floats, Floats]:
         """At each recorded step, until the group stops or turns, the place (step,) and the force

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,10 @@ class Interpolation:
         three of Delaunay's triangles. A point that lacks one of them is left out."""
         one = len(scene.raster.lattice.cell().sites) == 1
         return _in_cells(scene, points) if one else _in_triangles(scene, points)
+
+    def part(self, chosen: NDArray[Any]) -> Interpolation:
+        """Of some of the points inside: by their numbers among these, or True for each."""
+        return replace(self, rows=self.rows[chosen], shares=self.shares[chosen])
 
     def of(self, planes: Floats, scene: Scene) -> Floats:
         """(point, axis): the values of planes at the points inside."""

@@ -64,8 +64,8 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         while True:
             there = _at(problem, z + share * step, share)
             count += 1
-            most = _cost(at.residuals, loss) * (1.0 + SLACK)
-            if there is not None and _cost(there.residuals, loss) <= most:
+            most = cost_of(at.residuals, loss) * (1.0 + SLACK)
+            if there is not None and cost_of(there.residuals, loss) <= most:
                 break
             share /= 4.0
             if share < SMALLEST:
@@ -121,13 +121,16 @@ def _weight(residuals: Floats, loss: Loss) -> Floats:
     return np.asarray(1.0 / np.sqrt(1.0 + z) if loss == "soft_l1" else 1.0 / (1.0 + z))
 
 
-def _cost(residuals: Floats, loss: Loss) -> float:
+def cost_of(residuals: Floats, loss: Loss) -> float:
+    """-2 log L of residuals over their noise: Σ r², or what the loss makes of it."""
     z = np.square(residuals / OUTLIERS)
-    if loss == "linear":
-        return float(z.sum())
     if loss == "huber":
-        return float(np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0).sum())
-    return float((2.0 * (np.sqrt(1.0 + z) - 1.0) if loss == "soft_l1" else np.log1p(z)).sum())
+        z = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
+    elif loss == "soft_l1":
+        z = 2.0 * (np.sqrt(1.0 + z) - 1.0)
+    elif loss == "cauchy":
+        z = np.log1p(z)
+    return float(z.sum()) * OUTLIERS**2
 
 
 def _spread(residuals: Floats, unknowns: int, loss: Loss) -> float:

@@ -105,13 +105,12 @@ class MeasuredField(Measured):
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
         scene = build_scene(experiment)
         points, displacements = self.rows[:, :2], self.rows[:, 2:]
+        far = np.ones(len(points), bool)
         if self.margin:
-            inside = _depth(scene.experiment, points) >= self.margin
-            points, displacements = points[inside], displacements[inside]
+            far = _depth(scene.experiment, points) >= self.margin
         terms = self.distortion.ux, self.distortion.uy
-        evidence = FieldEvidence.of(scene, points, displacements, terms)
-        left_out = len(self.rows) - len(evidence.points)
-        return FieldObservation.of(scene, evidence, self.weighted_noise, modes, left_out)
+        evidence = FieldEvidence.of(scene, points[far], displacements[far], terms)
+        return FieldObservation.of(scene, evidence, self.weighted_noise, modes, far)
 
 
 class MeasuredTracks(Measured):

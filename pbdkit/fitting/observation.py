@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.parameter import Parameter
@@ -29,12 +30,14 @@ class Seen:
 @dataclass(frozen=True, kw_only=True)
 class Observation(ABC):
     """Numbers that were measured of an experiment. `noise` is their standard deviation, over the
-    root of their weight; both come in `unit`s of what was given. `left_out` rows are of no use."""
+    root of their weight; both come in `unit`s of what was given. `rows` are the numbers of the rows
+    that count among those that were given; `left_out` are of no use."""
 
     kind: ClassVar[str]
     experiment: Experiment
     measured: Floats
     noise: float
+    rows: NDArray[np.intp]
     left_out: int = 0
     unit: float = 1.0
 
@@ -63,6 +66,16 @@ class Observation(ABC):
         """Σ measured · p and Σ p² over the noise squared, with the predictions p for a modulus of
         1: their ratio is where the search for it begins."""
         return 0.0, 0.0
+
+    @abstractmethod
+    def places(self) -> Floats:
+        """Where it was measured, (row, coordinate): what lies near another row tells the same."""
+
+    def part(self, chosen: NDArray[np.bool_]) -> Self:
+        """The same of some of its rows, True for each."""
+        columns = len(self.measured) // len(self.rows)
+        measured = self.measured.reshape(columns, -1)[:, chosen].ravel()
+        return replace(self, measured=measured, rows=self.rows[chosen])
 
     def with_noise(self, noise: float) -> Self:
         """The same with another noise."""

@@ -4,10 +4,11 @@ too, and with what the measurement shows beside the body's displacement."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.boundary import Boundary, boundaries
@@ -43,14 +44,23 @@ class FieldObservation(Observation):
 
     @classmethod
     def of(
-        cls, scene: Scene, evidence: FieldEvidence, noise: float, modes: int, left_out: int = 0
+        cls,
+        scene: Scene,
+        evidence: FieldEvidence,
+        noise: float,
+        modes: int,
+        among: NDArray[np.bool_] | None = None,
     ) -> FieldObservation:
-        """With so many modes along each measured boundary; 0 takes it as it was measured."""
+        """With so many modes along each measured boundary; 0 takes it as it was measured. The
+        evidence was chosen `among` the rows that are True."""
+        inside = evidence.interpolation.inside if among is None else among
+        rows = np.flatnonzero(among) if among is not None else np.arange(len(inside))
         return cls(
             experiment=scene.experiment,
             measured=evidence.measured,
             noise=noise,
-            left_out=left_out,
+            rows=rows[evidence.interpolation.inside],
+            left_out=len(inside) - len(evidence.points),
             scene=scene,
             evidence=evidence,
             boundaries=boundaries(scene, modes) if modes else (),
@@ -69,6 +79,14 @@ class FieldObservation(Observation):
         """Boundaries as they were measured, and no distortion."""
         known = [b.start(self.experiment.steps) for b in self.boundaries]
         return np.concatenate([*known, np.zeros(self.own - self._coefficients)])
+
+    def places(self) -> Floats:
+        """The points."""
+        return self.evidence.points
+
+    def part(self, chosen: NDArray[np.bool_]) -> FieldObservation:
+        """Of some of them."""
+        return replace(super().part(chosen), evidence=self.evidence.part(chosen))
 
     def at(
         self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float

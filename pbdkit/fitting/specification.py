@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, model_validator
 
@@ -14,6 +14,7 @@ from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import report
 from pbdkit.experiment.source import Source, read_file
+from pbdkit.fitting.least_squares import Loss
 from pbdkit.fitting.measurements import MeasuredField, Measurements, Pair, Positive
 from pbdkit.interfaces.component import Strict, did_you_mean
 
@@ -39,6 +40,22 @@ class Force(Strict):
     noise: Annotated[float, Field(ge=0.0)] = 0.0
 
 
+class Rival(Strict):
+    """Another model for the same data: changes of the experiment, by path, and what is unknown of
+    it, where that is something else."""
+
+    settings: Annotated[dict[str, Any], Field(min_length=1)]
+    unknown: Annotated[dict[str, Bounds], Field(min_length=1)] | None = None
+
+
+class Sampler(Strict):
+    """Walkers of emcee, and their steps, a quarter of which is not counted."""
+
+    walkers: Annotated[int, Field(ge=4, le=1000)] = 16
+    steps: Annotated[int, Field(ge=10)] = 200
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+
+
 class Fit(Strict):
     """Looks for the `unknown` parameters, between bounds, with which an experiment is nearest to
     what was measured of it: a field of its equilibrium, tracks, a curve, or some of these.
@@ -46,6 +63,11 @@ class Fit(Strict):
     Groups that move by `measured` are given `modes` smooth displacements along each axis, which
     are estimated too; 0 takes what was measured there as it is. `loss` says how residuals count:
     all but `linear` let outliers count less.
+
+    On request, and at a price: `profile` names parameters whose likelihood is followed by fitting
+    all else anew; `sampler` draws from the posterior; `candidates` are other models by name, which
+    are compared with this one by what they foretell of points left out, one of so many `folds`
+    after another.
     """
 
     version: Version = 1
@@ -54,7 +76,11 @@ class Fit(Strict):
     measured: Measurements
     force: Force | None = None
     modes: Annotated[int, Field(ge=0, le=40)] = 6
-    loss: Literal["linear", "soft_l1", "huber", "cauchy"] = "linear"
+    loss: Loss = "linear"
+    profile: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    sampler: Sampler | None = None
+    candidates: dict[str, Rival] = Field(default_factory=dict)
+    folds: Annotated[int, Field(ge=2, le=20)] = 5
 
     _folder: Path = Path()
 
@@ -73,6 +99,13 @@ class Fit(Strict):
                 "`force` is what a group carries at rest while a field is measured; give forces "
                 "over displacement as a curve"
             )
+        if unknown := [path for path in self.profile if path not in self.unknown]:
+            hint = did_you_mean(unknown[0], self.unknown)
+            raise ValueError(f"`profile` names '{unknown[0]}', which is not unknown{hint}")
+        if self.sampler and self.loss != "linear":
+            raise ValueError("a `sampler` draws for normal noise: it needs `loss: linear`")
+        if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
+            raise ValueError("a `sampler` needs two walkers for each parameter at least")
         return self
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
@@ -22,6 +23,7 @@ class TracksObservation(RunObservation):
 
     kind: ClassVar[str] = "tracks"
     times: Floats
+    points: Floats
     interpolation: Interpolation
 
     @classmethod
@@ -44,10 +46,25 @@ class TracksObservation(RunObservation):
             experiment=experiment,
             measured=u[inside].T.ravel(),
             noise=noise,
+            rows=np.flatnonzero(inside),
             left_out=int((~inside).sum()),
             scene=scene,
             times=times[inside],
+            points=points[inside],
             interpolation=found,
+        )
+
+    def places(self) -> Floats:
+        """The points."""
+        return self.points
+
+    def part(self, chosen: NDArray[np.bool_]) -> TracksObservation:
+        """Of some of them."""
+        return replace(
+            super().part(chosen),
+            times=self.times[chosen],
+            points=self.points[chosen],
+            interpolation=self.interpolation.part(chosen),
         )
 
     def _read(self, run: Run) -> Floats:
@@ -55,10 +72,6 @@ class TracksObservation(RunObservation):
         for state in run:
             share = np.maximum(0.0, 1.0 - np.abs(self.times - state.step))
             if (rows := np.flatnonzero(share)).size:
-                part = replace(
-                    self.interpolation,
-                    rows=self.interpolation.rows[rows],
-                    shares=self.interpolation.shares[rows],
-                )
+                part = self.interpolation.part(rows)
                 found[rows] += share[rows, None] * part.of(state.u, run.scene)
         return np.asarray(found.T.ravel())
