@@ -5,6 +5,7 @@ Moves and displacements are planes, (axis, sublattice, cell, cell), as in a stat
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
 from functools import cache
@@ -20,14 +21,16 @@ Floats = NDArray[np.floating[Any]]
 
 
 @cache
-def _libraries() -> ThreadpoolController:
+def _libraries(with_scipy: bool) -> ThreadpoolController:
+    """Those that are loaded by now; scipy has one of its own."""
     return ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """Libraries of linear algebra work on one thread meanwhile: on how many they work decides the
-    order of their sums, and the last digits."""
-    found: AbstractContextManager[object] = _libraries().limit(limits=1, user_api="blas")
+    """Libraries of linear algebra that are loaded by now work on one thread meanwhile: on how many
+    they work decides the order of their sums, and the last digits."""
+    loaded = _libraries("scipy.linalg" in sys.modules)
+    found: AbstractContextManager[object] = loaded.limit(limits=1, user_api="blas")
     return found
 
 

@@ -30,6 +30,8 @@ GIVEN = "as given"
 
 def fit_experiment(fit: Fit, experiment: Experiment) -> Fitted:
     """Carries a fit out, on one thread. Raises ExperimentError for what cannot be fitted."""
+    import scipy.linalg  # noqa: F401  # what is loaded later would work on all threads
+
     with one_thread():
         problem, solution = _solved(problem_of(fit, experiment), fit)
         names = [*fit.unknown]

@@ -11,9 +11,14 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
+from pbdkit.fitting.gap import least_gap
 from pbdkit.fitting.observation import Observation, Seen
 from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.stepping.state import Floats
+
+WIDE = 10.0
+"""Bounds in such a ratio have a middle that says nothing."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +81,17 @@ class Problem:
             yield observation, slice(first, first := first + observation.own)
 
     def start(self) -> Floats:
-        """In the middle between bounds, with boundaries as they were measured."""
-        z = np.zeros(self.size)
-        z[: len(self.unknowns)] = [(u.low + u.high) / 2 for u in self.unknowns]
+        """In the middle between bounds; where these are wide, with a field, where the gap to
+        equilibrium is least. Boundaries are as they were measured."""
+        z, count = np.zeros(self.size), len(self.unknowns)
+        low, high = (bound[:count] for bound in self.bounds())
+        z[:count] = (low + high) / 2.0
+        fields = [o for o in self.observations if isinstance(o, FieldObservation)]
+        wide = (low > 0.0) & (high > WIDE * low)
+        if fields and wide.any():
+            parameters = [u.parameter for u in self.unknowns]
+            found = least_gap(fields[0], parameters, low, high)
+            z[:count] = np.where(wide, found, z[:count])
         for observation, own in self.owned():
             z[own] = observation.start()
         return self.with_best_modulus(z)
