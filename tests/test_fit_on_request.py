@@ -1,0 +1,152 @@
+"""What a fit tells on request: profiles, a sampler, other models; and where it begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_fit import NOISE, measured, plate
+
+import pbdkit
+from pbdkit.fitting.calling import problem_of
+from pbdkit.fitting.sampling import _marginal
+from pbdkit.fitting.specification import described_fit
+
+COARSE = {"lattice": {"type": "square", "a": 2.0}}
+POISSON = {"rule.poisson_ratio": [0.0, 0.49]}
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory):
+    path = tmp_path_factory.mktemp("fit") / "field.csv"
+    measured(plate(**COARSE), path, noise=NOISE)
+    given = {"file": str(path), "noise": NOISE}
+    return {"experiment": plate(**COARSE), "unknown": POISSON, "measured": given, "modes": 3}
+
+
+def test_a_profile_agrees_with_the_standard_error_where_the_problem_is_straight(fit):
+    found = pbdkit.fit(fit | {"profile": ["rule.poisson_ratio"]})
+    estimate, profile = found.values["rule.poisson_ratio"], found.profiles["rule.poisson_ratio"]
+    assert profile.low == pytest.approx(estimate.value - 1.96 * estimate.error, rel=0.02)
+    assert profile.high == pytest.approx(estimate.value + 1.96 * estimate.error, rel=0.02)
+    parabola = ((profile.values - estimate.value) / estimate.error) ** 2
+    np.testing.assert_allclose(profile.rises, parabola, rtol=0.1, atol=1e-3)
+    assert any("by its profile" in line for line in found.lines())
+    assert found.as_dict()["profiles"]["rule.poisson_ratio"]["interval"] == [
+        profile.low,
+        profile.high,
+    ]
+
+
+def test_a_profile_with_two_parameters_fits_the_other_anew(fit):
+    """The profile of one of two correlated parameters is wider than a cut through the valley."""
+    rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1.0, "half": 1.0}}
+    unknown = {"rule.poisson_ratio": [0.0, 0.49], "rule.stiffness.half": [0.3, 3.0]}
+    given = fit | {"experiment": plate(rule, **COARSE), "unknown": unknown}
+    found = pbdkit.fit(given | {"profile": ["rule.stiffness.half"]})
+    estimate, profile = found.values["rule.stiffness.half"], found.profiles["rule.stiffness.half"]
+    assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.05)
+
+
+def test_what_data_do_not_bound_has_no_end(fit):
+    rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": 1.0}
+    given = fit | {"experiment": plate(rule, **COARSE), "unknown": {"rule.stiffness": [0.5, 2.0]}}
+    profile = pbdkit.fit(given | {"profile": ["rule.stiffness"]}).profiles["rule.stiffness"]
+    assert (profile.low, profile.high) == (None, None)
+    assert "from no bound to no bound" in str(profile)
+
+
+def test_the_posterior_of_a_straight_problem_is_the_normal_one(fit):
+    """On a grid, without a sampler: its mean is the estimate, its deviation the standard error."""
+    found = pbdkit.fit(fit)
+    estimate = found.values["rule.poisson_ratio"]
+    values = estimate.value + estimate.error * np.linspace(-2.0, 2.0, 7)
+    logs = [_marginal(found.problem, found.solution.z, np.array([v]), 1.0) for v in values]
+    second, first, _ = np.polyfit(values, logs, 2)
+    assert -first / (2 * second) == pytest.approx(estimate.value, abs=0.05 * estimate.error)
+    assert found.ratio < 1.0
+    assert np.sqrt(-0.5 / second) == pytest.approx(estimate.error, rel=0.03)
+
+
+def test_the_sampler_draws_from_it(fit):
+    pytest.importorskip("emcee")
+    found = pbdkit.fit(fit | {"modes": 1, "sampler": {"walkers": 8, "steps": 24}})
+    estimate, sample = found.values["rule.poisson_ratio"], found.sample
+    assert sample.draws.shape == (8 * 18, 1)
+    assert 0.2 < sample.acceptance < 0.95
+    assert abs(sample.mean[0] - estimate.value) < estimate.error
+    assert 0.0 < sample.error[0] < estimate.error
+    assert sample.deviation[0] == pytest.approx(estimate.error, rel=0.5)
+    again = pbdkit.fit(fit | {"modes": 1, "sampler": {"walkers": 8, "steps": 24}})
+    assert again.sample.draws.tobytes() == sample.draws.tobytes()
+
+
+def test_the_right_model_foretells_best(tmp_path):
+    """An orthotropic plate: the isotropic rule foretells left-out points worse."""
+    rule = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3}
+    made = plate(rule, **COARSE)
+    measured(made, tmp_path / "field.csv", noise=NOISE / 4)
+    found = pbdkit.fit(
+        {
+            "experiment": plate(**COARSE),
+            "unknown": POISSON,
+            "measured": {"file": str(tmp_path / "field.csv"), "noise": NOISE / 4},
+            "modes": 3,
+            "candidates": {
+                "orthotropic": {
+                    "settings": {"rule": rule},
+                    "unknown": {"rule.modulus_ratio": [0.2, 1.5], "rule.shear_ratio": [0.1, 0.6]},
+                },
+            },
+        }
+    )
+    order = [candidate.name for candidate in found.candidates]
+    assert order == ["orthotropic", "as given"]
+    best, worst = found.candidates
+    assert best.differs == 0.0
+    assert 0.8 < best.left_out < 1.6  # in blocks at the ends boundaries are told by others alone
+    assert worst.left_out > 1.4 * best.left_out
+    assert best.values["rule.modulus_ratio"] == pytest.approx(0.5, abs=0.05)
+    assert [c["name"] for c in found.as_dict()["candidates"]] == order
+    assert any(line.startswith("orthotropic: left-out") for line in found.lines())
+
+
+def test_wide_bounds_start_where_the_gap_is_least(tmp_path):
+    """The middle of 0.01 to 100 is far off; the gap tells the order of magnitude."""
+    rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": {"otherwise": 1.0, "half": 1.7}}
+    made = plate(rule)
+    measured(made, tmp_path / "field.csv", noise=NOISE)
+    fit = {
+        "experiment": made,
+        "unknown": {"rule.stiffness.half": [0.01, 100.0]},
+        "measured": {"file": str(tmp_path / "field.csv"), "noise": NOISE},
+        "modes": 4,
+    }
+    asked, source = described_fit(fit, given=False)
+    start = problem_of(asked, pbdkit.Experiment.build(source)).start()[0]
+    assert 0.5 < start < 3.0
+    found = pbdkit.fit(fit)
+    estimate = found.values["rule.stiffness.half"]
+    assert estimate.value == pytest.approx(1.7, abs=4 * estimate.error)
+    assert found.solution.evaluations < 12
+
+
+WRONG = {
+    "a profile of what is known": ({"profile": ["rule.stiffness"]}, "which is not unknown"),
+    "a sampler with a loss": (
+        {"loss": "huber", "sampler": {}}, "needs `loss: linear`",
+    ),
+    "a candidate that is none": (
+        {"candidates": {"other": {"settings": {"rule.poisson": 0.3}}}}, "poisson",
+    ),
+    "a candidate without its unknown": (
+        {"candidates": {"other": {"settings": {"rule": {"type": "springs"}}}}},
+        "no number of the experiment",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_named(name, fit):
+    more, told = WRONG[name]
+    with pytest.raises(pbdkit.ExperimentError, match=told):
+        pbdkit.fit(fit | more)
