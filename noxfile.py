@@ -47,7 +47,7 @@ def lint(session: nox.Session) -> None:
 def schemas(session: nox.Session) -> None:
     """The JSON Schemas are those of the program; `nox -s schemas -- write` makes them anew."""
     install(session, "test")
-    for what in ("experiment", "dataset", "sweep"):
+    for what in ("experiment", "dataset", "sweep", "fit"):
         made = session.run("pbdkit", "schema", what, "--builtin", silent=True)
         kept = Path("schemas", f"{what}.schema.json")
         if "write" in session.posargs:

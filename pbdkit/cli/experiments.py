@@ -35,17 +35,18 @@ def init(file: Path) -> None:
 
 
 @click.command()
-@click.argument("what", type=click.Choice(["experiment", "dataset", "sweep"]), default="experiment")
+@click.argument("what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment")
 @click.option("--builtin", is_flag=True, help="Leave third-party components out.")
 def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments, datasets or sweeps, closed over what is installed."""
+    """Print the JSON Schema of experiments, datasets, sweeps or fits, closed over what is installed."""
     from pbdkit.experiment.schema import experiment_schema
+    from pbdkit.fitting.specification import fit_schema
     from pbdkit.registry.registry import Registry
     from pbdkit.results.layout import dataset_schema
     from pbdkit.sweeps.specification import sweep_schema
 
-    if what == "sweep":
-        made = sweep_schema()
+    if what in (of_files := {"sweep": sweep_schema, "fit": fit_schema}):
+        made = of_files[what]()
     else:
         make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
         made = make(Registry(), installed=not builtin)
