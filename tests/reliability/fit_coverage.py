@@ -1,4 +1,4 @@
-"""Whether the errors of `pbdkit.fit` are those of repeats: synthetic plates, fitted again and again.
+"""Whether the errors of `pbdkit.fit` are those of repeats: plates, fitted again and again.
 
     python tests/reliability/fit_coverage.py [--trials N] [--kinds poisson ...] [--processes P]
 
@@ -20,7 +20,6 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
