@@ -1,6 +1,6 @@
 """Whether the errors of `pbdkit.fit` are those of repeats: plates, fitted again and again.
 
-    python tests/reliability/fit_coverage.py [--trials N] [--kinds poisson ...] [--processes P]
+    python tests/reliability/fit_coverage.py [--trials N] [--kinds poisson ...] [--loss soft_l1]
 
 The true field is an equilibrium on the lattice of the fit, between ends that move by cubics. Each
 repeat draws new noise, as large as that of image correlation, for the points of the field and for
@@ -19,7 +19,7 @@ import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -149,7 +149,7 @@ def truth(name: str) -> Truth:
     return Truth(points[inside], found[inside], force)
 
 
-def repeat(name: str, seed: int, trial: int) -> list[tuple[float, float]]:
+def repeat(name: str, seed: int, trial: int, loss: str) -> list[tuple[float, float]]:
     """Value and standard error of all that is unknown; NaN where the fit says it is not told."""
     kind, true = KINDS[name], truth(name)
     generator = np.random.default_rng([seed, list(KINDS).index(name), trial])
@@ -165,6 +165,7 @@ def repeat(name: str, seed: int, trial: int) -> list[tuple[float, float]]:
             "unknown": kind.unknown,
             "measured": {"file": file.name, "noise": NOISE},
             "modes": 4,
+            "loss": loss,
         }
         if kind.forced:
             fit["force"] = {"group": 1, "value": true.force}
@@ -203,14 +204,14 @@ def main() -> int:
     asked.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     asked.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked.add_argument("--seed", type=int, default=0)
+    asked.add_argument("--loss", default="linear")
     given = asked.parse_args()
     good = True
     with ProcessPoolExecutor(given.processes) as pool:
         for name in given.kinds:
-            repeat(name, given.seed, 0)  # compiles what all of them use
-            trials = range(given.trials)
-            seeds, names = [given.seed] * given.trials, [name] * given.trials
-            found = np.array(list(pool.map(repeat, names, seeds, trials, chunksize=10)))
+            repeat(name, given.seed, 0, given.loss)  # compiles what all of them use
+            one = partial(repeat, name, given.seed, loss=given.loss)
+            found = np.array(list(pool.map(one, range(given.trials), chunksize=10)))
             good &= told(name, found)
     return 0 if good else 1
 
