@@ -18,7 +18,7 @@ from finite_elements.updating import MARGIN, Estimate, Found, alike, ways
 STRESS = FORCE / THICKNESS / HEIGHT
 WINDOWS = {"left": (1.0, 20.0), "right": (60.0, 79.0)}
 ELEMENTS = 12
-"""Over the height: the values stay within a fiftieth of their errors with twice as many."""
+"""Over the height: the values stay within a twentieth of their errors with twice as many."""
 
 
 class End(NamedTuple):

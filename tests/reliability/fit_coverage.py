@@ -5,9 +5,10 @@
 The true field is an equilibrium on the lattice of the fit, between ends that move by cubics. Each
 repeat draws new noise, as large as that of image correlation, for the points of the field and for
 those of both ends, and fits. Counted is how often the true value lies within 1.96 standard errors,
-and how far the mean of value - true, in standard errors, is from 0. What is behind ± is twice the
-sampling error of so many repeats. Exits with 1 where a goal is missed by more than sampling
-explains (three times its standard deviation).
+how far the mean of value - true, in standard errors, is from 0, and its standard deviation. What is
+behind ± is twice the sampling error of so many repeats. Exits with 1 where a goal is missed by more
+than sampling explains (three times its standard deviation); values may spread by 5 % more or less
+than their errors, and as much besides.
 """
 
 from __future__ import annotations
