@@ -46,6 +46,7 @@ OUT = Path("out.nc")
         "mutate_stores.py --trials 2 --kinds breaking",
         "equilibria.py fracture --trials 3",
         "equilibria.py certificates --trials 5",
+        "fit_coverage.py --trials 10 --processes 1 --kinds poisson",
     ],
 )
 def test_a_sample_of_the_long_trials(trial: str) -> None:
