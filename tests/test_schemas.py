@@ -10,6 +10,7 @@ import pbdkit
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.shipped import read_experiment, shipped_names
 from pbdkit.experiment.source import read_file
+from pbdkit.fitting.specification import fit_schema, shipped_fits
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
 from pbdkit.sweeps.specification import sweep_schema
@@ -17,12 +18,13 @@ from pbdkit.sweeps.specification import sweep_schema
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 EXPERIMENT = experiment_schema(Registry(), installed=False)
 DATASET = dataset_schema(Registry(), installed=False)
-SWEEP = sweep_schema()
+SWEEP, FIT = sweep_schema(), fit_schema()
 of_experiment, of_dataset = map(jsonschema.Draft202012Validator, (EXPERIMENT, DATASET))
 
 
 @pytest.mark.parametrize(
-    ("name", "schema"), [("experiment", EXPERIMENT), ("dataset", DATASET), ("sweep", SWEEP)]
+    ("name", "schema"),
+    [("experiment", EXPERIMENT), ("dataset", DATASET), ("sweep", SWEEP), ("fit", FIT)],
 )
 def test_committed_schema_is_current(name, schema):
     committed = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
@@ -71,3 +73,16 @@ def test_the_schema_of_sweeps_describes_what_is_taken():
     for wrong in ({"varry": {}}, {"keep": {"times": "lost"}}, {"replicates": 0}, {"experiment": 3}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(sweep | wrong, SWEEP)
+
+
+@pytest.mark.parametrize("name", shipped_fits())
+def test_shipped_fits_are_described(name):
+    data = read_file(Path(pbdkit.__file__).parent / "fits" / f"{name}.yaml").data
+    jsonschema.validate(data, FIT)
+    field = data["measured"]
+    jsonschema.validate(
+        data | {"measured": [field, {"type": "curve", "file": "f", "group": 1}]}, FIT
+    )
+    for wrong in ({"unknowns": {}}, {"modes": -1}, {"measured": {"type": "field"}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(data | wrong, FIT)

@@ -35,10 +35,12 @@ def init(file: Path) -> None:
 
 
 @click.command()
-@click.argument("what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment")
+@click.argument(
+    "what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment"
+)
 @click.option("--builtin", is_flag=True, help="Leave third-party components out.")
 def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments, datasets, sweeps or fits, closed over what is installed."""
+    """Print the JSON Schema of experiments, datasets, sweeps or fits, with what is installed."""
     from pbdkit.experiment.schema import experiment_schema
     from pbdkit.fitting.specification import fit_schema
     from pbdkit.registry.registry import Registry

@@ -18,8 +18,10 @@ PART = 0.3
 """A parameter belongs to a direction that has more of it."""
 AT_BOUND = 1e-6
 """The share of the way between bounds by which a value stands on one."""
-MOST_TURNS, SMALLEST, SLACK = 30, 1e-3, 1e-9
-"""Of Gauss and Newton; the smallest share of a step that is taken; what rounding does to costs."""
+MOST_TURNS, SMALLEST = 30, 1e-3
+"""Of Gauss and Newton; the smallest share of a step that is taken."""
+ENOUGH, SLACK = 0.25, 1e-9
+"""The share of the gain that is foretold which a step has to bring (Armijo), but for rounding."""
 MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-13
 """Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
 largest singular value below which one is none."""
@@ -60,11 +62,13 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     at, count = problem.at(z), 1
     for _ in range(MOST_TURNS):
         step = _linear_step(at, low - z, high - z, loss)
+        cost = cost_of(at.residuals, loss)
+        gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
         share = 1.0
         while True:
             there = _at(problem, z + share * step, share)
             count += 1
-            most = cost_of(at.residuals, loss) * (1.0 + SLACK)
+            most = cost * (1.0 + SLACK) - ENOUGH * share * gain
             if there is not None and cost_of(there.residuals, loss) <= most:
                 break
             share /= 4.0

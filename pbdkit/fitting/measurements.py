@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import (
     BeforeValidator,
+    ConfigDict,
     Field,
     SerializeAsAny,
     TypeAdapter,
@@ -87,12 +88,19 @@ class Distortion(Strict):
     uy: Annotated[tuple[Term, ...], Field(strict=False)] = ()
 
 
+def _without_type(schema: dict[str, Any]) -> None:
+    # A measurement is a field unless it says otherwise.
+    schema["required"] = [key for key in schema["required"] if key != "type"]
+
+
 class MeasuredField(Measured):
     """Displacements at scattered points of the equilibrium, in lattice units or, with `units` in
     the experiment, in what they say.
 
     Points nearer to the outline of the body than `margin` are left out.
     """
+
+    model_config = ConfigDict(json_schema_extra=_without_type)
 
     type: Literal["field"] = "field"
     columns: Annotated[tuple[str, str, str, str], Field(strict=False)] = ("x", "y", "ux", "uy")
