@@ -211,13 +211,15 @@ def test_what_is_wrong_is_named(name, measured, monkeypatch):
 
 
 def test_bonds_that_break_otherwise_are_refused(measured):
-    """The limit is met at a strain that the parameter decides."""
-    breaking = bar(fracture={"type": "strain", "failure": 0.0125})
-    with pytest.raises(pbdkit.ExperimentError, match="breaks other bonds"):
+    """The limit decides in which step a bond breaks."""
+    slow = bar()["leaders"]
+    slow[1]["motion"] |= {"velocity": [0.002, 0.001], "steps": STEPS}
+    breaking = bar(leaders=slow, fracture={"type": "strain", "failure": 0.01})
+    with pytest.raises(pbdkit.ExperimentError, match=r"fracture.failure breaks other bonds"):
         pbdkit.fit(
             {
                 "experiment": breaking,
-                "unknown": {"rule.poisson_ratio": [0.0, 0.45]},
+                "unknown": {"fracture.failure": [0.005, 0.015]},
                 "measured": tracks(measured),
             }
         )

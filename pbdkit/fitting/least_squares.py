@@ -26,7 +26,9 @@ MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-13
 """Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
 largest singular value below which one is none."""
 SETTLED = 1e-3
-"""The share of its standard error by which no unknown moves any more."""
+"""The share of its standard error by which no unknown would move any more."""
+SWING = 0.25
+"""A step that takes back more than such a share of the last one swings: less of it is taken."""
 OUTLIERS = 1.345
 """Residuals beyond so many times their noise count less, where a loss says so (Huber)."""
 
@@ -59,30 +61,38 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
-    at, count = problem.at(z), 1
+    at, count, share, before = problem.at(z), 1, 1.0, np.zeros(problem.size)
     for _ in range(MOST_TURNS):
         step = _linear_step(at, low - z, high - z, loss)
-        cost = cost_of(at.residuals, loss)
-        gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
-        share = 1.0
-        while True:
-            there = _at(problem, z + share * step, share)
-            count += 1
-            most = cost * (1.0 + SLACK) - ENOUGH * share * gain
-            if there is not None and cost_of(there.residuals, loss) <= most:
-                break
-            share /= 4.0
-            if share < SMALLEST:
-                raise UnconvergedError("the fit finds no way to fit better, and none to stay")
-        z, at = z + share * step, there
         covariance, untold = _known(problem, at, loss)
-        if (np.abs(share * step) <= SETTLED * np.sqrt(np.diag(covariance))).all():
+        ratio = _spread(at.residuals, problem.size, loss)
+        own = step / np.sqrt(np.diag(covariance)) / max(1.0, ratio)
+        if (np.abs(own) <= SETTLED).all():
             break
+        swings = own @ before < -SWING * (before @ before)
+        share = share / 2.0 if swings else min(1.0, 2.0 * share)
+        share, at, tried = _taken(problem, at, z, step, share, loss)
+        z, before, count = z + share * step, share * own, count + tried
     else:
         raise UnconvergedError(f"the fit still moves after {MOST_TURNS} turns")
-    ratio = _spread(at.residuals, problem.size, loss)
     covariance *= max(1.0, ratio) ** 2
     return Solution(z, at, covariance, ratio, untold, _on_bounds(problem, z), count)
+
+
+def _taken(
+    problem: Problem, at: At, z: Floats, step: Floats, share: float, loss: Loss
+) -> tuple[float, At, int]:
+    """The share of a step that is taken, the problem there, and how often it was looked at."""
+    cost = cost_of(at.residuals, loss)
+    gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
+    count = 0
+    while share >= SMALLEST:
+        there, count = _at(problem, z + share * step, share), count + 1
+        most = cost * (1.0 + SLACK) - ENOUGH * share * gain
+        if there is not None and cost_of(there.residuals, loss) <= most:
+            return share, there, count
+        share /= 4.0
+    raise UnconvergedError("the fit finds no way to fit better, and none to stay")
 
 
 def _at(problem: Problem, z: Floats, share: float) -> At | None:
