@@ -12,42 +12,58 @@ from pbdkit.registry.extras import refuse_no_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
     from pbdkit.fitting.fitted import Fitted
 
 Floats = NDArray[np.floating[Any]]
-PANEL_IN, MARGIN_IN = 3.4, 0.9
+PANEL_IN, MARGIN_IN, CURVE_IN = 3.4, 0.9, 2.8
 WITHIN = 3.0
 """Residuals beyond so many times the noise have the last colour."""
 
 
 def draw_fit(fitted: Fitted) -> Figure:
-    """A row for ux and one for uy: measured, fitted, the residual over its noise; and for each
-    parameter how much each point tells of it. Raises ExperimentError where matplotlib is missing.
+    """Each measurement by itself. A field: a row for ux and one for uy, measured, fitted, the
+    residual over its noise, and for each parameter how much each point tells of it. Tracks and
+    curves: what was measured and fitted, the residual, and what is told, along time or
+    displacement. Raises ExperimentError where matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.drawing.figures import new_figure
 
-    field, information = fitted.field(), fitted.information()
-    columns = 3 + len(information)
+    columns = 3 + len(fitted.values)
+    kinds = [observation.kind for observation in fitted.problem.observations]
+    heights = [_field_height(fitted, n) if k == "field" else CURVE_IN for n, k in enumerate(kinds)]
+    figure = new_figure(figsize=(columns * PANEL_IN, sum(heights)), dpi=150, layout="constrained")
+    parts = figure.subfigures(len(kinds), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for n, (part, kind) in enumerate(zip(parts, kinds, strict=True)):
+        (_draw_field if kind == "field" else _draw_curve)(part, fitted, n)
+    return figure
+
+
+def _field_height(fitted: Fitted, n: int) -> float:
+    wide, tall = np.ptp(fitted.field(n).points, axis=0)
+    return 2 * min(max(PANEL_IN * float(tall / wide), 1.2), 5.0) + MARGIN_IN
+
+
+def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
+    field, information = fitted.field(n), fitted.information(n)
+    noise = fitted.met[n].noise
     wide, tall = np.ptp(field.points, axis=0)
-    height = min(max(PANEL_IN * tall / wide, 1.2), 5.0)
-    figure = new_figure(
-        figsize=(columns * PANEL_IN, 2 * height + MARGIN_IN), dpi=150, layout="constrained"
-    )
-    axes = figure.subplots(2, columns, sharex=True, sharey=True)
+    axes = figure.subplots(2, 3 + len(information), sharex=True, sharey=True)
     size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(tall / wide / len(field.points)))
     for row, name in enumerate(("ux", "uy")):
         measured, left = field.measured[:, row], field.residual[:, row]
         shown = [
             (f"{name} measured", measured, (measured.min(), measured.max()), "viridis"),
             (f"{name} fitted", measured - left, (measured.min(), measured.max()), "viridis"),
-            (f"{name} residual / noise", left / fitted.noise, (-WITHIN, WITHIN), "RdBu_r"),
+            (f"{name} residual / noise", left / noise, (-WITHIN, WITHIN), "RdBu_r"),
         ]
         for path, told in information.items():
-            share = told.reshape(2, -1)[row] / max(t.max() for t in information.values())
-            shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
+            most = max(t.max() for t in information.values())
+            shown.append(
+                (f"{name} tells {path}", told.reshape(2, -1)[row] / most, (0, 1), "magma_r")
+            )
         for ax, (title, values, limits, colours) in zip(axes[row], shown, strict=True):
             _scatter(ax, field.points, values, limits, colours, size)
             ax.set_title(title, fontsize=9)
@@ -55,7 +71,44 @@ def draw_fit(fitted: Fitted) -> Figure:
         ax.set_xlabel("x (lattice unit)", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("y (lattice unit)", fontsize=9)
-    return figure
+
+
+def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
+    numbers, information = fitted.numbers(n), fitted.information(n)
+    axes = figure.subplots(1, 3 + len(information))
+    order = np.argsort(numbers.along)
+    axes[0].plot(numbers.along, numbers.measured, ".", color="0.6", markersize=4, label="measured")
+    axes[0].plot(
+        numbers.along[order], numbers.fitted[order], **_line(numbers.joined), label="fitted"
+    )
+    axes[0].legend(fontsize=8)
+    axes[1].plot(numbers.measured, numbers.fitted, ".", markersize=3)
+    axes[1].axline((float(numbers.measured[0]),) * 2, slope=1.0, color="0.6", linewidth=0.8)
+    axes[2].plot(numbers.along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
+    axes[2].axhline(0.0, color="0.6", linewidth=0.8)
+    titles = [numbers.what, "fitted over measured", "residual / noise"]
+    most = max(t.max() for t in information.values())
+    for ax, (path, told) in zip(axes[3:], information.items(), strict=True):
+        ax.plot(numbers.along, told / most, ".", markersize=3)
+        titles.append(f"tells {path}")
+    for k, (ax, title) in enumerate(zip(axes, titles, strict=True)):
+        ax.set_title(title, fontsize=9)
+        ax.set_xlabel("measured" if k == 1 else numbers.over, fontsize=9)
+        ax.tick_params(labelsize=8)
+
+
+def _line(joined: bool) -> dict[str, Any]:
+    """Of a curve; tracks of many points at one time are not joined."""
+    return (
+        {"color": "C0", "linewidth": 1.2}
+        if joined
+        else {
+            "color": "C0",
+            "marker": "x",
+            "linestyle": "",
+            "markersize": 3,
+        }
+    )
 
 
 def _scatter(

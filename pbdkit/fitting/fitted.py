@@ -9,33 +9,17 @@ from typing import Any
 import numpy as np
 
 from pbdkit.fitting.comparison import Candidate
-from pbdkit.fitting.evidence import Carried
-from pbdkit.fitting.least_squares import TELLS, Solution
+from pbdkit.fitting.estimate import Estimate, youngs_modulus
+from pbdkit.fitting.force_curve import CurveObservation
+from pbdkit.fitting.least_squares import Solution
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
 from pbdkit.fitting.profile import Profile
-from pbdkit.fitting.resting_field import FieldObservation, FieldSeen
+from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.fitting.sampling import Sample
-from pbdkit.fitting.specification import Fit, Force
+from pbdkit.fitting.specification import Fit
+from pbdkit.fitting.tracks import TracksObservation
 from pbdkit.stepping.state import Floats
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its standard error. `told` is False where the data cannot tell it: then it says
-    nothing. `on_bound`: it stands on a bound, beyond which it might fit better."""
-
-    value: float
-    error: float
-    told: bool = True
-    on_bound: bool = False
-
-    def __str__(self) -> str:
-        if not self.told:
-            return "the data cannot tell it"
-        digits = max(0, 1 - int(np.floor(np.log10(self.error)))) if self.error > 0.0 else 6
-        text = f"{self.value:.{min(digits, 12)}f} ± {self.error:.{min(digits, 12)}f}"
-        return text + (", on its bound" if self.on_bound else "")
 
 
 @dataclass(frozen=True)
@@ -46,6 +30,20 @@ class FittedField:
     points: Floats
     measured: Floats
     residual: Floats
+
+
+@dataclass(frozen=True)
+class FittedNumbers:
+    """Numbers along a time or displacement, (number,), as they were measured, fitted, and what is
+    left; what they are, and what they go over. `joined` where they are one curve."""
+
+    along: Floats
+    measured: Floats
+    fitted: Floats
+    residual: Floats
+    what: str
+    over: str
+    joined: bool
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class Fitted:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it in plain values, as the JSON file holds it."""
-        named = {path: _plain(estimate) for path, estimate in self.values.items()}
+        named = {path: estimate.as_dict() for path, estimate in self.values.items()}
         modulus = self.youngs_modulus
         return {
             "values": named,
@@ -101,7 +99,7 @@ class Fitted:
                 one: {other: float(self.correlations[n, m]) for m, other in enumerate(named)}
                 for n, one in enumerate(named)
             },
-            "youngs_modulus": None if modulus is None else _plain(modulus),
+            "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
             "measured": [asdict(met) for met in self.met],
             "evaluations": self.solution.evaluations,
@@ -142,6 +140,18 @@ class Fitted:
             evidence.points, measured.reshape(2, -1).T, np.asarray(left.reshape(2, -1).T)
         )
 
+    def numbers(self, n: int = 0) -> FittedNumbers:
+        """What was measured in tracks or a curve n, and what the fit leaves. Raises ValueError for
+        a field."""
+        observation, rows = [*self.problem.rows()][n]
+        if not isinstance(observation, TracksObservation | CurveObservation):
+            raise ValueError(f"measurement {n} is a {observation.kind}")
+        measured = observation.measured * observation.unit
+        left = self.solution.at.residuals[rows] * observation.noise * observation.unit
+        along = np.tile(observation.along, len(measured) // len(observation.along))
+        what, over, joined = observation.names
+        return FittedNumbers(along, measured, measured - left, left, what, over, joined)
+
     def information(self, n: int = 0) -> dict[str, Floats]:
         """By parameter, how much each number of measurement n tells of it, (number,): the square of
         what its derivative has that no other unknown can make up for."""
@@ -178,12 +188,6 @@ class Fitted:
         yield from map(str, self.candidates)
 
 
-def _plain(estimate: Estimate) -> dict[str, Any]:
-    if not estimate.told:
-        return {"value": None, "error": None, "told": False}
-    return asdict(estimate)
-
-
 def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     """The answer in words of the fit file."""
     count = len(problem.unknowns)
@@ -202,40 +206,12 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     met = tuple(
         _met(observation, solution.at.residuals[rows]) for observation, rows in problem.rows()
     )
-    return Fitted(values, correlations, _modulus(fit, problem, solution), met, problem, solution)
+    return Fitted(
+        values, correlations, youngs_modulus(fit.force, problem, solution), met, problem, solution
+    )
 
 
 def _met(observation: Observation, residuals: Floats) -> Met:
     ratio = float(np.sqrt(np.mean(residuals**2)))
     noise = observation.noise * observation.unit
     return Met(observation.kind, noise, ratio, len(residuals), observation.left_out)
-
-
-def _modulus(fit: Fit, problem: Problem, solution: Solution) -> Estimate | None:
-    count = len(problem.unknowns)
-    if problem.with_modulus:
-        value, error = float(solution.z[count]), float(solution.errors[count])
-        return Estimate(value, error, told=error < TELLS * abs(value))
-    return _carried_modulus(fit.force, problem, solution) if fit.force else None
-
-
-def _carried_modulus(force: Force, problem: Problem, solution: Solution) -> Estimate:
-    """Force over thickness and what the group carries over Young's modulus, along the force."""
-    way = np.array(force.value) / np.hypot(*force.value)
-    carried, count = Carried(force.group), len(problem.unknowns)
-    seen = solution.at.seen[0]
-    assert isinstance(seen, FieldSeen)
-    unit = float(way @ carried.predicted(seen.resting))
-    parameters = [*(u.parameter for u in problem.unknowns)]
-    names = [*parameters, *[None] * (len(seen.changes) - count)]
-    gradient = np.zeros(problem.size)
-    for n, (du, parameter) in enumerate(zip(seen.changes, names, strict=True)):
-        gradient[n] = way @ carried.change(seen.resting, du, parameter)
-    told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
-    known = [*told, *range(count, problem.size)]
-    part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])
-    size = float(np.hypot(*force.value))
-    value = size / force.thickness / unit
-    error = abs(value) * np.hypot(part / unit, force.noise / size)
-    matters = any(abs(gradient[n]) > 1e-9 * abs(unit) for n in range(count) if n not in told)
-    return Estimate(value, float(error), told=not matters)

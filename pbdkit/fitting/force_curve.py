@@ -84,6 +84,12 @@ class CurveObservation(RunObservation):
             left_out=int((~inside).sum()),
         )
 
+    @property
+    def names(self) -> tuple[str, str, bool]:
+        """What its numbers are, what they go over, and whether they are one curve."""
+        over = "time (step)" if self.at_times else f"displacement of group {self.group}"
+        return f"force on group {self.group}", over, True
+
     def places(self) -> Floats:
         """The displacements or times."""
         return self.along[:, None]

@@ -22,7 +22,7 @@ class TracksObservation(RunObservation):
     particles, they are linear."""
 
     kind: ClassVar[str] = "tracks"
-    times: Floats
+    along: Floats
     points: Floats
     interpolation: Interpolation
 
@@ -49,10 +49,15 @@ class TracksObservation(RunObservation):
             rows=np.flatnonzero(inside),
             left_out=int((~inside).sum()),
             scene=scene,
-            times=times[inside],
+            along=times[inside],
             points=points[inside],
             interpolation=found,
         )
+
+    @property
+    def names(self) -> tuple[str, str, bool]:
+        """What its numbers are, what they go over, and whether they are one curve."""
+        return "displacements (lattice unit)", "time (step)", False
 
     def places(self) -> Floats:
         """The points."""
@@ -62,15 +67,15 @@ class TracksObservation(RunObservation):
         """Of some of them."""
         return replace(
             super().part(chosen),
-            times=self.times[chosen],
+            along=self.along[chosen],
             points=self.points[chosen],
             interpolation=self.interpolation.part(chosen),
         )
 
     def _read(self, run: Run) -> Floats:
-        found = np.zeros((len(self.times), 2))
+        found = np.zeros((len(self.along), 2))
         for state in run:
-            share = np.maximum(0.0, 1.0 - np.abs(self.times - state.step))
+            share = np.maximum(0.0, 1.0 - np.abs(self.along - state.step))
             if (rows := np.flatnonzero(share)).size:
                 part = self.interpolation.part(rows)
                 found[rows] += share[rows, None] * part.of(state.u, run.scene)

@@ -1,0 +1,67 @@
+"""A value with its error, and Young's modulus, which follows from forces."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from pbdkit.fitting.evidence import Carried
+from pbdkit.fitting.least_squares import TELLS, Solution
+from pbdkit.fitting.problem import Problem
+from pbdkit.fitting.resting_field import FieldSeen
+from pbdkit.fitting.specification import Force
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its standard error. `told` is False where the data cannot tell it: then it says
+    nothing. `on_bound`: it stands on a bound, beyond which it might fit better."""
+
+    value: float
+    error: float
+    told: bool = True
+    on_bound: bool = False
+
+    def __str__(self) -> str:
+        if not self.told:
+            return "the data cannot tell it"
+        digits = max(0, 1 - int(np.floor(np.log10(self.error)))) if self.error > 0.0 else 6
+        text = f"{self.value:.{min(digits, 12)}f} ± {self.error:.{min(digits, 12)}f}"
+        return text + (", on its bound" if self.on_bound else "")
+
+    def as_dict(self) -> dict[str, Any]:
+        """In plain values; none of what the data cannot tell."""
+        return asdict(self) if self.told else {"value": None, "error": None, "told": False}
+
+
+def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) -> Estimate | None:
+    """What curves tell of it, else what follows from a force; None where there is neither."""
+    count = len(problem.unknowns)
+    if problem.with_modulus:
+        value, error = float(solution.z[count]), float(solution.errors[count])
+        return Estimate(value, error, told=error < TELLS * abs(value))
+    return _of_force(force, problem, solution) if force else None
+
+
+def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
+    """Force over thickness and what the group carries over Young's modulus, along the force."""
+    way = np.array(force.value) / np.hypot(*force.value)
+    carried, count = Carried(force.group), len(problem.unknowns)
+    seen = solution.at.seen[0]
+    assert isinstance(seen, FieldSeen)
+    unit = float(way @ carried.predicted(seen.resting))
+    parameters = [*(u.parameter for u in problem.unknowns)]
+    names = [*parameters, *[None] * (len(seen.changes) - count)]
+    gradient = np.zeros(problem.size)
+    for n, (du, parameter) in enumerate(zip(seen.changes, names, strict=True)):
+        gradient[n] = way @ carried.change(seen.resting, du, parameter)
+    told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
+    known = [*told, *range(count, problem.size)]
+    part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])
+    size = float(np.hypot(*force.value))
+    value = size / force.thickness / unit
+    error = abs(value) * np.hypot(part / unit, force.noise / size)
+    matters = any(abs(gradient[n]) > 1e-9 * abs(unit) for n in range(count) if n not in told)
+    return Estimate(value, float(error), told=not matters)
