@@ -7,6 +7,7 @@ only (mixed coordinates), it is solved first. Parts of the body that nothing hol
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -135,6 +136,25 @@ class MatrixSystem(System):
                     ) from None
             found[:, stage.axes] = x.reshape(-1, len(stage.axes))
         return found
+
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """By `solve`, which knows no tolerance."""
+        return self.solve(moves, 0.0)
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """The last stage first."""
+        table = self._table(weights)
+        found = np.zeros_like(table)
+        for stage in reversed(self._stages):
+            b = table[:, stage.axes].ravel()
+            x = np.zeros_like(b)
+            for some, part in stage.parts:
+                x[some] = part.solve_transposed(b[some])
+            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
+            if stage.into is not None:
+                table[:, 1 - stage.axes[0]] += stage.into.T @ x
+        found[self._guided] = 0.0
+        return self._planes(found)
 
     def _owed(self, state: State) -> Floats | None:
         """What followers have yet to get, (follower, axis), where the step looks back:

@@ -6,6 +6,7 @@ Moves and displacements are planes, (axis, sublattice, cell, cell), as in a stat
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cache
 from typing import Any
@@ -76,6 +77,16 @@ class System(ABC):
 
         Raises ExperimentError where a part is pushed on for ever.
         """
+
+    @abstractmethod
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """A⁻¹ moves to a share of its largest number; answers that are `near`, as those of systems
+        alike, save iterations."""
+
+    @abstractmethod
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """λ, zero but at followers, with Σ λ · moves = Σ weights · A⁻¹ moves for all moves: Aᵀ λ =
+        weights, to a share of its largest number."""
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
