@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import re
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -260,6 +261,61 @@ def test_what_is_solved_transposed_is_the_transpose(method, frame):
         size = np.linalg.norm(there) * np.linalg.norm(b)
         assert abs((there * b).sum() - (a * back).sum()) < 1e-9 * size
         assert re.search(name, resting.system.methods)
+
+
+by_grids = pytest.mark.skipif(not find_spec("numba"), reason="grids are compiled by numba")
+WIDE = SHEET | {
+    "rule": ELASTIC, "frame": {"type": "natural"},
+    "body": {"type": "grid", "columns": 32, "rows": 24},
+    "solver": {"type": "equilibrium", "method": "multigrid"},
+}  # fmt: skip
+
+
+@by_grids
+def test_answers_that_begin_at_those_of_another_equilibrium_are_the_same():
+    parameter, accuracy = Parameter("rule.poisson_ratio"), 1e-9
+    there = Resting.of(pbdkit.Experiment(**WIDE), accuracy=accuracy)
+    led = np.zeros_like(there.state.u)
+    led.reshape(2, -1)[0, there.scene.leading[1].place] = 1.0
+    nearby = parameter.put(there.scene.experiment, 0.31)
+    found, counts = [], []
+    for start in (None, there):
+        there.answer(led), there.change(parameter)
+        here = Resting.of(nearby, start, accuracy)
+        before = here.system.iterations
+        found.append((here.answer(led), here.change(parameter)))
+        counts.append(here.system.iterations - before)
+    for alone, begun in zip(*found, strict=True):
+        np.testing.assert_allclose(begun, alone, rtol=0.0, atol=1e-7 * np.abs(alone).max())
+    assert counts[1] < 0.8 * counts[0]
+
+
+@by_grids
+def test_what_leaders_do_is_among_the_stencils():
+    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    led = np.zeros_like(resting.state.u)
+    place = resting.scene.leading[1].place
+    led.reshape(2, -1)[:, place] = np.random.default_rng(0).normal(size=(2, len(place)))
+    pushed = resting.system.pushed_by(led)
+    np.testing.assert_allclose(pushed, resting.along(resting._moves, led), atol=1e-13)
+
+
+def test_a_rough_derivative_is_as_accurate_as_asked():
+    exact, rough = (Resting.of(pbdkit.Experiment(**WIDE), None, a) for a in (1e-12, 1e-7))
+    one, other = (resting.change(Parameter("rule.poisson_ratio")) for resting in (exact, rough))
+    assert 0.0 < np.abs(one - other).max() < 1e-6 * np.abs(one).max()
+
+
+def test_sensitivities_have_no_kernel_compiled_anew():
+    pytest.importorskip("numba")
+    from pbdkit.equilibrium.grids.grid_functions import kernels
+
+    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    resting.gradient(np.ones_like(resting.state.u), [Parameter("rule.poisson_ratio")])
+    again = Resting.of(resting.scene.experiment, resting)
+    again.answer(np.ones_like(resting.state.u))
+    for name, ways in (("product", 1), ("scaled", 1), ("dot", 2)):
+        assert len(getattr(kernels(), name).signatures) == ways, name
 
 
 def test_bonds_that_change_and_obstacles_are_refused():

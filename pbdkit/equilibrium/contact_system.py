@@ -135,6 +135,9 @@ class ContactSystem(System):
         """By `solve`, which knows no tolerance."""
         return self.solve(moves, 0.0)
 
+    def pushed_by(self, led: Floats) -> None:
+        """Unknown."""
+
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
         """Part by part."""
         b = self._table(weights)

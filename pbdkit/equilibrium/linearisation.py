@@ -63,6 +63,10 @@ class _Replaceable(System):
         """By the first that can."""
         return self._first_able(lambda system: system.answer(moves, share, near))
 
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """By the present one."""
+        return self._system.pushed_by(led)
+
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
         """By the first that can."""
         return self._first_able(lambda system: system.solve_transposed(weights, share))

@@ -84,6 +84,11 @@ class System(ABC):
         alike, save iterations."""
 
     @abstractmethod
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """The moves of followers whose leaders are displaced so much, as linear as A; None where
+        the system does not know of leaders."""
+
+    @abstractmethod
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
         """λ, zero but at followers, with Σ λ · moves = Σ weights · A⁻¹ moves for all moves: Aᵀ λ =
         weights, to a share of its largest number."""

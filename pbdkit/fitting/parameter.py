@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,8 +27,9 @@ over 1 and 2."""
 STEP, FARTHER, LEAST = 2e-3, 1e-2, 1e-7
 """The step as a share of a value, or of 1 where that is smaller than a tenth; that of parts that
 may decide who is there, which shows farther out; no smaller one is taken where a bound is near."""
-SMOOTH = 1e-5
-"""Where order 2 is off by this share of order 4, that is off by about its square."""
+SMOOTH, ROUGH = 1e-5, 1e-8
+"""Where order 2 is off by this share of order 4, that is off by about its square; from what
+accuracy on order 2 serves, by a step of a quarter of its root."""
 PARTS = ("rule", "fracture")
 """What alone changes where one of their parameters does."""
 ALONE = ("leaders", "loads")
@@ -88,16 +90,25 @@ class Parameter:
             told = error.errors()[0]["msg"]
             raise ExperimentError(f"{self.path} = {value:.6g}: {told}") from None
 
-    def derivative(self, experiment: Experiment, function: Callable[[Experiment], Any]) -> Any:
+    def derivative(
+        self,
+        experiment: Experiment,
+        function: Callable[[Experiment], Any],
+        accuracy: float = 0.0,
+    ) -> Any:
         """d function / d parameter at an experiment, of an array: by central differences of order 4
-        where these are exact to some 1e-10, else of order 8.
+        where these are exact to some 1e-10, else of order 8; of order 2 where an accuracy of some
+        1e-7, as a share, is enough.
 
         Raises ExperimentError where the number stands on its bound.
         """
         value = self.value_in(experiment)
         part, _, _ = self.path.partition(".")
         among = part in (*PARTS, *ALONE)
-        step, ends = self._ends(experiment, value, STEP if among else FARTHER)
+        if among and accuracy >= ROUGH:
+            step, ((above, below),) = self._ends(experiment, value, math.sqrt(accuracy) / 4.0, 1)
+            return (function(above) - function(below)) / (2.0 * step)
+        step, ends = self._ends(experiment, value, STEP if among else FARTHER, len(WEIGHTS))
         changes = [function(above) - function(below) for above, below in ends[: len(ORDER_4)]]
         found = sum(weight / step * change for weight, change in zip(ORDER_4, changes, strict=True))
         off = np.abs(found - changes[0] / (2.0 * step)).max(initial=0.0)
@@ -107,15 +118,15 @@ class Parameter:
         return sum(weight / step * change for weight, change in zip(WEIGHTS, changes, strict=True))
 
     def _ends(
-        self, experiment: Experiment, value: float, share: float
+        self, experiment: Experiment, value: float, share: float, pairs: int
     ) -> tuple[float, list[tuple[Experiment, Experiment]]]:
-        """The step, and the experiments with up to four more and fewer of it."""
+        """The step, and the experiments with 1, 2, … more and fewer of it."""
         step = share * max(abs(value), 0.1)
         while True:
             try:
                 return step, [
                     (self.put(experiment, value + n * step), self.put(experiment, value - n * step))
-                    for n in range(1, 1 + len(WEIGHTS))
+                    for n in range(1, 1 + pairs)
                 ]
             except ExperimentError:
                 step /= 10.0

@@ -109,7 +109,7 @@ class Resting:
         """∂u/∂θ as planes, (axis, sublattice, cell, cell): leaders as they are led, followers as
         they follow, the frame in line. Raises ExperimentError."""
         shown, moves = self._pushed_by(parameter)
-        return self._with_frame(shown, self._answer(moves))
+        return self._with_frame(shown, self._answer(moves, parameter.path.encode()))
 
     def gradient(self, weights: Floats, parameters: Sequence[Parameter]) -> Floats:
         """dJ/dθ of J = Σ weights · u, (parameter,): by one solution for all of them. `weights` are
@@ -126,7 +126,8 @@ class Resting:
 
     def answer(self, led: Floats) -> Floats:
         """∂u of leaders that go on so much, as planes: followers follow."""
-        moves = self.along(self._moves, led)
+        pushed = self.system.pushed_by(led) if self.finder.linear else None
+        moves = self.along(self._moves, led) if pushed is None else pushed
         return self._with_frame(0.0, led + self._answer(moves, led.tobytes()))
 
     def answers(self, led: Sequence[Floats]) -> list[Floats]:
@@ -152,7 +153,7 @@ class Resting:
     def _pushed_by(self, parameter: Parameter) -> tuple[Floats, Floats]:
         """How leaders, and the frame points of a body that stays, are moved by a parameter, and the
         moves of followers among them."""
-        shown, moves = parameter.derivative(self.scene.experiment, self._pushed)
+        shown, moves = parameter.derivative(self.scene.experiment, self._pushed, self.accuracy)
         return shown, moves
 
     def _pushed(self, experiment: Experiment) -> Floats:
@@ -184,15 +185,14 @@ class Resting:
                 plane += np.bincount(frame.body_place, values, plane.size)
         return found
 
-    def _answer(self, moves: Floats, of: bytes = b"") -> Floats:
+    def _answer(self, moves: Floats, of: bytes) -> Floats:
         """A⁻¹ moves, kept by what they are the moves of."""
         if not moves.any():
             return moves
         near = [known[of] for known in self.former if of in known]
         with one_thread():
             found = self.system.answer(moves, self.accuracy, near)
-        if of:
-            self._answers[of] = found.copy()
+        self._answers[of] = found.copy()
         return found
 
 

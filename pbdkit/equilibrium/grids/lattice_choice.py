@@ -38,8 +38,10 @@ def lattice_system(
     held = held_components(scene, step)
     if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
         return None
+    known = balanced(constrained(matrix, held), alike)
     try:
-        system = LatticeSystem(*balanced(constrained(matrix, held), alike), state.u.shape, watch)
+        # What frame points show of leaders is not among the stencils.
+        system = LatticeSystem(*known, state.u.shape, watch, not (moves or scene.frame))
     except FloatingError:
         return None
     if not system.may_be_stable:
