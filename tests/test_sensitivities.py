@@ -318,6 +318,19 @@ def test_sensitivities_have_no_kernel_compiled_anew():
         assert len(getattr(kernels(), name).signatures) == ways, name
 
 
+def test_a_displaced_part_that_nothing_holds_is_refused():
+    pulled = [
+        {"select": {"edge": edge}, "force": [sign * 0.01, 0.0]}
+        for edge, sign in (("left", -1.0), ("right", 1.0))
+    ]
+    free = SHEET | {"leaders": [], "rule": ELASTIC, "frame": {"type": "natural"}}
+    resting = Resting.of(pbdkit.Experiment(**free | {"loads": pulled}))
+    with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of the body"):
+        resting.change(Parameter("rule.poisson_ratio"))
+    with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of the body"):
+        resting.gradient(resting.state.u, [Parameter("rule.poisson_ratio")])
+
+
 def test_bonds_that_change_and_obstacles_are_refused():
     torn = {"rule": ELASTIC, "frame": {"type": "natural"},
             "fracture": {"type": "strain", "failure": 0.01}}  # fmt: skip

@@ -95,7 +95,19 @@ class Resting:
     @cached_property
     def system(self) -> System:
         """A, at the equilibrium; of a linear scene at rest, where stencils are exact: that by which
-        it was found."""
+        it was found. Raises ExperimentError where a part that nothing holds was displaced."""
+        found = self._linearised()
+        try:
+            found.refuse_moving_floats(self.state.u, self.finder.moves.rounding(self.state.u))
+        except ExperimentError as error:
+            raise ExperimentError(
+                "nothing holds a part of the body: where it comes to rest hangs on how it started, "
+                "too, so that there are no sensitivities; let a leader hold it",
+                error.where,
+            ) from None
+        return found
+
+    def _linearised(self) -> System:
         if self.finder.linear and self.finder.at_rest:
             return self.finder.at_rest[0]
         at = self.state
