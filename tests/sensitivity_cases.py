@@ -138,9 +138,9 @@ def other_case(frame, parts):
 
 
 def paths_of(rule, frame):
-    """All parameters with two frames; with others some of the rule, which act on the frame too."""
+    """All parameters with one frame; with others some of the rule, which act on the frame too."""
     paths = RULES[rule][2]
-    return paths if frame in ("mean", "natural") else paths[: max(1, len(paths) - 3)]
+    return paths if frame == ("mean" if rule in BY_DISTANCE else "natural") else paths[: max(1, len(paths) - 3)]
 
 
 class Plain:
