@@ -140,7 +140,8 @@ def other_case(frame, parts):
 def paths_of(rule, frame):
     """All parameters with one frame; with others some of the rule, which act on the frame too."""
     paths = RULES[rule][2]
-    return paths if frame == ("mean" if rule in BY_DISTANCE else "natural") else paths[: max(1, len(paths) - 3)]
+    full = frame == ("mean" if rule in BY_DISTANCE else "natural")
+    return paths if full else paths[: max(1, len(paths) - 3)]
 
 
 class Plain:
