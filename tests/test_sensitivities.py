@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import operator
+import re
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import sensitivity_cases
 
 import pbdkit
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
+from pbdkit.interfaces import FollowerRule, FramePolicy
+from pbdkit.registry import BUILTIN
+from pbdkit.registry.registry import Registry
 from pbdkit.scene import homes
 from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.raster import FOLLOWER
@@ -188,6 +194,141 @@ def test_derivatives_are_those_of_differences_of_equilibria(name):
     size = np.abs(expected).max()
     assert size > 1e-5
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * size)
+
+
+@pytest.mark.parametrize("frame", sensitivity_cases.FRAMES)
+@pytest.mark.parametrize("rule", sensitivity_cases.RULES)
+def test_derivatives_and_gradients_are_those_of_equilibria_found_anew(rule, frame):
+    given = sensitivity_cases.case(rule, frame)
+    rules, told = sensitivity_cases.REFUSED.get(frame, ((), ""))
+    if rule in rules:
+        with pytest.raises(pbdkit.ExperimentError, match=told):
+            build_scene(pbdkit.Experiment(**given))
+        pytest.skip(f"the rule does not take this frame: it {told}")
+    for path, size, off, along in sensitivity_cases.errors(
+        given, sensitivity_cases.paths_of(rule, frame)
+    ):
+        assert size > 1e-3, path
+        assert off < 1e-9, path
+        assert not along > 1e-12, path
+
+
+@pytest.mark.parametrize("frame", ["natural", "mean"])
+@pytest.mark.parametrize("path", sensitivity_cases.MORE)
+def test_derivatives_by_other_parts_are_those_of_equilibria_found_anew(path, frame):
+    given = sensitivity_cases.other_case(frame, sensitivity_cases.MORE[path])
+    ((_, size, off, along),) = sensitivity_cases.errors(given, [path])
+    assert size > 1e-3
+    assert off < 1e-9
+    assert along < 1e-12
+
+
+def test_every_rule_and_frame_that_ships_is_among_those_compared():
+    own = next(plugin for plugin in Registry().plugins if plugin.distribution == BUILTIN)
+    rules = {rule["type"] for rule, _, _ in sensitivity_cases.RULES.values()}
+    for kind, compared in ((FollowerRule, rules), (FramePolicy, {*sensitivity_cases.FRAMES})):
+        assert {offer.name for offer in own.offers if offer.interface is kind} == compared
+
+
+METHODS = {
+    "inverse": ("auto", (7, 6), "lu"),
+    "factors": ("lu", (32, 24), "lu"),
+    "grids of a lattice": ("multigrid", (32, 24), "multigrid"),
+    "without a preconditioner": ("conjugate-gradients", (12, 9), "conjugate-gradients|gmres"),
+}
+
+
+@pytest.mark.parametrize("frame", ["natural", "mean", "traction-free"])
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_solved_transposed_is_the_transpose(method, frame):
+    """⟨A⁻¹a, b⟩ = ⟨a, A⁻ᵀb⟩: of symmetric systems, of others, and of ones in stages."""
+    asked, (columns, rows), name = METHODS[method]
+    for rule in (ELASTIC, {"type": "mixed-coordinate", "K": -0.01}):
+        parts = {"neighbours": {"type": "coordination"}} if rule is not ELASTIC else {}
+        if parts and frame != "mean":
+            continue
+        given = SHEET | parts | {
+            "rule": rule, "frame": {"type": frame},
+            "body": {"type": "grid", "columns": columns, "rows": rows},
+            "solver": {"type": "equilibrium", "method": asked},
+        }  # fmt: skip
+        resting = Resting.of(pbdkit.Experiment(**given))
+        kinds = kinds_of_places(resting.scene.raster, resting.scene.leading, 1)
+        a, b = np.random.default_rng(0).normal(size=(2, *resting.state.u.shape))
+        for planes in (a, b):
+            planes.reshape(2, -1)[:, kinds != FOLLOWER] = 0.0
+        there, back = resting.system.answer(a, 1e-12), resting.system.solve_transposed(b, 1e-12)
+        size = np.linalg.norm(there) * np.linalg.norm(b)
+        assert abs((there * b).sum() - (a * back).sum()) < 1e-9 * size
+        assert re.search(name, resting.system.methods)
+
+
+by_grids = pytest.mark.skipif(not find_spec("numba"), reason="grids are compiled by numba")
+WIDE = SHEET | {
+    "rule": ELASTIC, "frame": {"type": "natural"},
+    "body": {"type": "grid", "columns": 32, "rows": 24},
+    "solver": {"type": "equilibrium", "method": "multigrid"},
+}  # fmt: skip
+
+
+@by_grids
+def test_answers_that_begin_at_those_of_another_equilibrium_are_the_same():
+    parameter, accuracy = Parameter("rule.poisson_ratio"), 1e-9
+    there = Resting.of(pbdkit.Experiment(**WIDE), accuracy=accuracy)
+    led = np.zeros_like(there.state.u)
+    led.reshape(2, -1)[0, there.scene.leading[1].place] = 1.0
+    nearby = parameter.put(there.scene.experiment, 0.31)
+    found, counts = [], []
+    for start in (None, there):
+        there.answer(led), there.change(parameter)
+        here = Resting.of(nearby, start, accuracy)
+        before = here.system.iterations
+        found.append((here.answer(led), here.change(parameter)))
+        counts.append(here.system.iterations - before)
+    for alone, begun in zip(*found, strict=True):
+        np.testing.assert_allclose(begun, alone, rtol=0.0, atol=1e-7 * np.abs(alone).max())
+    assert counts[1] < 0.8 * counts[0]
+
+
+@by_grids
+def test_what_leaders_do_is_among_the_stencils():
+    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    led = np.zeros_like(resting.state.u)
+    place = resting.scene.leading[1].place
+    led.reshape(2, -1)[:, place] = np.random.default_rng(0).normal(size=(2, len(place)))
+    pushed = resting.system.pushed_by(led)
+    np.testing.assert_allclose(pushed, resting.along(resting._moves, led), atol=1e-13)
+
+
+def test_a_rough_derivative_is_as_accurate_as_asked():
+    exact, rough = (Resting.of(pbdkit.Experiment(**WIDE), None, a) for a in (1e-12, 1e-7))
+    one, other = (resting.change(Parameter("rule.poisson_ratio")) for resting in (exact, rough))
+    assert 0.0 < np.abs(one - other).max() < 1e-6 * np.abs(one).max()
+
+
+def test_sensitivities_have_no_kernel_compiled_anew():
+    pytest.importorskip("numba")
+    from pbdkit.equilibrium.grids.grid_functions import kernels
+
+    resting = Resting.of(pbdkit.Experiment(**WIDE))
+    resting.gradient(np.ones_like(resting.state.u), [Parameter("rule.poisson_ratio")])
+    again = Resting.of(resting.scene.experiment, resting)
+    again.answer(np.ones_like(resting.state.u))
+    for name, ways in (("product", 1), ("scaled", 1), ("dot", 2)):
+        assert len(getattr(kernels(), name).signatures) == ways, name
+
+
+def test_a_displaced_part_that_nothing_holds_is_refused():
+    pulled = [
+        {"select": {"edge": edge}, "force": [sign * 0.01, 0.0]}
+        for edge, sign in (("left", -1.0), ("right", 1.0))
+    ]
+    free = SHEET | {"leaders": [], "rule": ELASTIC, "frame": {"type": "natural"}}
+    resting = Resting.of(pbdkit.Experiment(**free | {"loads": pulled}))
+    with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of the body"):
+        resting.change(Parameter("rule.poisson_ratio"))
+    with pytest.raises(pbdkit.ExperimentError, match="nothing holds a part of the body"):
+        resting.gradient(resting.state.u, [Parameter("rule.poisson_ratio")])
 
 
 def test_bonds_that_change_and_obstacles_are_refused():

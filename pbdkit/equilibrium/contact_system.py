@@ -14,6 +14,7 @@ Newton iteration (Hintermüller, Ito, Kunisch), which changes the set until it s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -129,6 +130,21 @@ class ContactSystem(System):
                     ("obstacles",),
                 ) from None
         return self._planes(x)
+
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """By `solve`, which knows no tolerance."""
+        return self.solve(moves, 0.0)
+
+    def pushed_by(self, led: Floats) -> None:
+        """Unknown."""
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """Part by part."""
+        b = self._table(weights)
+        found = np.zeros_like(b)
+        for some, part in self._parts:
+            found[some] = part.solve_transposed(b[some])
+        return self._planes(found)
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """Nothing is linear where particles come to rest on obstacles."""

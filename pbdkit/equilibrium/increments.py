@@ -41,7 +41,7 @@ Way = Generator[float, None, Certificate]
 
 
 def increments(
-    scene: Scene, state: State, watch: Watch, since: float = 0.0, *, compiles: bool = True
+    scene: Scene, state: State, watch: Watch, since: float = 0.0, finder: Finder | None = None
 ) -> Way:
     """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
     moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
@@ -64,8 +64,9 @@ def increments(
                 "{type: stepping}, or a motion that ends",
                 (field, n, "motion"),
             )
-    scale = scale_of(scene, initial_state(scene) if since or state.step else state)
-    finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch, compiles)
+    if finder is None:
+        scale = scale_of(scene, initial_state(scene) if since or state.step else state)
+        finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))
@@ -75,10 +76,10 @@ def increments(
 
 
 def settle(
-    scene: Scene, state: State, watch: Watch | None = None, *, compiles: bool = True
+    scene: Scene, state: State, watch: Watch | None = None, finder: Finder | None = None
 ) -> Certificate:
-    """The same in one go; moves are compiled where that `compiles` and they are many."""
-    way = increments(scene, state, watch or Watch(), compiles=compiles)
+    """The same in one go, by a finder where one is at hand."""
+    way = increments(scene, state, watch or Watch(), finder=finder)
     while True:
         try:
             next(way)

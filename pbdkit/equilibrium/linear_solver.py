@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,10 @@ class LinearSolver(ABC):
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
 
+    @abstractmethod
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """The same of Aᵀ x = b."""
+
 
 class Dense(LinearSolver):
     """The inverse itself, for small matrices."""
@@ -70,6 +75,10 @@ class Dense(LinearSolver):
     def solve(self, b: Floats, accuracy: float) -> Floats:
         """By a product."""
         return self.inverse @ b
+
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By a product."""
+        return self.inverse.T @ b
 
 
 class SparseLU(LinearSolver):
@@ -103,8 +112,8 @@ class SparseLU(LinearSolver):
         """By the factors."""
         return self._by_factors(b, "N")
 
-    def solve_transposed(self, b: Floats) -> Floats:
-        """Aᵀ x = b."""
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By the same factors."""
         return self._by_factors(b, "T")
 
     def _by_factors(self, b: Floats, how: str) -> Floats:
@@ -129,6 +138,7 @@ class Krylov(LinearSolver):
         inner = "conjugate-gradients" if symmetric else "gmres"
         self.name = f"multigrid, {inner}" if grids else inner
         self._matrix, self._symmetric, self._watch = matrix, symmetric, watch
+        self._grids = grids
         self._cycle = grids(matrix) if grids else np.copy
         self._most = MOST_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
 
@@ -160,6 +170,14 @@ class Krylov(LinearSolver):
                 x, _ = gmres(self._matrix, b, maxiter=MOST_ITERATIONS // 30, **how)
         self._watch.look(1.0)
         return np.asarray(x)
+
+    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
+        """By grids of the transpose, where that is another matrix."""
+        return (self if self._symmetric else self._transposed).solve(b, accuracy)
+
+    @cached_property
+    def _transposed(self) -> Krylov:
+        return Krylov(self._matrix.T.tocsr(), False, self._watch, self._grids)
 
 
 def linear_solver(

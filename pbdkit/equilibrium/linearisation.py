@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TypeVar
 
@@ -40,7 +40,7 @@ def linearised(
         return MatrixSystem(scene, state, method, watch, step)
 
     if find_spec("numba") and asks_for_grids(scene.experiment, method, scene.raster.count):
-        from pbdkit.equilibrium.grids.lattice_system import lattice_system
+        from pbdkit.equilibrium.grids.lattice_choice import lattice_system
 
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())
@@ -58,6 +58,18 @@ class _Replaceable(System):
     def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
         """By the first that can."""
         return self._first_able(lambda system: system.solve(moves, tolerance, owed))
+
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.answer(moves, share, near))
+
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """By the present one."""
+        return self._system.pushed_by(led)
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.solve_transposed(weights, share))
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """By the present one."""

@@ -7,8 +7,8 @@ only (mixed coordinates), it is solved first. Parts of the body that nothing hol
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
+from pbdkit.equilibrium.stage import Stage
 from pbdkit.equilibrium.system import System
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
 from pbdkit.errors import ExperimentError
@@ -26,16 +27,6 @@ from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.intp]
-
-
-@dataclass
-class _Stage:
-    """The unknowns of one axis, or of both where they move each other, with their parts: who
-    belongs to each. `into` is what the axis solved before adds to the moves."""
-
-    axes: list[int]
-    parts: list[tuple[Indices, Part]]
-    into: Any = None
 
 
 class MatrixSystem(System):
@@ -136,6 +127,28 @@ class MatrixSystem(System):
             found[:, stage.axes] = x.reshape(-1, len(stage.axes))
         return found
 
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """By `solve`, which knows no tolerance."""
+        return self.solve(moves, 0.0)
+
+    def pushed_by(self, led: Floats) -> None:
+        """Unknown."""
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """The last stage first."""
+        table = self._table(weights)
+        found = np.zeros_like(table)
+        for stage in reversed(self._stages):
+            b = table[:, stage.axes].ravel()
+            x = np.zeros_like(b)
+            for some, part in stage.parts:
+                x[some] = part.solve_transposed(b[some])
+            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
+            if stage.into is not None:
+                table[:, 1 - stage.axes[0]] += stage.into.T @ x
+        found[self._guided] = 0.0
+        return self._planes(found)
+
     def _owed(self, state: State) -> Floats | None:
         """What followers have yet to get, (follower, axis), where the step looks back:
         before · (u(t-1) - u(t)), None elsewhere."""
@@ -171,22 +184,22 @@ class MatrixSystem(System):
         """Part by part."""
         return all(part.is_stable() for stage in self._stages for _, part in stage.parts)
 
-    def _named(self, stage: _Stage, unknowns: Indices) -> str:
+    def _named(self, stage: Stage, unknowns: Indices) -> str:
         numbers = np.unique(self._operator.followers[unknowns // len(stage.axes)]) + 1
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
-    def _following(self, first: int) -> _Stage:
+    def _following(self, first: int) -> Stage:
         """The stage of the other axis; it shares the solvers of the first where both are alike."""
         other, led = 1 - first, self._operator.couplings_led
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
         if self._both.is_isotropic() and led.is_isotropic():
-            return _Stage([other], self._stages[0].parts, into)
+            return Stage([other], self._stages[0].parts, into)
         stage = self._stage([other])
         stage.into = into
         return stage
 
-    def _stage(self, axes: list[int]) -> _Stage:
+    def _stage(self, axes: list[int]) -> Stage:
         matrix = one_minus(self._both.entries(axes).matrix())
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
         self._amplification = max(self._amplification, largest)
@@ -201,7 +214,7 @@ class MatrixSystem(System):
         held[label[led.rows[led.values != 0.0]]] = True
         # What leaders move directly or not is solved together, each part that floats by itself.
         groups = [np.flatnonzero((held & ~alone)[label])] if held.any() else []
-        stage = _Stage(axes, [])
+        stage = Stage(axes, [])
         for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held & ~alone)]:
             part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
             stage.parts.append((some, part))

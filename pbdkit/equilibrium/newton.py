@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,17 +25,16 @@ SERVES, NEAR = 0.02, 1e-3
 """What share of an error a correction may leave for its linearisation to serve once more; how
 accurately corrections are solved for at least, as a share of themselves."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
-NUDGE = 1e-6
-"""By so much leaders are moved to see what their way does to others."""
-SHARE = 0.25
-"""Of the tolerance, for linear systems."""
+NUDGE, SHARE = 1e-6, 0.25
+"""By so much leaders are moved to see what their way does to others; the share of the tolerance
+that linear systems have."""
 UNSTABLE = "what is found is not stable"
 
 
 @dataclass(frozen=True)
 class Finder:
     """Looks for equilibria of a scene, to within a length, by one of the solver's methods, shares
-    being of the length `scale`; `compiles` is that of the moves."""
+    being of the length `scale`; `compiles` is of the moves; `at_rest` the last system there."""
 
     scene: Scene
     tolerance: float
@@ -43,6 +42,7 @@ class Finder:
     method: str
     watch: Watch
     compiles: bool = True
+    at_rest: list[System] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
     def moves(self) -> Moves:
@@ -170,14 +170,14 @@ class _Linear(Search):
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
         at_rest = replace(state, u=np.zeros_like(state.u))
         super().__init__(finder, state, moment, at_rest, "assembling")
+        finder.at_rest[:] = [self._system]
         self._owed: State | None = state.copy()
 
     def run(self) -> Certificate:
         """Corrects until the tolerance is reached."""
-        moves = self._left.any() or self._state.u.any() or self._state.previous.any()
         self._linear = True
-        if moves:  # else nothing is prescribed but rest
-            self._correct()
+        if self._left.any() or self._state.u.any() or self._state.previous.any():
+            self._correct()  # else nothing is prescribed but rest
         return self._certified()
 
     def _correct(self) -> None:
@@ -188,8 +188,8 @@ class _Linear(Search):
             self._owed = None
             after, floor = _size(self._left), self._floor()
             if n == 0 and before > 1e3 * floor:
-                mismatch = self._system.mismatch(correction, moves, self._left)
-                if not mismatch <= LINEAR + floor / before:
+                off = self._system.mismatch(correction, moves, self._left)
+                if not off <= LINEAR + floor / before:
                     raise UnconvergedError(NOT_LINEAR, self._certificate(self._distance()))
             if not after <= 0.5 * before or self._distance() <= self._finder.tolerance:
                 return

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cache
 from typing import Any
@@ -79,6 +80,21 @@ class System(ABC):
 
         Raises ExperimentError where a part is pushed on for ever.
         """
+
+    @abstractmethod
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """A⁻¹ moves to a share of its largest number; answers that are `near`, as those of systems
+        alike, save iterations."""
+
+    @abstractmethod
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """The moves of followers whose leaders are displaced so much, as linear as A; None where
+        the system does not know of leaders."""
+
+    @abstractmethod
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """λ, zero but at followers, with Σ λ · moves = Σ weights · A⁻¹ moves for all moves: Aᵀ λ =
+        weights, to a share of its largest number."""
 
     @abstractmethod
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:

@@ -60,6 +60,10 @@ class Part(ABC):
         """The x to which steps from x = 0 converge; `owed` is what invariants have to gain. Raises
         DriftingError where there is none."""
 
+    @abstractmethod
+    def solve_transposed(self, weights: Floats) -> Floats:
+        """λ with λ · r = weights · x for the x of every r that has one, nothing being owed."""
+
     @property
     def name(self) -> str:
         """The method."""
@@ -144,12 +148,28 @@ class Held(Part):
         self._watch.begin("solving")
         assert self._solver is not None
         x = self._solver.solve(r, ACCURACY)
-        if isinstance(self._solver, Krylov) and self._has_choice:
-            left = float(np.linalg.norm(r - self._matrix @ x))
-            if not left <= 100 * ACCURACY * float(np.linalg.norm(r)):  # the iteration got stuck
-                self._solver = linear_solver(self._matrix, "lu", **self._how)
-                x = self._solver.solve(r, ACCURACY)
+        if self._is_stuck(self._matrix, x, r):
+            x = self._factorised().solve(r, ACCURACY)
         return x
+
+    def solve_transposed(self, weights: Floats) -> Floats:
+        """By the same method."""
+        assert self._solver is not None
+        found = self._solver.solve_transposed(weights, ACCURACY)
+        if self._is_stuck(self._matrix.T, found, weights):
+            found = self._factorised().solve_transposed(weights, ACCURACY)
+        return found
+
+    def _is_stuck(self, matrix: Any, x: Floats, r: Floats) -> bool:
+        """Whether there is another choice than the iteration that found x, and it got nowhere."""
+        if not (isinstance(self._solver, Krylov) and self._has_choice):
+            return False
+        left = float(np.linalg.norm(r - matrix @ x))
+        return not left <= 100 * ACCURACY * float(np.linalg.norm(r))
+
+    def _factorised(self) -> LinearSolver:
+        self._solver = linear_solver(self._matrix, "lu", **self._how)
+        return self._solver
 
     def farthest(self, r: Floats, rounding: float) -> float:
         """Of what an iteration leaves, some times as far as it leads if it goes on."""
@@ -191,6 +211,14 @@ class Floating(Part):
         b = np.concatenate([r - self._left @ push, kept])
         return self._solver.solve(b, ACCURACY)[: self._size]
 
+    def solve_transposed(self, weights: Floats) -> Floats:
+        """By the same method; nothing that pushes the part on for ever has a share."""
+        if self._solver is None:
+            return np.zeros_like(weights)
+        b = np.append(weights, np.zeros(self._borders))
+        found = self._solver.solve_transposed(b, ACCURACY)[: self._size]
+        return np.asarray(found - self._left @ (self._left.T @ found))
+
 
 def _sparse_bordered(matrix: Any, left: Floats, rows: Floats) -> LinearSolver:
     """Raises LinAlgError where the bordered matrix is singular."""
@@ -214,6 +242,6 @@ def _left_kernel(matrix: Any) -> Floats:
     shifted = SparseLU(matrix + SHIFT * eye_array(matrix.shape[0]), is_symmetric(matrix))
     basis = np.random.default_rng(0).normal(size=(matrix.shape[0], MOST_MODES))
     for _ in range(4):
-        basis = np.linalg.qr(shifted.solve_transposed(basis))[0]
+        basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
     _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
     return np.asarray(basis @ turned[values <= SINGULAR].T)

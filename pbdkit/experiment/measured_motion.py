@@ -87,11 +87,13 @@ class Measured(Motion):
     @cached_property
     def _triangles(self) -> Any:
         """None where all points lie on a line."""
-        from scipy.spatial import Delaunay
-
         at = np.array(self.points)
         _, sizes, _ = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)
-        return Delaunay(at) if sizes[1] > ON_EDGE * sizes[0] else None
+        if sizes[1] <= ON_EDGE * sizes[0]:
+            return None
+        from scipy.spatial import Delaunay
+
+        return Delaunay(at)
 
     def _interpolated(self, places: Floats) -> Floats:
         if self._triangles is None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit.scene.raster import FOLLOWER, Raster
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats
 
@@ -37,9 +38,17 @@ class Interpolation:
         """Of some of the points inside: by their numbers among these, or True for each."""
         return replace(self, rows=self.rows[chosen], shares=self.shares[chosen])
 
+    @cached_property
+    def _places(self) -> dict[str, tuple[Raster, Indices]]:
+        """Where the rows lie on the last raster that was asked for."""
+        return {}
+
     def of(self, planes: Floats, scene: Scene) -> Floats:
         """(point, axis): the values of planes at the points inside."""
-        place = scene.raster.place_of(self.rows.ravel()).reshape(self.rows.shape)
+        known, place = self._places.get("last", (None, self.rows))
+        if known is not scene.raster:
+            place = scene.raster.place_of(self.rows.ravel()).reshape(self.rows.shape)
+            self._places["last"] = scene.raster, place
         flat = planes.reshape(len(planes), -1)
         found: Floats = np.einsum("apc,pc->pa", flat[:, place], self.shares)
         return found

@@ -60,7 +60,7 @@ class Estimate:
     def _made(self, step: int) -> LatticeSystem | None:
         if self.obstacle:
             return None
-        from pbdkit.equilibrium.grids.lattice_system import lattice_system
+        from pbdkit.equilibrium.grids.lattice_choice import lattice_system
 
         return lattice_system(self._scene, self.at_rest, step, Watch())
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,8 +21,33 @@ from pbdkit.equilibrium.grids.multigrid import Multigrid
 Floats = NDArray[np.floating[Any]]
 MOST = 400
 """Turns of an iteration."""
+ALIKE = 1e-13
+"""The share of what others add by which a field differs from them at least."""
 SLOWEST = 0.9
 """The slowest fall of the jumps that is extrapolated."""
+
+
+def best_of(matrix: Any, near: Sequence[Floats], b: Floats) -> Floats | float:
+    """The x among combinations of some fields that leaves nothing of K x = b along any of them, and
+    least energy where K is symmetric (Galerkin); b is overwritten with what it leaves. 0 of none.
+    """
+    if not near:
+        return 0.0
+    kernel = kernels()
+    pulls = [np.zeros_like(b) for _ in near]
+    for v, pull in zip(near, pulls, strict=True):
+        kernel.product(matrix, v, pull)
+    products = np.array([[kernel.dot(v, pull) for pull in pulls] for v in near])
+    along = np.array([kernel.dot(v, b) for v in near])
+    size = np.sqrt(np.abs(products.diagonal()))
+    size[size == 0.0] = 1.0
+    scaled = products / np.outer(size, size)
+    weights = np.linalg.lstsq(scaled, along / size, rcond=ALIKE)[0] / size
+    x = np.zeros_like(b)
+    for weight, v, pull in zip(weights, near, pulls, strict=True):
+        x += weight * v
+        b -= weight * pull
+    return x
 
 
 class Found(ABC):

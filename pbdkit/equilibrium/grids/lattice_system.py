@@ -10,16 +10,15 @@ extrapolated from coarse grids.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grids.fields import field_of, free_field_of, planes_of
 from pbdkit.equilibrium.grids.grid_functions import kernels
-from pbdkit.equilibrium.grids.held_components import constrained, held_components
 from pbdkit.equilibrium.grids.inverse_iteration import SlowMode, softest
 from pbdkit.equilibrium.grids.lattice_krylov import (
     BiconjugateGradients,
@@ -27,25 +26,13 @@ from pbdkit.equilibrium.grids.lattice_krylov import (
     Descent,
     Found,
     Krylov,
+    best_of,
 )
-from pbdkit.equilibrium.grids.multigrid import FloatingError, Multigrid
-from pbdkit.equilibrium.grids.stencil_matrix import (
-    NUDGE,
-    StencilMatrix,
-    differenced_matrix,
-    stencil_matrix,
-)
-from pbdkit.equilibrium.grids.stencil_properties import (
-    DIFFERENCED,
-    EXACT,
-    balanced,
-    is_held,
-    leads_one_way,
-)
-from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.grids.multigrid import Multigrid
+from pbdkit.equilibrium.grids.stencil_matrix import StencilMatrix, inverses
+from pbdkit.equilibrium.grids.stencil_properties import transposed
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
-from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
@@ -53,8 +40,6 @@ LOOKS_AHEAD = 2
 """Iterations that a bound takes."""
 SAFETY = 2.0
 """By what λ is divided."""
-FAITHFUL = 1e-3
-"""The share of what all moves at once are by which stencils from differences may be off."""
 NEAR = 0.01
 """The share of the first jump at which an iteration has found most of an error."""
 TURNS = 6
@@ -64,12 +49,19 @@ ENOUGH = 8
 
 
 class LatticeSystem(System):
-    """The system by multigrid. Raises FloatingError where leaders do not hold all of the body."""
+    """The system by multigrid; `has_leaders` says whether rows of the matrix have what leaders do
+    to followers too. Raises FloatingError where leaders do not hold all of the body."""
 
     def __init__(
-        self, matrix: StencilMatrix, symmetric: bool, shape: tuple[int, ...], watch: Watch
+        self,
+        matrix: StencilMatrix,
+        symmetric: bool,
+        shape: tuple[int, ...],
+        watch: Watch,
+        has_leaders: bool = False,
     ) -> None:
         self._matrix, self._shape, self._watch = matrix, shape, watch
+        self._has_leaders = has_leaders and matrix.at is None and matrix.held is None
         self._grids = Multigrid(matrix)
         self._symmetric = symmetric
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
@@ -103,15 +95,61 @@ class LatticeSystem(System):
             raise StuckError
         return self._planes(found.x)
 
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """From the combination of those `near` that is best."""
+        begun = [free_field_of(self._matrix, v) for v in near]
+        return self._planes(self._to_share(self._pull(moves), share, begun))
+
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """-S⁻¹ K led."""
+        if not self._has_leaders:
+            return None
+        pull, out = self._grids.grid().field(np.float64), self._grids.grid().field(np.float64)
+        kernels().product(self._solver.matrix, field_of(self._matrix, led), pull)
+        own = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
+        inverse = np.ascontiguousarray(own)  # kernels are compiled for such alone
+        kernels().scaled(self._solver.matrix, tuple(inverse[0].tolist()), inverse, pull, out)
+        return self._planes(out)
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """A⁻¹ = K⁻¹ S, and Sᵀ K⁻ᵀ its transpose: by the same grids where K is symmetric, else by
+        those of its transpose."""
+        b, out = free_field_of(self._matrix, weights), self._grids.grid().field(np.float64)
+        solver = self if self._symmetric else self._transposed
+        x = solver._to_share(b, share, ())
+        turned = np.ascontiguousarray(self._matrix.scale[:, [0, 2, 1, 3]])
+        kernels().scaled(self._solver.matrix, tuple(turned[0].tolist()), turned, x, out)
+        return self._planes(out)
+
+    @cached_property
+    def _transposed(self) -> LatticeSystem:
+        return LatticeSystem(transposed(self._matrix), False, self._shape, self._watch)
+
+    def _to_share(self, b: Floats, share: float, near: Sequence[Floats]) -> Floats:
+        """x with K x = b to a share of its largest number."""
+        self._watch.begin("solving")
+        start = best_of(self._solver.matrix, near, b)
+
+        def is_near(d: Found) -> bool:
+            return d.ahead <= share * float(np.abs(start + d.x).max())
+
+        found = self._found(b, is_near)
+        if found.jumps and not is_near(found):
+            raise StuckError
+        return np.asarray(start + found.x)
+
     def slowest(self) -> SlowMode:
         """Roughly the mode of the steps that fades most slowly, by the coarser grids."""
         mode, softness = softest(self._grids, type(self._solver))
-        return SlowMode(self._planes(mode), softness * float(np.abs(self._matrix.scale[0, 0])))
+        return SlowMode(
+            self._planes(mode),
+            softness * float(np.abs(self._matrix.scale[0, 0])),
+        )
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """Of forces."""
         kernel, pull = kernels(), self._grids.grid().field(np.float64)
-        kernel.product(self._solver.matrix, self._here(c), pull)
+        kernel.product(self._solver.matrix, field_of(self._matrix, c), pull)
         left = self._pull(after) - self._pull(before) + pull
         return math.sqrt(kernel.dot(left, left) / kernel.dot(pull, pull))
 
@@ -150,7 +188,10 @@ class LatticeSystem(System):
         before = v
         for _ in range(TURNS):
             found = self._found(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
-            before, v = v, self._planes(found.x / (np.abs(found.x).max() or 1.0))
+            before, v = (
+                v,
+                self._planes(found.x / (np.abs(found.x).max() or 1.0)),
+            )
         return bool((v * before).sum() > 0.0)
 
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
@@ -201,50 +242,9 @@ class LatticeSystem(System):
         """What K c equals, on the grid."""
         out, scale = self._grids.grid().field(np.float64), self._matrix.scale
         same = tuple(scale[0].tolist())
-        kernels().scaled(self._solver.matrix, same, scale, self._here(moves), out)
-        return out
-
-    def _here(self, planes: Floats) -> Floats:
-        """On the grid."""
-        if self._matrix.at is None:
-            return planes.reshape(2, *self._matrix.code.shape)
-        out = self._grids.grid().field(np.float64)
-        out.reshape(2, -1)[:, self._matrix.at] = planes.reshape(2, -1)[:, self._matrix.place]
+        kernels().scaled(self._solver.matrix, same, scale, field_of(self._matrix, moves), out)
         return out
 
     def _planes(self, field: Floats) -> Floats:
         """On the scene's raster."""
-        if self._matrix.at is None:
-            return field.reshape(self._shape)
-        planes = np.zeros(self._shape)
-        planes.reshape(2, -1)[:, self._matrix.place] = field.reshape(2, -1)[:, self._matrix.at]
-        return planes
-
-
-def lattice_system(
-    scene: Scene, state: State, step: int, watch: Watch, moves: Moves | None = None
-) -> LatticeSystem | None:
-    """The system of a scene, by the moves of its followers where these are compiled and the state
-    is not at rest; None where it has no such form, or leaders do not hold the body."""
-    if moves and moves.is_compiled and state.u.any():
-        matrix = differenced_matrix(scene, state, step, moves)
-        alike = DIFFERENCED
-    else:
-        matrix, alike, moves = stencil_matrix(scene, state, step), EXACT, None
-    held = held_components(scene, step)
-    if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
-        return None
-    try:
-        system = LatticeSystem(*balanced(constrained(matrix, held), alike), state.u.shape, watch)
-    except FloatingError:
-        return None
-    if not system.may_be_stable:
-        if state.u.any():
-            raise IndefiniteError
-        return None
-    if moves:
-        put = random_displacements(scene, NUDGE)
-        there = replace(state, u=state.u + put)
-        if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
-            return None
-    return system
+        return planes_of(self._matrix, field, self._shape)

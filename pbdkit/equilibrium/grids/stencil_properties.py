@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.grids.grid_functions import kernels
-from pbdkit.equilibrium.grids.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
+from pbdkit.equilibrium.grids.stencil_matrix import (
+    FREE,
+    LED,
+    OUTSIDE,
+    OWN,
+    WINDOW,
+    StencilMatrix,
+)
 
 EXACT, DIFFERENCED = 1e-9, 1e-5
 """Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
@@ -51,6 +58,21 @@ def balanced(matrix: StencilMatrix, alike: float = EXACT) -> tuple[StencilMatrix
     if alike > EXACT:
         kernels().symmetrise(code, stencils)
     return found, True
+
+
+def transposed(matrix: StencilMatrix) -> StencilMatrix:
+    """Kᵀ, with stencils of their own for all but those whose neighbourhood is like that of most;
+    `scale` is that of K."""
+    code, (row, place) = matrix.code, np.nonzero(matrix.code >= 0)
+    there = np.stack([code[row + s // 3 - 1, place + s % 3 - 1] for s in range(WINDOW)], axis=1)
+    alike = (there == 0).all(axis=1)
+    codes = code.copy()
+    codes[row, place] = np.where(alike, 0, np.cumsum(~alike))
+    kept = np.concatenate([np.zeros((1, WINDOW), there.dtype), there[~alike]])
+    found = matrix.stencils[np.maximum(kept, 0), WINDOW - 1 - np.arange(WINDOW)][..., [0, 2, 1, 3]]
+    found *= (kept >= 0)[..., None]
+    scale = matrix.scale[np.maximum(kept[:, OWN], 0)]
+    return replace(matrix, code=codes, stencils=np.ascontiguousarray(found), scale=scale)
 
 
 def leads_one_way(matrix: StencilMatrix) -> bool:

@@ -1,0 +1,56 @@
+"""Whether the stencils of its lattice serve a scene, and the system that they make."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pbdkit.equilibrium.grids.held_components import constrained, held_components
+from pbdkit.equilibrium.grids.lattice_system import LatticeSystem
+from pbdkit.equilibrium.grids.multigrid import FloatingError
+from pbdkit.equilibrium.grids.stencil_matrix import NUDGE, differenced_matrix, stencil_matrix
+from pbdkit.equilibrium.grids.stencil_properties import (
+    DIFFERENCED,
+    EXACT,
+    balanced,
+    is_held,
+    leads_one_way,
+)
+from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.system import IndefiniteError
+from pbdkit.results.progress import Watch
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State
+
+FAITHFUL = 1e-3
+"""The share of what all moves at once are by which stencils from differences may be off."""
+
+
+def lattice_system(
+    scene: Scene, state: State, step: int, watch: Watch, moves: Moves | None = None
+) -> LatticeSystem | None:
+    """The system of a scene, by the moves of its followers where these are compiled and the state
+    is not at rest; None where it has no such form, or leaders do not hold the body."""
+    if moves and moves.is_compiled and state.u.any():
+        matrix = differenced_matrix(scene, state, step, moves)
+        alike = DIFFERENCED
+    else:
+        matrix, alike, moves = stencil_matrix(scene, state, step), EXACT, None
+    held = held_components(scene, step)
+    if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
+        return None
+    known = balanced(constrained(matrix, held), alike)
+    try:
+        # What frame points show of leaders is not among the stencils.
+        system = LatticeSystem(*known, state.u.shape, watch, not (moves or scene.frame))
+    except FloatingError:
+        return None
+    if not system.may_be_stable:
+        if state.u.any():
+            raise IndefiniteError
+        return None
+    if moves:
+        put = random_displacements(scene, NUDGE)
+        there = replace(state, u=state.u + put)
+        if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
+            return None
+    return system
