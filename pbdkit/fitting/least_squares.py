@@ -87,7 +87,7 @@ def _taken(
     gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
     count = 0
     while share >= SMALLEST:
-        there, count = _at(problem, z + share * step, share), count + 1
+        there, count = _at(problem, z + share * step, at, share), count + 1
         most = cost * (1.0 + SLACK) - ENOUGH * share * gain
         if there is not None and cost_of(there.residuals, loss) <= most:
             return share, there, count
@@ -95,10 +95,10 @@ def _taken(
     raise UnconvergedError("the fit finds no way to fit better, and none to stay")
 
 
-def _at(problem: Problem, z: Floats, share: float) -> At | None:
+def _at(problem: Problem, z: Floats, near: At, share: float) -> At | None:
     """None where nothing is predicted there, as long as a smaller step may be taken."""
     try:
-        return problem.at(z)
+        return problem.at(z, near)
     except UnconvergedError:
         if share < 4.0 * SMALLEST:
             raise
@@ -108,8 +108,6 @@ def _at(problem: Problem, z: Floats, share: float) -> At | None:
 def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
     """What would fit best if residuals stayed linear: by least squares between bounds, weighted
     anew until weights stay."""
-    from scipy.optimize import lsq_linear
-
     size = np.linalg.norm(at.jacobian, axis=0)
     size = np.where(size > 0.0, size, 1.0)
     scaled, y = at.jacobian / size, np.zeros(len(size))
@@ -119,6 +117,8 @@ def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
         right = basis.T @ (at.residuals * weight)
         before, y = y, np.linalg.lstsq(triangle, right, rcond=RANK)[0]
         if (y < low * size).any() or (y > high * size).any():
+            from scipy.optimize import lsq_linear
+
             y = lsq_linear(triangle, right, (low * size, high * size), tol=1e-14).x
         if (np.abs(y - before) <= STEADY).all():
             break

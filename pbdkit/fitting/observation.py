@@ -27,6 +27,15 @@ class Seen:
     by_modulus: Floats
 
 
+@dataclass(frozen=True)
+class Near:
+    """What was seen before, and by what share of the way between its bounds a parameter is away
+    from there at most."""
+
+    seen: Seen
+    away: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Observation(ABC):
     """Numbers that were measured of an experiment. `noise` is their standard deviation, over the
@@ -57,9 +66,15 @@ class Observation(ABC):
 
     @abstractmethod
     def at(
-        self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float
+        self,
+        experiment: Experiment,
+        parameters: Sequence[Parameter],
+        own: Floats,
+        modulus: float,
+        near: Near | None = None,
     ) -> Seen:
-        """What there is at an experiment like its own. Raises ExperimentError, and
+        """What there is at an experiment like its own; what was seen `near` there is where
+        the search for it may begin. Raises ExperimentError, and
         UnconvergedError where nothing can be predicted."""
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:

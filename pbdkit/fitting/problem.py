@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.gap import least_gap
-from pbdkit.fitting.observation import Observation, Seen
+from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.stepping.state import Floats
@@ -37,9 +37,10 @@ class Unknown:
 
 @dataclass(frozen=True)
 class At:
-    """The problem at some z: the residuals (measured - predicted) / noise of all observations, one
+    """The problem at z: the residuals (measured - predicted) / noise of all observations, one
     after another, their derivatives (residual, unknown), and each observation by itself."""
 
+    z: Floats
     residuals: Floats
     jacobian: Floats
     seen: tuple[Seen, ...]
@@ -123,20 +124,26 @@ class Problem:
             found = unknown.parameter.put(found, float(value))
         return found
 
-    def at(self, z: Floats) -> At:
-        """All of it. Raises ExperimentError, and UnconvergedError where nothing is predicted."""
+    def at(self, z: Floats, near: At | None = None) -> At:
+        """All of it, sooner with what was found `near` there. Raises ExperimentError, and
+        UnconvergedError where nothing is predicted."""
         parameters = [u.parameter for u in self.unknowns]
         count = sum(len(o.measured) for o in self.observations)
         jacobian, seen, residuals = np.zeros((count, self.size)), [], np.zeros(count)
         modulus = float(z[len(parameters)]) if self.with_modulus else 1.0
-        pairs = zip(self.rows(), self.owned(), strict=True)
-        for (observation, rows), (_, own) in pairs:
+        before = self._near(near, z) if near else [None] * len(self.observations)
+        each = zip(self.rows(), self.owned(), before, strict=True)
+        for (observation, rows), (_, own), seen_near in each:
             experiment = self.experiment_at(observation, z)
-            found = observation.at(experiment, parameters, z[own], modulus)
+            found = observation.at(experiment, parameters, z[own], modulus, seen_near)
             seen.append(found)
             residuals[rows] = found.residuals
             jacobian[rows, : len(parameters)] = found.by_parameter
             jacobian[rows, own] = found.by_own
             if self.with_modulus:
                 jacobian[rows, len(parameters)] = found.by_modulus
-        return At(residuals, jacobian, tuple(seen))
+        return At(z, residuals, jacobian, tuple(seen))
+
+    def _near(self, at: At, z: Floats) -> list[Near]:
+        ways = [abs(z[n] - at.z[n]) / u.span for n, u in enumerate(self.unknowns)]
+        return [Near(seen, float(max(ways, default=0.0))) for seen in at.seen]

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.boundary import Boundary, boundaries
 from pbdkit.fitting.evidence import FieldEvidence
-from pbdkit.fitting.observation import Observation, Seen
+from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats
 
-DERIVATIVES = 1e-7
+DERIVATIVES = 1e-5
 """How accurate they are, as a share of the largest: far within any noise."""
+CLOSE = 0.01
+"""Parameters that are away by so little leave the answers to boundaries as they were, to such a
+share: residuals stay exact, and estimates move by that share of their errors."""
 
 
 @dataclass(frozen=True)
@@ -89,18 +92,25 @@ class FieldObservation(Observation):
         return replace(super().part(chosen), evidence=self.evidence.part(chosen))
 
     def at(
-        self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float
+        self,
+        experiment: Experiment,
+        parameters: Sequence[Parameter],
+        own: Floats,
+        modulus: float,
+        near: Near | None = None,
     ) -> FieldSeen:
         """At its equilibrium."""
         n = 0
         for boundary in self.boundaries:
             experiment = boundary.moved(experiment, own[n : n + boundary.size])
             n += boundary.size
-        resting = Resting.of(experiment, self.scene, DERIVATIVES)
+        before = near.seen if near and isinstance(near.seen, FieldSeen) else None
+        resting = Resting.of(experiment, before.resting if before else self.scene, DERIVATIVES)
         changes = [resting.change(parameter) for parameter in parameters]
-        for boundary in self.boundaries:
-            planes = (boundary.planes(resting.scene, m) for m in range(boundary.size))
-            changes += [resting.answer(each) for each in planes]
+        if before and near and near.away < CLOSE and resting.finder.linear:
+            changes += before.changes[len(parameters) :]
+        else:
+            changes += self._answers(resting)
         by = [self.evidence.seen(du, resting) / self.noise for du in changes]
         rows, count = len(self.measured), len(parameters)
         beside = self.evidence.distortions / self.noise
@@ -114,3 +124,11 @@ class FieldObservation(Observation):
             resting,
             tuple(changes),
         )
+
+    def _answers(self, resting: Resting) -> list[Floats]:
+        """The derivative of the displacements by each coefficient of the boundaries."""
+        return [
+            resting.answer(boundary.planes(resting.scene, m))
+            for boundary in self.boundaries
+            for m in range(boundary.size)
+        ]

@@ -17,7 +17,7 @@ from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.record import Record
-from pbdkit.fitting.observation import Observation, Seen
+from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.runs.course import Run
@@ -41,7 +41,12 @@ class RunObservation(Observation):
     scene: Scene
 
     def at(
-        self, experiment: Experiment, parameters: Sequence[Parameter], own: Floats, modulus: float
+        self,
+        experiment: Experiment,
+        parameters: Sequence[Parameter],
+        own: Floats,
+        modulus: float,
+        near: Near | None = None,
     ) -> Seen:
         """By one run, and eight for each parameter."""
         predicted, broken = self._run(experiment)
