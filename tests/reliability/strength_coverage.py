@@ -1,0 +1,225 @@
+"""Strengths from synthetic repeats of known ones: bias, and how often intervals hold the truth.
+
+    python tests/reliability/strength_coverage.py drawn --trials 2000
+    python tests/reliability/strength_coverage.py torn --trials 200
+    python tests/reliability/strength_coverage.py simulated --trials 40
+
+drawn: strengths of all bonds of a sheet are drawn and its first break is computed; with --law
+weibull the intervals that are taken are put beside those of maximum likelihood (Wald) and of its
+profile. torn: chains of springs are torn by pbdkit, by the plugin's Weibull or by `scatter`.
+simulated: sheets that bear more than at their first break are torn, and strengths are found by
+simulation. A row a goal: `goal | measured`. Exits with 1 where one is missed by more than chance
+does, three standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT)]
+
+import numpy as np
+from scipy.stats import chi2
+
+import pbdkit
+from pbdkit.experiment.source import Source
+from pbdkit.fitting.first_break import BondStrains, Elastic
+from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.specimens import Specimens, seeded
+from pbdkit.fitting.strength_fitted import fitted_strength
+from pbdkit.fitting.strength_laws import LAWS, Breaks, weibull_sums
+from pbdkit.fitting.strength_specification import Peaks, StrengthFit
+
+TRUE = {"weibull": (0.02, 8.0), "uniform": (0.02, 0.3)}
+BOUNDS = {"weibull": [[0.002, 0.5], [1.0, 60.0]], "uniform": [[0.002, 0.5], [0.02, 0.98]]}
+BIAS, COVERAGE = 0.1, (0.935, 0.965)
+
+
+def pulled(body: dict[str, Any], fracture: dict[str, Any], far: float) -> dict[str, Any]:
+    """A body of springs, pulled along x."""
+    return {
+        "name": "pulled",
+        "lattice": {"type": "square", "a": 1.0},
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "body": body,
+        "rule": {"type": "elastic", "poisson_ratio": 1 / 3},
+        "frame": {"type": "natural"},
+        "fracture": fracture,
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+            {"select": {"edge": "right"}, "motion": {"type": "displace", "displacement": [far, 0]}},
+        ],
+        "steps": 1,
+        "solver": {"type": "equilibrium", "increments": 400, "tolerance": 1e-6},
+    }
+
+
+SHEET = {"type": "grid", "columns": 9, "rows": 6}
+SMALL = {"type": "grid", "columns": 5, "rows": 3}
+
+
+def built(law: str, body: dict[str, Any], far: float) -> pbdkit.Experiment:
+    """With the true strengths."""
+    first, second = TRUE[law]
+    fracture = {
+        "weibull": {"type": "weibull", "scale": first, "modulus": second},
+        "uniform": {"type": "strain", "failure": first, "scatter": second},
+    }[law]
+    plugin = runpy.run_path(str(ROOT / "plugins/pbdkit-weibull/pbdkit_weibull.py"))["Weibull"]
+    return pbdkit.Experiment.build(Source("pulled", pulled(body, fracture, far)), [plugin])
+
+
+def elastic_of(law: str, experiment: pbdkit.Experiment, of: str = "force") -> Elastic:
+    """The body before anything breaks."""
+    for path in LAWS[law].paths:
+        experiment = Parameter(path).put(experiment, LAWS[law].whole(path))
+    return Elastic.of(experiment, Peaks(peaks=(1.0, 1.0, 1.0), of=of))
+
+
+def described(law: str, peaks: Any, **more: Any) -> StrengthFit:
+    """Of such peaks."""
+    return StrengthFit(
+        kind="strength",
+        experiment="",
+        unknown=dict(zip(LAWS[law].paths, BOUNDS[law], strict=True)),
+        measured=Peaks(peaks=tuple(peaks), of="force"),
+        **more,
+    )
+
+
+def first_breaks(law: str, strains: BondStrains, count: int, numbers: Any) -> Any:
+    """Load factors of as many specimens."""
+    first, second = TRUE[law]
+    size = count, len(strains.p)
+    if law == "weibull":
+        strengths = first * numbers.weibull(second, size)
+    else:
+        strengths = first * (1.0 + second * numbers.uniform(-1.0, 1.0, size))
+    return np.array([strains.load_at(each).min() for each in strengths])
+
+
+def estimated(law: str, strains: BondStrains, loads: Any) -> list[list[float]]:
+    """(parameter, (value, low, high)) by the likelihood."""
+    fit = described(law, loads)
+    (a, b) = (fit.unknown[path] for path in LAWS[law].paths)
+    draws = LAWS[law].draws(strains.merged(), Breaks(loads, np.ones(len(loads), bool)), (a, b))
+    return _rows(fitted_strength(fit, LAWS[law].paths, draws, "likelihood", LAWS[law]))
+
+
+def _rows(found: Any) -> list[list[float]]:
+    return [[e.value, e.low, e.high] for e in found.values.values()]
+
+
+def by_others(strains: BondStrains, loads: Any) -> dict[str, list[list[float]]]:
+    """The same of the largest likelihood: Wald's intervals, by observed information in logarithms,
+    and of the profile."""
+    n, merged = len(loads), strains.merged()
+    wide = 6.0 / n**0.5
+    log_m = np.linspace(np.log(8.0) - wide, np.log(8.0) + wide, 161)
+    m = np.exp(log_m)
+    sums, slopes = weibull_sums(merged, Breaks(loads, np.ones(n, bool)), m)
+    total = np.logaddexp.reduce(sums, axis=1)
+    profile = slopes.sum(axis=1) - n * total
+    best = int(profile.argmax())
+    log_s = (total - np.log(n)) / m
+    bend = -np.gradient(np.gradient(profile, log_m), log_m)[best]
+    # ln s given m has the error 1/(m √n); along the ridge it goes with ln m.
+    ridge = np.gradient(log_s, log_m)[best]
+    errors = np.array([(ridge**2 / bend + 1.0 / (m[best] ** 2 * n)) ** 0.5, bend**-0.5])
+    middle = np.array([log_s[best], log_m[best]])
+    grid = np.linspace(middle[0] - 6 * errors[0], middle[0] + 8 * errors[0], 201)
+    joint = slopes.sum(axis=1) - n * m * grid[:, None] - np.exp(total - m * grid[:, None])
+    wald = np.exp([middle, middle - 1.96 * errors, middle + 1.96 * errors]).T
+    limit = chi2.ppf(0.95, 1) / 2
+    ends = []
+    for nodes, values in ((grid, joint.max(axis=1)), (log_m, profile)):
+        inside = nodes[values > values.max() - limit]
+        ends.append([inside[0], inside[-1]])
+    held = np.column_stack([np.exp(middle), np.exp(ends)])
+    return {"Wald": wald.tolist(), "profile": held.tolist()}
+
+
+def told(law: str, found: Any, how: str, judged: bool = True) -> bool:
+    """Rows of (trial, parameter, (value, low, high)); whether the goals are met, but for chance."""
+    found, fine = np.array(found), True
+    chance = 3.0 / len(found) ** 0.5
+    for n, path in enumerate(LAWS[law].paths):
+        true, (value, low, high) = TRUE[law][n], found[:, n].T
+        bias = (value.mean() - true) / value.std(ddof=1)
+        held = float(((low < true) & (true < high)).mean())
+        print(f"{how}: bias of {path} < {BIAS} standard errors | {bias:+.3f} (± {chance / 3:.3f})")
+        print(f"{how}: 95 % intervals of {path} hold it in 93.5 to 96.5 % | {held:.1%}", flush=True)
+        room = chance * 0.95**0.5 * 0.05**0.5
+        fine &= abs(bias) < BIAS + chance
+        fine &= COVERAGE[0] - room <= held <= COVERAGE[1] + room
+    return bool(fine or not judged)
+
+
+def drawn(law: str, trials: int, count: int, numbers: Any) -> bool:
+    """Strengths drawn, first breaks computed."""
+    strains = elastic_of(law, built(law, SHEET, 0.3)).strains
+    found: dict[str, list[Any]] = {"integrated": []}
+    for _ in range(trials):
+        loads = first_breaks(law, strains, count, numbers)
+        found["integrated"].append(estimated(law, strains, loads))
+        if law == "weibull":
+            for name, rows in by_others(strains, loads).items():
+                found.setdefault(name, []).append(rows)
+    how = f"{law}, {count} specimens"
+    return all([told(law, rows, f"{how}, {name}", name == "integrated")
+                for name, rows in found.items()])  # fmt: skip
+
+
+def torn(law: str, trials: int, count: int, numbers: Any) -> bool:
+    """Specimens torn by pbdkit, the load of their first break told from the run."""
+    experiment = built(law, SMALL, 0.3)
+    elastic = elastic_of(law, experiment)
+    source, found = Specimens.of(experiment, Peaks(peaks=(1, 1, 1), of="force"), elastic), []
+    for _ in range(trials):
+        seeds = numbers.integers(2**31, size=count).tolist()
+        forces = [source.first_break(seeded(experiment, seed)).force for seed in seeds]
+        loads = np.array(forces) / elastic.full.force
+        found.append(estimated(law, elastic.strains, loads))
+    return told(law, found, f"{law}, {count} specimens torn")
+
+
+def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
+    """By simulation, of peaks."""
+    experiment = built(law, SMALL, 0.3)
+    elastic = elastic_of(law, experiment)
+    source, found = Specimens.of(experiment, Peaks(peaks=(1, 1, 1), of="force"), elastic), []
+    for n in range(trials):
+        seeds = numbers.integers(2**31, size=count).tolist()
+        peaks = [source.torn(seeded(experiment, seed)).peak.force for seed in seeds]
+        fit = described(law, peaks, method="simulation", seed=n + 1)
+        found.append(_rows(pbdkit.fitting.strength.fit_strength_of(fit, experiment)))
+    return told(law, found, f"{law}, {count} specimens, simulation")
+
+
+def main() -> None:
+    """One row a goal."""
+    asked = argparse.ArgumentParser()
+    asked.add_argument("which", choices=["drawn", "torn", "simulated"])
+    asked.add_argument("--law", choices=[*LAWS], action="append")
+    asked.add_argument("--trials", type=int, default=200)
+    asked.add_argument("--specimens", type=int, default=30)
+    asked.add_argument("--seed", type=int, default=1)
+    given = asked.parse_args()
+    print("goal | measured")
+    fine = True
+    for law in given.law or LAWS:
+        numbers = np.random.default_rng(given.seed)
+        way = {"drawn": drawn, "torn": torn, "simulated": simulated}[given.which]
+        fine &= way(law, given.trials, given.specimens, numbers)
+    sys.exit(0 if fine else 1)
+
+
+if __name__ == "__main__":
+    import pbdkit.fitting.strength
+
+    main()
