@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from pbdkit.stepping.state import Floats
 
 LIMITS = (0.025, 0.975)
 MIDDLE = (0.15865525393145707, 0.8413447460685429)
+CUT = 1.02
+"""An interval ends at a bound that is no farther away, as a ratio."""
 SHIFT = 0.25
 """The share of the standard error of the mean of ln peak by which peaks may lie above first breaks:
 an interval of 95 % that is so far off holds 94.3 %."""
@@ -23,13 +25,15 @@ an interval of 95 % that is so far off holds 94.3 %."""
 @dataclass(frozen=True)
 class StrengthEstimate:
     """A median with its standard error, half of the interval that holds 68.3 %, and the ends of
-    that of 95 %. `told` is False where the data cannot tell it."""
+    that of 95 %. `told` is False where the data cannot tell it; `cut` is True where a bound ends
+    the interval, beyond which it might go on."""
 
     value: float
     error: float
     low: float
     high: float
     told: bool = True
+    cut: bool = False
 
     def __str__(self) -> str:
         if not self.told:
@@ -38,7 +42,8 @@ class StrengthEstimate:
         value, error, low, high = (
             f"{each:.{digits}f}" for each in (self.value, self.error, self.low, self.high)
         )
-        return f"{value} ± {error}, 95 % from {low} to {high}"
+        text = f"{value} ± {error}, 95 % from {low} to {high}"
+        return text + (", cut off by its bounds" if self.cut else "")
 
 
 @dataclass(frozen=True)
@@ -141,7 +146,8 @@ def fitted_strength(
     for n, path in enumerate(paths):
         low, high = fit.unknown[path]
         found = _estimate(draws.values[:, n], draws.weights)
-        values[path] = replace(found, told=found.error <= TELLS * (high - low))
+        cut = min(found.low / low, high / found.high) < CUT
+        values[path] = replace(found, told=found.error <= TELLS * (high - low), cut=cut)
     variation = None
     if law is not None:
         each = draws.values[:, [list(paths).index(path) for path in law.paths]]
@@ -165,12 +171,5 @@ def _estimate(values: Floats, weights: Floats) -> StrengthEstimate:
 
 def _plain(estimate: StrengthEstimate) -> dict[str, Any]:
     if not estimate.told:
-        return {"value": None, "error": None, "low": None, "high": None, "told": False}
-    low, high = estimate.low, estimate.high
-    return {
-        "value": estimate.value,
-        "error": estimate.error,
-        "low": low,
-        "high": high,
-        "told": True,
-    }
+        return dict.fromkeys(("value", "error", "low", "high", "cut")) | {"told": False}
+    return asdict(estimate)

@@ -129,7 +129,7 @@ class StrengthFit(Strict):
     measured: Peaks
     method: Literal["auto", "likelihood", "simulation"] = "auto"
     check: Annotated[int, Field(ge=0, le=1000)] = 8
-    simulations: Annotated[int, Field(ge=100, le=1_000_000)] = 600
+    simulations: Annotated[int, Field(ge=100, le=1_000_000)] = 2000
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
     @model_validator(mode="after")
