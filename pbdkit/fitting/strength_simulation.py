@@ -21,8 +21,8 @@ from pbdkit.fitting.strength_laws import Draws
 from pbdkit.fitting.strength_specification import StrengthFit
 from pbdkit.stepping.state import Floats
 
-FIRST = 0.25
-"""The share of specimens that look where the measurement is likely."""
+SHARES = 0.2, 0.2, 0.6
+"""Of specimens: over the bounds, then twice where the measurement is likely."""
 POINTS = 2**14
 """At which the likelihood is evaluated."""
 LIKELY, WIDER = 8.0, 0.25
@@ -112,27 +112,20 @@ def simulated(fit: StrengthFit, experiment: Experiment, specimens: Specimens) ->
         raise ExperimentError(text, ("measured", "of"))
     _refuse_short_load(specimens, float(fit.measured.values.max()))
     y = np.log(fit.measured.values)
-    box = np.log(list(fit.unknown.values())).T
-    first = int(FIRST * fit.simulations)
-    logs = _spread(box, first, fit.seed)
-    peaks = _torn(fit, experiment, specimens, logs, 0)
-    points, likely = _likely(Peaks.of(logs, peaks), box, y, fit.seed)
-    margin = WIDER * np.ptp(points[likely], axis=0)
-    box = np.clip([points[likely].min(axis=0) - margin, points[likely].max(axis=0) + margin], *box)
-    more = _spread(box, fit.simulations - first, fit.seed + 1)
-    found = _torn(fit, experiment, specimens, more, first)
-    inside = ((logs >= box[0]) & (logs <= box[1])).all(axis=1)
-    model = Peaks.of(np.vstack([logs[inside], more]), np.concatenate([peaks[inside], found]))
-    points = _spread(box, POINTS, fit.seed)
-    logarithm = model.likelihood(points, y)
+    box = whole = np.log(list(fit.unknown.values())).T
+    logs, peaks = np.zeros((0, len(fit.unknown))), np.zeros(0)
+    for stage, share in enumerate(SHARES):
+        more = _spread(box, int(share * fit.simulations), fit.seed + stage)
+        found = _torn(fit, experiment, specimens, more, len(logs))
+        logs, peaks = np.vstack([logs, more]), np.concatenate([peaks, found])
+        inside = ((logs >= box[0]) & (logs <= box[1])).all(axis=1)
+        model, points = Peaks.of(logs[inside], peaks[inside]), _spread(box, POINTS, fit.seed)
+        logarithm = model.likelihood(points, y)
+        near = points[logarithm > logarithm.max() - LIKELY]
+        margin = WIDER * np.ptp(near, axis=0)
+        box = np.clip([near.min(axis=0) - margin, near.max(axis=0) + margin], *whole)
     weights = np.exp(logarithm - logarithm.max())
     return Draws(np.exp(points), weights / weights.sum())
-
-
-def _likely(model: Peaks, box: Floats, y: Floats, seed: int) -> tuple[Floats, np.ndarray]:
-    points = _spread(box, POINTS, seed)
-    found = model.likelihood(points, y)
-    return points, found > found.max() - LIKELY
 
 
 def _spread(box: Floats, count: int, seed: int) -> Floats:

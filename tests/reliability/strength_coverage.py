@@ -2,14 +2,15 @@
 
     python tests/reliability/strength_coverage.py drawn --trials 2000
     python tests/reliability/strength_coverage.py torn --trials 200
+    python tests/reliability/strength_coverage.py closed --trials 500
     python tests/reliability/strength_coverage.py simulated --trials 40
 
 drawn: strengths of all bonds of a sheet are drawn and its first break is computed; with --law
 weibull the intervals that are taken are put beside those of maximum likelihood (Wald) and of its
-profile. torn: chains are torn by pbdkit, by the plugin's Weibull or by `scatter`.
-simulated: sheets that bear more than at their first break are torn, and strengths are found by
-simulation. A row a goal: `goal | measured`. Exits with 1 where one is missed by more than chance
-does, three standard deviations.
+profile. torn: chains are torn by pbdkit, by the plugin's Weibull or by `scatter`. closed: the same
+chains in closed form, and strengths found by simulation. simulated: sheets that bear more than at
+their first break are torn, and strengths are found by simulation. A row a goal: `goal | measured`.
+Exits with 1 where one is missed by more than chance does, three standard deviations.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import argparse
 import runpy
 import sys
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +31,11 @@ from scipy.stats import chi2
 
 import pbdkit
 from pbdkit.experiment.source import Source
-from pbdkit.fitting.first_break import BondStrains, Elastic
+from pbdkit.fitting import strength_simulation
+from pbdkit.fitting.first_break import BondStrains, Elastic, Seen
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.specimens import Specimens, seeded
+from pbdkit.fitting.specimens import Specimen, Specimens, seeded
+from pbdkit.fitting.strength import fit_strength_of
 from pbdkit.fitting.strength_fitted import fitted_strength
 from pbdkit.fitting.strength_laws import LAWS, Breaks, weibull_sums
 from pbdkit.fitting.strength_specification import Peaks, StrengthFit
@@ -228,14 +232,44 @@ def simulated(law: str, trials: int, count: int, numbers: Any) -> bool:
         seeds = numbers.integers(2**31, size=count).tolist()
         peaks = [source.torn(seeded(experiment, seed)).peak.force for seed in seeds]
         fit = described(law, peaks, method="simulation", seed=n + 1)
-        found.append(_rows(pbdkit.fitting.strength.fit_strength_of(fit, experiment)))
+        found.append(_rows(fit_strength_of(fit, experiment)))
     return told(law, found, f"{law}, {count} specimens, simulation")
+
+
+@dataclass(frozen=True)
+class Chains:
+    """In the place of specimens: chains, torn in closed form."""
+
+    peaks: Peaks
+    elastic: None = None
+
+    def torn(self, experiment: pbdkit.Experiment) -> Specimen:
+        """By the strengths of their bonds."""
+        fracture, numbers = experiment.fracture, np.random.default_rng(experiment.seed)
+        if fracture.type == "weibull":
+            least = fracture.scale * numbers.weibull(fracture.modulus, BONDS).min()
+        else:
+            least = fracture.failure * (1 + fracture.scatter * numbers.uniform(-1, 1, BONDS).min())
+        return Specimen(Seen(least, least), None, True)
+
+
+def closed(law: str, trials: int, count: int, numbers: Any) -> bool:
+    """By simulation, of chains that need no run."""
+    experiment, found = built(law, chains(law, 1)), []
+    source = Chains(Peaks(peaks=(1, 1, 1), of="force"))
+    for n in range(trials):
+        seeds = numbers.integers(2**31, size=count).tolist()
+        peaks = [source.torn(seeded(experiment, seed)).peak.force for seed in seeds]
+        fit = described(law, peaks, method="simulation", seed=n + 1)
+        draws = strength_simulation.simulated(fit, experiment, source)
+        found.append(_rows(fitted_strength(fit, LAWS[law].paths, draws, "simulation", LAWS[law])))
+    return told(law, found, f"{law}, {count} chains, simulation")
 
 
 def main() -> None:
     """One row a goal."""
     asked = argparse.ArgumentParser()
-    asked.add_argument("which", choices=["drawn", "torn", "simulated"])
+    asked.add_argument("which", choices=["drawn", "torn", "closed", "simulated"])
     asked.add_argument("--law", choices=[*LAWS], action="append")
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--specimens", type=int, default=30)
@@ -246,12 +280,11 @@ def main() -> None:
     fine = True
     for law in given.law or LAWS:
         numbers = np.random.default_rng(given.seed)
-        way = {"drawn": drawn, "torn": torn, "simulated": simulated}[given.which]
+        ways = {"drawn": drawn, "torn": torn, "closed": closed, "simulated": simulated}
+        way = ways[given.which]
         fine &= way(law, given.trials, given.specimens, numbers)
     sys.exit(0 if fine else 1)
 
 
 if __name__ == "__main__":
-    import pbdkit.fitting.strength
-
     main()
