@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pbdkit.api import (
         analyse as analyse,
         fit as fit,
+        fit_strength as fit_strength,
         identify as identify,
         load as load,
         rerun as rerun,
@@ -112,7 +113,7 @@ _HOME = {
     "pbdkit.results.result_file": "open",
     "pbdkit.sessions.calling": "live",
     "pbdkit.sweeps.concatenation": "concat",
-    "pbdkit.api": "analyse fit identify load rerun resume run sweep",
+    "pbdkit.api": "analyse fit fit_strength identify load rerun resume run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import xarray
 
     from pbdkit.fitting.fitted import Fitted
+    from pbdkit.fitting.strength_fitted import FittedStrength
     from pbdkit.identity.identity import Identity
 
 Components = Iterable[type[Component]]
@@ -198,6 +199,31 @@ def fit(
     found = as_experiment(experiment, components) if experiment is not None else None
     try:
         return fit_experiment(asked, found or Experiment.build(source, components))
+    except UnconvergedError as error:
+        raise DivergedError(str(error)) from None
+
+
+def fit_strength(
+    description: Mapping[str, Any] | str | Path,
+    *,
+    experiment: Given | None = None,
+    components: Components = (),
+) -> FittedStrength:
+    """The strength of bonds and its scatter from the peaks of repeated tests, with their
+    uncertainty.
+
+    `description` is a strength fit file, the name of a shipped one, or a dict of the same;
+    `experiment` takes the place of its own. Raises ExperimentError and PluginError, and
+    DivergedError where a specimen finds no equilibrium.
+    """
+    from pbdkit.equilibrium.certificate import UnconvergedError
+    from pbdkit.fitting.strength import fit_strength_of
+    from pbdkit.fitting.strength_specification import described_strength_fit
+
+    asked, source = described_strength_fit(description, given=experiment is not None)
+    found = as_experiment(experiment, components) if experiment is not None else None
+    try:
+        return fit_strength_of(asked, found or Experiment.build(source, components))
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
 

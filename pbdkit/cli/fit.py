@@ -17,18 +17,23 @@ PATH = click.Path(path_type=Path)
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
-    """Find the parameters that fit a measured field best, with their errors."""
+    """Find the parameters that fit a measured field best, or the strengths of repeated tests, with
+    their errors."""
     import pbdkit
     from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
     from pbdkit.cli.waiting import waiting
+    from pbdkit.fitting.strength_specification import is_strength_fit
 
     path = output or Path(Path(file).name).with_suffix(".json")
     refuse_output(path, force=force, experiment=Path(file))
     if picture:
         refuse_output(picture, force=force)
     refuse_unwritable(picture, path)
+    repeats = is_strength_fit(file)
+    if picture and repeats:
+        raise pbdkit.ExperimentError("a strength fit has no picture; leave --plot out")
     with waiting(f"fitting {file}", silent=quiet):
-        found = pbdkit.fit(file)
+        found = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
     with refusals_as(f"{path}: cannot be written"):
         path.write_text(json.dumps(found.as_dict(), indent=2) + "\n", encoding="utf-8")
     if not quiet:
@@ -37,5 +42,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         click.echo(f"{path} written")
     if picture:
         from pbdkit.drawing.fit import draw_fit
+        from pbdkit.fitting.fitted import Fitted
 
+        assert isinstance(found, Fitted)
         save(picture, draw_fit(found))
