@@ -10,7 +10,8 @@ import pbdkit
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.shipped import read_experiment, shipped_names
 from pbdkit.experiment.source import read_file
-from pbdkit.fitting.specification import fit_schema, shipped_fits
+from pbdkit.fitting.schema import fit_schema
+from pbdkit.fitting.specification import shipped_fits
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
 from pbdkit.sweeps.specification import sweep_schema
@@ -79,10 +80,12 @@ def test_the_schema_of_sweeps_describes_what_is_taken():
 def test_shipped_fits_are_described(name):
     data = read_file(Path(pbdkit.__file__).parent / "fits" / f"{name}.yaml").data
     jsonschema.validate(data, FIT)
-    field = data["measured"]
-    jsonschema.validate(
-        data | {"measured": [field, {"type": "curve", "file": "f", "group": 1}]}, FIT
-    )
-    for wrong in ({"unknowns": {}}, {"modes": -1}, {"measured": {"type": "field"}}):
+    for wrong in ({"unknowns": {}}, {"unknown": 3}, {"measured": {"type": "fields"}}):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(data | wrong, FIT)
+
+
+def test_one_measurement_or_several_are_described():
+    data = read_file(Path(pbdkit.__file__).parent / "fits" / "plate-with-hole.yaml").data
+    several = [data["measured"], {"type": "curve", "file": "f", "group": 1}]
+    jsonschema.validate(data | {"measured": several}, FIT)

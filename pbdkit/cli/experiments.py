@@ -42,7 +42,7 @@ def init(file: Path) -> None:
 def schema(what: str, builtin: bool) -> None:
     """Print the JSON Schema of experiments, datasets, sweeps or fits, with what is installed."""
     from pbdkit.experiment.schema import experiment_schema
-    from pbdkit.fitting.specification import fit_schema
+    from pbdkit.fitting.schema import fit_schema
     from pbdkit.registry.registry import Registry
     from pbdkit.results.layout import dataset_schema
     from pbdkit.sweeps.specification import sweep_schema

@@ -13,9 +13,9 @@ from pbdkit.equilibrium.certificate import (
     Certificate,
     UnconvergedError,
     broken_bonds,
-    scale_of,
 )
 from pbdkit.equilibrium.contact_search import follow_contact
+from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.load_path import last_change, moments, spacings
 from pbdkit.equilibrium.newton import Finder
 from pbdkit.errors import ExperimentError
@@ -65,8 +65,7 @@ def increments(
                 (field, n, "motion"),
             )
     if finder is None:
-        scale = scale_of(scene, initial_state(scene) if since or state.step else state)
-        finder = Finder(scene, asked.tolerance * scale, scale, asked.method, watch)
+        finder = finder_of(scene, initial_state(scene) if since or state.step else state, watch)
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.given import given_classes
@@ -23,9 +25,12 @@ from pbdkit.fitting.profile import profiled
 from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.fitting.sampling import sampled
 from pbdkit.fitting.specification import Fit
+from pbdkit.stepping.state import Floats
 
 GIVEN = "as given"
 """What the experiment of the fit is called among candidates."""
+TINY = 1e-6
+"""The noise as a share of what was measured, until residuals tell it: all of them are larger."""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment) -> Fitted:
@@ -107,10 +112,17 @@ def _refuse_too_few(observation: Observation, unknowns: int) -> None:
 
 def _solved(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     """By the noise that residuals have, where none is given."""
-    solution = solved(problem, problem.start(), fit.loss)
-    if fit.measured[0].noise is None:
+    if fit.measured[0].noise is not None:
+        return problem, solved(problem, problem.start(), fit.loss)
+    (only,) = problem.observations
+    problem = replace(problem, observations=(only.with_noise(TINY * _size(only.measured)),))
+    solution = solved(problem, problem.start())
+    for _ in range(1 if fit.loss == "linear" else 2):  # a loss tells outliers by the noise
         (only,) = problem.observations
-        noise = solution.ratio * only.noise
-        problem = replace(problem, observations=(only.with_noise(noise),))
+        problem = replace(problem, observations=(only.with_noise(solution.ratio * only.noise),))
         solution = solved(problem, solution.z, fit.loss)
     return problem, solution
+
+
+def _size(measured: Floats) -> float:
+    return float(np.sqrt(np.mean(measured**2))) or 1.0

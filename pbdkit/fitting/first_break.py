@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pbdkit.components.forces import reactions
+from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.increments import increments
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
@@ -183,7 +184,8 @@ class Elastic:
         if scene.barriers:
             raise ExperimentError("what touches obstacles is held by more and more of it: " + FIRST)
         state, seen = initial_state(scene), list[Floats]()
-        for _ in increments(scene, state, Watch(), compiles=False):
+        finder = finder_of(scene, state, compiles=False)
+        for _ in increments(scene, state, Watch(), finder=finder):
             seen.append(state.u.copy())
         _refuse_out_of_proportion(seen, state.u, experiment.rule.linear)
         strains = bond_strains(scene, state)

@@ -25,7 +25,7 @@ ENOUGH, SLACK = 0.25, 1e-9
 MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-13
 """Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
 largest singular value below which one is none."""
-SETTLED = 1e-3
+SETTLED = 1e-2
 """The share of its standard error by which no unknown would move any more."""
 SWING = 0.25
 """A step that takes back more than such a share of the last one swings: less of it is taken."""

@@ -21,7 +21,7 @@ from pbdkit.stepping.state import Floats
 
 DERIVATIVES = 1e-5
 """How accurate they are, as a share of the largest: far within any noise."""
-CLOSE = 0.01
+CLOSE = 0.02
 """Parameters that are away by so little leave the answers to boundaries as they were, to such a
 share: residuals stay exact, and estimates move by that share of their errors."""
 
@@ -107,10 +107,11 @@ class FieldObservation(Observation):
         before = near.seen if near and isinstance(near.seen, FieldSeen) else None
         resting = Resting.of(experiment, before.resting if before else self.scene, DERIVATIVES)
         changes = [resting.change(parameter) for parameter in parameters]
-        if before and near and near.away < CLOSE and resting.finder.linear:
+        lent = before is not None and near is not None and near.away < CLOSE
+        if before and lent and resting.finder.linear:
             changes += before.changes[len(parameters) :]
         else:
-            changes += self._answers(resting)
+            changes += self.answers(resting)
         by = [self.evidence.seen(du, resting) / self.noise for du in changes]
         rows, count = len(self.measured), len(parameters)
         beside = self.evidence.distortions / self.noise
@@ -125,7 +126,7 @@ class FieldObservation(Observation):
             tuple(changes),
         )
 
-    def _answers(self, resting: Resting) -> list[Floats]:
+    def answers(self, resting: Resting) -> list[Floats]:
         """The derivative of the displacements by each coefficient of the boundaries."""
         return [
             resting.answer(boundary.planes(resting.scene, m))

@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import Certificate, scale_of, spacing_of
+from pbdkit.equilibrium.certificate import Certificate, spacing_of
+from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.increments import settle
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves
@@ -69,10 +70,8 @@ class Resting:
                 "sensitivities; leave the obstacles out",
                 ("obstacles",),
             )
-        state, asked = initial_state(scene), experiment.solver.sought
-        before, scale = _bonds(state), scale_of(scene, state)
-        length = asked.tolerance * scale
-        finder = Finder(scene, length, scale, asked.method, Watch(), compiles=False)
+        state = initial_state(scene)
+        before, finder = _bonds(state), finder_of(scene, state, compiles=False)
         certificate = settle(scene, state, finder=finder)
         if any((a != b).any() for a, b in zip(before, _bonds(state), strict=True)):
             raise ExperimentError(

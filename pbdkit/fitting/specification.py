@@ -13,7 +13,6 @@ from pbdkit.experiment.base import Base, base_source
 from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import report
-from pbdkit.experiment.schema import DIALECT
 from pbdkit.experiment.source import Source, read_file
 from pbdkit.fitting.least_squares import Loss
 from pbdkit.fitting.measurements import MeasuredField, Measurements, Pair, Positive
@@ -129,13 +128,6 @@ def described_fit(
     except ValidationError as error:
         raise report(error, source) from None
     return fit, source if given else base_source(path, fit.experiment, source)
-
-
-def fit_schema() -> dict[str, Any]:
-    """The JSON Schema of fit files; what stands under `experiment` is left to that of
-    experiments."""
-    described = Fit.model_json_schema(by_alias=True)
-    return {"$schema": DIALECT, **described, "title": "pbdkit fit"}
 
 
 def shipped_fits() -> list[str]:

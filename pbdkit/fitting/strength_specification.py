@@ -15,7 +15,8 @@ from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import fault, report
 from pbdkit.experiment.source import Source, read_file
-from pbdkit.fitting.specification import FOLDER, Bounds, Positive
+from pbdkit.fitting.measurements import Positive
+from pbdkit.fitting.specification import FOLDER, Bounds
 from pbdkit.interfaces.component import Strict
 from pbdkit.stepping.state import Floats
 
