@@ -18,29 +18,32 @@ from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
 from pbdkit.stepping.state import Floats
 
-BLOCKS = 8
-"""So many along the longest way."""
+BLOCKS = 32
+"""So many along the longest way: of larger ones at an end, nothing else tells how it moves."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model by name: the mean square of left-out residuals over their noise, its standard error
-    over blocks, the root mean square by which its predictions differ from those of the best one
-    over the noise, and the parameters that fit, by path.
+    """A model by name: the mean square of left-out residuals over their noise and its standard
+    error over blocks; by how much that is `behind` the best one's, block by block, and the error of
+    this; the root mean square by which its predictions differ from the best one's, over the noise;
+    and the parameters that fit, by path.
 
-    1 is the noise alone. What differs by much less than the noise data cannot tell apart.
+    1 is the noise alone. Who is behind by less than two errors is as good.
     """
 
     name: str
     left_out: float
     error: float
+    behind: float
+    behind_error: float
     differs: float
     values: dict[str, float]
 
     def __str__(self) -> str:
         return (
-            f"{self.name}: left-out residuals² are {self.left_out:.3f} ± {self.error:.3f} of the "
-            f"noise's; {self.differs:.2g} of the noise from the best"
+            f"{self.name}: left-out residuals² are {self.left_out:.3f} of the noise's, behind by "
+            f"{self.behind:.3f} ± {self.behind_error:.3f}; {self.differs:.2g} of the noise away"
         )
 
 
@@ -64,14 +67,19 @@ def compared(posed: Sequence[Posed], folds: int, loss: Loss, seed: int) -> tuple
     found = [
         Candidate(
             each.name,
-            float(score.mean()),
-            float(score.std(ddof=1) / np.sqrt(len(score))),
+            *_mean(score),
+            *_mean(score - scores[best]),
             float(np.sqrt(np.mean((each.solution.at.residuals - right) ** 2))),
             _values(each),
         )
         for each, score in zip(posed, scores, strict=True)
     ]
     return tuple(sorted(found, key=lambda candidate: candidate.left_out))
+
+
+def _mean(score: Floats) -> tuple[float, float]:
+    """With its standard error."""
+    return float(score.mean()), float(score.std(ddof=1) / np.sqrt(len(score)))
 
 
 def _of_common_rows(posed: Sequence[Posed], loss: Loss) -> list[Posed]:

@@ -140,6 +140,22 @@ class Fitted:
             evidence.points, measured.reshape(2, -1).T, np.asarray(left.reshape(2, -1).T)
         )
 
+    def distortions(self, n: int = 0) -> dict[str, Estimate]:
+        """How much of each distortion field n shows, by what it is in proportion to, "ux x^2 y^0",
+        with x and y from -1 to 1 over the points."""
+        observation, own = [*self.problem.owned()][n]
+        if not isinstance(observation, FieldObservation):
+            return {}
+        terms = observation.evidence.terms
+        names = [
+            f"{u} x^{p} y^{q}" for u, of in zip(("ux", "uy"), terms, strict=True) for p, q in of
+        ]
+        z, errors = self.solution.z[own], self.solution.errors[own]
+        pairs = zip(z[len(z) - len(names) :], errors[len(z) - len(names) :], strict=True)
+        return {
+            name: Estimate(float(v), float(e)) for name, (v, e) in zip(names, pairs, strict=True)
+        }
+
     def numbers(self, n: int = 0) -> FittedNumbers:
         """What was measured in tracks or a curve n, and what the fit leaves. Raises ValueError for
         a field."""

@@ -29,6 +29,8 @@ SETTLED = 1e-2
 """The share of its standard error by which no unknown would move any more."""
 SWING = 0.25
 """A step that takes back more than such a share of the last one swings: less of it is taken."""
+FROZEN = 1e-3
+"""What changes all residuals together by less of their noise, from bound to bound, stays."""
 OUTLIERS = 1.345
 """Residuals beyond so many times their noise count less, where a loss says so (Huber)."""
 
@@ -109,8 +111,9 @@ def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
     """What would fit best if residuals stayed linear: by least squares between bounds, weighted
     anew until weights stay."""
     size = np.linalg.norm(at.jacobian, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
-    scaled, y = at.jacobian / size, np.zeros(len(size))
+    matters = size * np.minimum(high - low, 1e300) > FROZEN
+    size = np.where(matters, size, 1.0)
+    scaled, y = np.where(matters, at.jacobian / size, 0.0), np.zeros(len(size))
     for _ in range(1 if loss == "linear" else MOST_WEIGHTINGS):
         weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
         basis, triangle = np.linalg.qr(scaled * weight[:, None])
