@@ -18,7 +18,8 @@ from pbdkit.experiment.source import read_text
 
 ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"
-NOTEBOOKS = sorted(p for p in (ROOT / "docs" / "tutorial").glob("*.md") if p.stem != "index")
+PARTS = (ROOT / "docs").rglob("*.md")
+NOTEBOOKS = sorted(p for p in PARTS if "\nfile_format: mystnb\n" in p.read_text())
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(EXTENDING.glob("*.md"))]
 
 

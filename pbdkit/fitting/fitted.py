@@ -11,7 +11,7 @@ import numpy as np
 from pbdkit.fitting.comparison import Candidate
 from pbdkit.fitting.estimate import Estimate, youngs_modulus
 from pbdkit.fitting.force_curve import CurveObservation
-from pbdkit.fitting.least_squares import Solution
+from pbdkit.fitting.least_squares import Loss, Solution, spread_of
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
 from pbdkit.fitting.profile import Profile
@@ -220,14 +220,15 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     covariance = solution.covariance[:count, :count]
     correlations = covariance / np.outer(errors, errors)
     met = tuple(
-        _met(observation, solution.at.residuals[rows]) for observation, rows in problem.rows()
+        _met(observation, solution.at.residuals[rows], fit.loss)
+        for observation, rows in problem.rows()
     )
     return Fitted(
         values, correlations, youngs_modulus(fit.force, problem, solution), met, problem, solution
     )
 
 
-def _met(observation: Observation, residuals: Floats) -> Met:
-    ratio = float(np.sqrt(np.mean(residuals**2)))
+def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
+    ratio = spread_of(residuals, 0, loss)
     noise = observation.noise * observation.unit
     return Met(observation.kind, noise, ratio, len(residuals), observation.left_out)

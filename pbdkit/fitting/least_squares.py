@@ -67,7 +67,7 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     for _ in range(MOST_TURNS):
         step = _linear_step(at, low - z, high - z, loss)
         covariance, untold = _known(problem, at, loss)
-        ratio = _spread(at.residuals, problem.size, loss)
+        ratio = spread_of(at.residuals, problem.size, loss)
         own = step / np.sqrt(np.diag(covariance)) / max(1.0, ratio)
         if (np.abs(own) <= SETTLED).all():
             break
@@ -150,7 +150,7 @@ def cost_of(residuals: Floats, loss: Loss) -> float:
     return float(z.sum()) * OUTLIERS**2
 
 
-def _spread(residuals: Floats, unknowns: int, loss: Loss) -> float:
+def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
     """The residuals' standard deviation in units of their noise; with a loss, by their median."""
     if loss == "linear":
         return float(np.sqrt(residuals @ residuals / max(1, len(residuals) - unknowns)))
@@ -187,7 +187,7 @@ def _of_loss(residuals: Floats, loss: Loss) -> float:
     """By how much a loss makes the variance larger: mean ψ² / (mean ψ')², in units of the noise."""
     if loss == "linear":
         return 1.0
-    z = residuals / max(_spread(residuals, 0, loss), 1e-300) / OUTLIERS
+    z = residuals / max(spread_of(residuals, 0, loss), 1e-300) / OUTLIERS
     if loss == "huber":
         psi, slope = np.clip(z, -1.0, 1.0), np.abs(z) <= 1.0
     elif loss == "soft_l1":
