@@ -111,7 +111,7 @@ def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
     """What would fit best if residuals stayed linear: by least squares between bounds, weighted
     anew until weights stay."""
     size = np.linalg.norm(at.jacobian, axis=0)
-    matters = size * np.minimum(high - low, 1e300) > FROZEN
+    matters = size * np.minimum(high - low, 1e100) > FROZEN
     size = np.where(matters, size, 1.0)
     scaled, y = np.where(matters, at.jacobian / size, 0.0), np.zeros(len(size))
     for _ in range(1 if loss == "linear" else MOST_WEIGHTINGS):
