@@ -10,7 +10,7 @@ import numpy as np
 from pbdkit.fitting.evidence import Carried
 from pbdkit.fitting.least_squares import TELLS, Solution
 from pbdkit.fitting.problem import Problem
-from pbdkit.fitting.resting_field import FieldObservation, FieldSeen
+from pbdkit.fitting.resting_field import FieldSeen
 from pbdkit.fitting.specification import Force
 
 
@@ -48,17 +48,15 @@ def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) ->
 def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     """Force over thickness and what the group carries over Young's modulus, along the force."""
     way = np.array(force.value) / np.hypot(*force.value)
-    carried, count = Carried(force.group), len(problem.unknowns)
-    field, seen = problem.observations[0], solution.at.seen[0]
-    assert isinstance(field, FieldObservation)
+    count, seen = len(problem.unknowns), solution.at.seen[0]
     assert isinstance(seen, FieldSeen)
-    changes = [*seen.changes[:count], *field.answers(seen.resting)]  # small parts of forces count
-    unit = float(way @ carried.predicted(seen.resting))
-    parameters = [*(u.parameter for u in problem.unknowns)]
-    names = [*parameters, *[None] * (len(changes) - count)]
-    gradient = np.zeros(problem.size)
-    for n, (du, parameter) in enumerate(zip(changes, names, strict=True)):
-        gradient[n] = way @ carried.change(seen.resting, du, parameter)
+    carried = Carried(seen.resting, force.group)
+    unit, gradient = float(way @ carried.predicted), np.zeros(problem.size)
+    for n, (du, unknown) in enumerate(zip(seen.changes, problem.unknowns, strict=True)):
+        gradient[n] = way @ carried.change(du, unknown.parameter)
+    carried = Carried(seen.answering, force.group)  # answers in balance with this state alone
+    for n, du in enumerate(seen.answers, start=count):
+        gradient[n] = way @ carried.change(du)
     told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
     known = [*told, *range(count, problem.size)]
     part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])

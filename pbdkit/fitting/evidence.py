@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pbdkit.components.forces import reactions
 from pbdkit.fitting.interpolation import Interpolation
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.sensitivity import Resting, along, scene_like
+from pbdkit.fitting.sensitivity import Resting, scene_like
 from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import Scene
@@ -76,30 +76,30 @@ class FieldEvidence:
 class Carried:
     """What a leader group carries at rest along each axis, over Young's modulus and thickness."""
 
+    resting: Resting
     group: int
 
-    def predicted(self, resting: Resting) -> Floats:
+    @cached_property
+    def predicted(self) -> Floats:
         """(axis,)."""
-        return self._reaction(resting, resting.scene, resting.state.u)
+        return self._reaction(self.resting.scene, self.resting.state.u)
 
-    def change(self, resting: Resting, du: Floats, parameter: Parameter | None) -> Floats:
+    def change(self, du: Floats, parameter: Parameter | None = None) -> Floats:
         """How that changes, (axis,), where displacements change by du and, if one is named, a
         parameter by 1 with them."""
-        u = resting.state.u
-
-        def at(u: Floats) -> Floats:
-            return self._reaction(resting, resting.scene, u)
-
-        found = along(at, u, du, resting.finder.linear)
+        scene, u = self.resting.scene, self.resting.state.u
+        if self.resting.finder.linear:
+            found: Floats = self._reaction(scene, u + du) - self.predicted
+        else:
+            found = self.resting.along(lambda u: self._reaction(scene, u), du)
         if parameter is not None:
             found = found + parameter.derivative(
-                resting.scene.experiment,
-                lambda e: self._reaction(resting, scene_like(resting.scene, e), u),
+                scene.experiment, lambda e: self._reaction(scene_like(scene, e), u)
             )
         return np.asarray(found)
 
-    def _reaction(self, resting: Resting, scene: Scene, u: Floats) -> Floats:
-        state = resting.state.copy()
+    def _reaction(self, scene: Scene, u: Floats) -> Floats:
+        state = self.resting.state.copy()
         state.u = u
         moment = StateMoment(state, Tables(scene))
         return np.asarray(reactions(moment)[self.group])

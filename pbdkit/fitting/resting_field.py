@@ -28,11 +28,14 @@ share: residuals stay exact, and estimates move by that share of their errors.""
 
 @dataclass(frozen=True)
 class FieldSeen(Seen):
-    """With the scene at rest, and the derivative of its displacements by each parameter, then by
-    each coefficient of boundaries, as planes."""
+    """With the scene at rest, and the derivative of its displacements by each parameter and by each
+    coefficient of boundaries, as planes; the latter may be those of an equilibrium nearby."""
 
     resting: Resting
     changes: tuple[Floats, ...] = field(repr=False)
+    answers: tuple[Floats, ...] = field(repr=False)
+    answering: Resting = field(repr=False)
+    """Whose answers these are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,10 +112,10 @@ class FieldObservation(Observation):
         changes = [resting.change(parameter) for parameter in parameters]
         lent = before is not None and near is not None and near.away < CLOSE
         if before and lent and resting.finder.linear:
-            changes += before.changes[len(parameters) :]
+            answers, answering = before.answers, before.answering
         else:
-            changes += self.answers(resting)
-        by = [self.evidence.seen(du, resting) / self.noise for du in changes]
+            answers, answering = self._answers(resting), resting
+        by = [self.evidence.seen(du, resting) / self.noise for du in (*changes, *answers)]
         rows, count = len(self.measured), len(parameters)
         beside = self.evidence.distortions / self.noise
         predicted = self.evidence.seen(resting.state.u, resting)
@@ -124,12 +127,14 @@ class FieldObservation(Observation):
             np.zeros(rows),
             resting,
             tuple(changes),
+            answers,
+            answering,
         )
 
-    def answers(self, resting: Resting) -> list[Floats]:
+    def _answers(self, resting: Resting) -> tuple[Floats, ...]:
         """The derivative of the displacements by each coefficient of the boundaries."""
-        return [
+        return tuple(
             resting.answer(boundary.planes(resting.scene, m))
             for boundary in self.boundaries
             for m in range(boundary.size)
-        ]
+        )
