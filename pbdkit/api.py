@@ -198,7 +198,7 @@ def fit(
     asked, source = described_fit(description, given=experiment is not None)
     found = as_experiment(experiment, components) if experiment is not None else None
     try:
-        return fit_experiment(asked, found or Experiment.build(source, components))
+        return fit_experiment(asked, found or Experiment.build(source, components), components)
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
 

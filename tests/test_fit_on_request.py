@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from test_fit import NOISE, measured, plate
@@ -109,6 +111,37 @@ def test_the_right_model_foretells_best(tmp_path):
     assert best.values["rule.modulus_ratio"] == pytest.approx(0.5, abs=0.05)
     assert [c["name"] for c in found.as_dict()["candidates"]] == order
     assert any(line.startswith("orthotropic: left-out") for line in found.lines())
+
+
+class Lazy(pbdkit.FollowerRule):
+    """Somebody else's rule: goes a share of the way to the mean of its neighbours."""
+
+    type: Literal["lazy"] = "lazy"
+    share: float = 0.5
+
+    @staticmethod
+    def gather(d, r, w, p):
+        """What a neighbour contributes."""
+        return d, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        """How far the particle moves."""
+        return p.share * total[0] / total[1]
+
+
+def test_a_third_party_s_rule_is_a_candidate(fit):
+    """Its equilibrium is that of barycentres, so that nothing tells its share."""
+    settings = {"rule": {"type": "lazy", "share": 0.5}, "frame.type": "mean"}
+    rival = {"settings": settings, "unknown": {"rule.share": [0.2, 0.9]}}
+    found = pbdkit.fit(fit | {"candidates": {"lazy": rival}, "folds": 2}, components=[Lazy])
+    assert [candidate.name for candidate in found.candidates] == ["as given", "lazy"]
+    own = pbdkit.fit(
+        fit | {"experiment": plate(settings["rule"], **COARSE) | {"frame": {"type": "mean"}}}
+        | {"unknown": rival["unknown"]},
+        components=[Lazy],
+    )  # fmt: skip
+    assert not own.values["rule.share"].told
 
 
 def test_wide_bounds_start_where_the_gap_is_least(tmp_path):

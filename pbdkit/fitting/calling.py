@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,6 @@ from pbdkit.experiment.source import Source
 from pbdkit.fitting.comparison import Candidate, Posed, compared
 from pbdkit.fitting.fitted import Fitted, fitted
 from pbdkit.fitting.least_squares import Solution, solved
-from pbdkit.fitting.measurements import Measured
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import Problem, Unknown
@@ -25,38 +24,45 @@ from pbdkit.fitting.profile import profiled
 from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.fitting.sampling import sampled
 from pbdkit.fitting.specification import Fit
+from pbdkit.interfaces.component import Component
 from pbdkit.stepping.state import Floats
 
+Components = Iterable[type[Component]]
 GIVEN = "as given"
 """What the experiment of the fit is called among candidates."""
 TINY = 1e-6
 """The noise as a share of what was measured, until residuals tell it: all of them are larger."""
 
 
-def fit_experiment(fit: Fit, experiment: Experiment) -> Fitted:
-    """Carries a fit out, on one thread. Raises ExperimentError for what cannot be fitted."""
+def fit_experiment(fit: Fit, experiment: Experiment, components: Components = ()) -> Fitted:
+    """Carries a fit out, on one thread; its `settings` may name these components. Raises
+    ExperimentError for what cannot be fitted."""
     import scipy.linalg  # noqa: F401  # what is loaded later would work on all threads
 
+    known = (*given_classes(experiment), *components)
     with one_thread():
-        problem, solution = _solved(problem_of(fit, experiment), fit)
+        problem, solution = _solved(problem_of(fit, experiment, components=known), fit)
         names = [*fit.unknown]
         profiles = {
             path: profiled(problem, solution, names.index(path), fit.loss) for path in fit.profile
         }
         sample = sampled(problem, solution, **dict(fit.sampler)) if fit.sampler else None
-        candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution))
+        candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution), known)
         found = fitted(fit, problem, solution)
         return replace(found, profiles=profiles, sample=sample, candidates=candidates)
 
 
-def _compared(fit: Fit, experiment: Experiment, own: Posed) -> tuple[Candidate, ...]:
+def _compared(
+    fit: Fit, experiment: Experiment, own: Posed, components: Components
+) -> tuple[Candidate, ...]:
     """The experiment as it is given, and all that the fit names."""
     if not fit.candidates:
         return ()
     posed, noises = [own], [o.noise for o in own.problem.observations]
     for name, rival in fit.candidates.items():
-        changed = _with_settings(experiment, rival.settings, fit, f"candidates.{name}")
-        problem = problem_of(fit, changed, rival.unknown)
+        where = f"candidates.{name}.settings"
+        changed = _with_settings(experiment, rival.settings, fit, where, components)
+        problem = problem_of(fit, changed, rival.unknown, components)
         pairs = zip(problem.observations, noises, strict=True)
         problem = replace(problem, observations=tuple(o.with_noise(n) for o, n in pairs))
         posed.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
@@ -64,7 +70,10 @@ def _compared(fit: Fit, experiment: Experiment, own: Posed) -> tuple[Candidate, 
 
 
 def problem_of(
-    fit: Fit, experiment: Experiment, asked: Mapping[str, tuple[float, float]] | None = None
+    fit: Fit,
+    experiment: Experiment,
+    asked: Mapping[str, tuple[float, float]] | None = None,
+    components: Components = (),
 ) -> Problem:
     """The problem that a fit file poses, or that with something else unknown. Raises
     ExperimentError."""
@@ -74,7 +83,9 @@ def problem_of(
         unknown.parameter.value_in(experiment)
     observations = []
     for measured in fit.measured:
-        found = measured.observation(_changed(experiment, measured, fit), fit.modes)
+        settings = measured.settings
+        changed = _with_settings(experiment, settings, fit, "measured.settings", components)
+        found = measured.observation(changed, fit.modes)
         _refuse_too_few(found, len(unknowns))
         observations.append(found)
     if fit.force and isinstance(observations[0], FieldObservation):
@@ -85,20 +96,19 @@ def problem_of(
     return Problem(unknowns, tuple(observations))
 
 
-def _changed(experiment: Experiment, measured: Measured, fit: Fit) -> Experiment:
-    if not measured.settings:
-        return experiment
-    return _with_settings(experiment, measured.settings, fit, "measured")
-
-
 def _with_settings(
-    experiment: Experiment, settings: Mapping[str, Any], fit: Fit, where: str
+    experiment: Experiment,
+    settings: Mapping[str, Any],
+    fit: Fit,
+    where: str,
+    components: Components,
 ) -> Experiment:
+    if not settings:
+        return experiment
     source = Source(experiment.name, experiment.as_written(), {}, fit.folder)
     for path, value in settings.items():
-        label = f"{where}.settings: {path}"
-        source = with_value(source, path, value, label, Experiment.defaults())
-    return Experiment.build(source, given_classes(experiment))
+        source = with_value(source, path, value, f"{where}: {path}", Experiment.defaults())
+    return Experiment.build(source, components)
 
 
 def _refuse_too_few(observation: Observation, unknowns: int) -> None:
