@@ -31,6 +31,7 @@ myst_heading_anchors = 4
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 120
+nb_execution_in_temp = True
 suppress_warnings = ["myst-nb.lexer"]  # of notebooks that were not run
 copybutton_prompt_text = r"\$ |>>> "
 copybutton_prompt_is_regexp = True
