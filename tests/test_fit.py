@@ -278,10 +278,10 @@ def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     figure = draw_fit(found)
     figure.canvas.draw()
     titles = [ax.title for ax in figure.axes if ax.get_title()]
-    assert [t.get_text() for t in titles] == [
+    assert [t.get_text() for t in titles] == [  # the plate is wide: side by side
         f"u{axis} {what}"
-        for axis in "xy"
         for what in ("measured", "fitted", "residual / noise", "tells rule.poisson_ratio")
+        for axis in "xy"
     ]
     boxes = [title.get_window_extent() for title in titles]
     assert all(figure.bbox.containsx(b.x0) and figure.bbox.containsx(b.x1) for b in boxes)

@@ -45,4 +45,4 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         from pbdkit.fitting.fitted import Fitted
 
         assert isinstance(found, Fitted)
-        save(picture, draw_fit(found))
+        save(picture, draw_fit(found), quiet=quiet)

@@ -123,8 +123,9 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
             raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-def save(picture: Path, drawn: Figure) -> None:
-    """Writes a figure and says so; StorageError where the system refuses."""
+def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
+    """Writes a figure and says so, unless quiet; StorageError where the system refuses."""
     with refusals_as(f"{picture}: cannot be written"):
         drawn.savefig(picture)
-    click.echo(f"{picture} written")
+    if not quiet:
+        click.echo(f"{picture} written")

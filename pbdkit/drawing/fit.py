@@ -3,6 +3,7 @@ each parameter."""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,57 +18,73 @@ if TYPE_CHECKING:
     from pbdkit.fitting.fitted import Fitted
 
 Floats = NDArray[np.floating[Any]]
-PANEL_IN, MARGIN_IN, CURVE_IN = 3.4, 0.9, 2.8
+PANEL_IN, MARGIN_IN, CURVE_IN, CURVES = 3.8, 0.75, 2.5, 3
 WITHIN = 3.0
 """Residuals beyond so many times the noise have the last colour."""
 
 
 def draw_fit(fitted: Fitted) -> Figure:
-    """Each measurement by itself. A field: a row for ux and one for uy, measured, fitted, the
-    residual over its noise, and for each parameter how much each point tells of it. Tracks and
-    curves: what was measured and fitted, the residual, and what is told, along time or
-    displacement. Raises ExperimentError where matplotlib is missing.
+    """Each measurement by itself. A field: ux and uy as measured, as fitted, the residual over its
+    noise, and for each parameter how much each point tells of it; side by side where the body is
+    wide, else below each other. Tracks and curves: what was measured and fitted, the residual, and
+    what is told, along time or displacement. Raises ExperimentError where matplotlib is missing.
     """
     refuse_no_matplotlib()
     from pbdkit.drawing.figures import new_figure
 
-    columns = 3 + len(fitted.values)
+    count = 3 + len(fitted.values)
     kinds = [observation.kind for observation in fitted.problem.observations]
-    heights = [_field_height(fitted, n) if k == "field" else CURVE_IN for n, k in enumerate(kinds)]
-    figure = new_figure(figsize=(columns * PANEL_IN, sum(heights)), dpi=150, layout="constrained")
+    sizes = [
+        _field_size(fitted, n, count) if kind == "field" else _curve_size(count)
+        for n, kind in enumerate(kinds)
+    ]
+    heights = [height for _, height in sizes]
+    size = (max(width for width, _ in sizes), sum(heights))
+    figure = new_figure(figsize=size, dpi=150, layout="constrained")
     parts = figure.subfigures(len(kinds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for n, (part, kind) in enumerate(zip(parts, kinds, strict=True)):
         (_draw_field if kind == "field" else _draw_curve)(part, fitted, n)
     return figure
 
 
-def _field_height(fitted: Fitted, n: int) -> float:
+def _is_wide(fitted: Fitted, n: int) -> bool:
     wide, tall = np.ptp(fitted.field(n).points, axis=0)
-    return 2 * min(max(PANEL_IN * float(tall / wide), 1.2), 5.0) + MARGIN_IN
+    return bool(wide > tall)
+
+
+def _field_size(fitted: Fitted, n: int, count: int) -> tuple[float, float]:
+    wide, tall = np.ptp(fitted.field(n).points, axis=0)
+    height = min(max(PANEL_IN * float(tall / wide), 0.8), 5.0) + MARGIN_IN
+    return (2 * PANEL_IN, count * height) if wide > tall else (count * PANEL_IN, 2 * height)
+
+
+def _curve_size(count: int) -> tuple[float, float]:
+    return 2 * PANEL_IN, CURVE_IN * math.ceil(count / CURVES)
 
 
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     field, information = fitted.field(n), fitted.information(n)
-    noise = fitted.met[n].noise
-    wide, tall = np.ptp(field.points, axis=0)
-    axes = figure.subplots(2, 3 + len(information), sharex=True, sharey=True)
-    size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(tall / wide / len(field.points)))
-    for row, name in enumerate(("ux", "uy")):
-        measured, left = field.measured[:, row], field.residual[:, row]
+    noise, most = fitted.met[n].noise, max(t.max() for t in information.values())
+    wide, count = _is_wide(fitted, n), 3 + len(information)
+    shape = (count, 2) if wide else (2, count)
+    axes = figure.subplots(*shape, sharex=True, sharey=True)
+    area = float(np.prod(np.ptp(field.points, axis=0)) / np.ptp(field.points, axis=0)[0] ** 2)
+    size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(area / len(field.points)))
+    for column, name in enumerate(("ux", "uy")):
+        measured, left = field.measured[:, column], field.residual[:, column]
         shown = [
             (f"{name} measured", measured, (measured.min(), measured.max()), "viridis"),
             (f"{name} fitted", measured - left, (measured.min(), measured.max()), "viridis"),
             (f"{name} residual / noise", left / noise, (-WITHIN, WITHIN), "RdBu_r"),
         ]
         for path, told in information.items():
-            most = max(t.max() for t in information.values())
-            shown.append(
-                (f"{name} tells {path}", told.reshape(2, -1)[row] / most, (0, 1), "magma_r")
-            )
-        for ax, (title, values, limits, colours) in zip(axes[row], shown, strict=True):
+            share = told.reshape(2, -1)[column] / most
+            shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
+        own = axes[:, column] if wide else axes[column]
+        for ax, (title, values, limits, colours) in zip(own, shown, strict=True):
             _scatter(ax, field.points, values, limits, colours, size)
             ax.set_title(title, fontsize=9)
-    for ax in axes[1]:
+    for ax in axes[-1]:
         ax.set_xlabel("x (lattice unit)", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("y (lattice unit)", fontsize=9)
@@ -75,9 +92,13 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
 
 def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     numbers, information = fitted.numbers(n), fitted.information(n)
-    axes = figure.subplots(1, 3 + len(information))
+    count = 3 + len(information)
+    grid = figure.subplots(math.ceil(count / CURVES), CURVES, squeeze=False)
+    axes = grid.ravel()
+    for ax in axes[count:]:
+        ax.remove()
     order = np.argsort(numbers.along)
-    axes[0].plot(numbers.along, numbers.measured, ".", color="0.6", markersize=4, label="measured")
+    axes[0].plot(numbers.along, numbers.measured, "o", color="0.7", markersize=4, label="measured")
     axes[0].plot(
         numbers.along[order], numbers.fitted[order], **_line(numbers.joined), label="fitted"
     )
@@ -88,10 +109,10 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     axes[2].axhline(0.0, color="0.6", linewidth=0.8)
     titles = [numbers.what, "fitted over measured", "residual / noise"]
     most = max(t.max() for t in information.values())
-    for ax, (path, told) in zip(axes[3:], information.items(), strict=True):
+    for ax, (path, told) in zip(axes[3:], information.items(), strict=False):
         ax.plot(numbers.along, told / most, ".", markersize=3)
         titles.append(f"tells {path}")
-    for k, (ax, title) in enumerate(zip(axes, titles, strict=True)):
+    for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
         ax.set_title(title, fontsize=9)
         ax.set_xlabel("measured" if k == 1 else numbers.over, fontsize=9)
         ax.tick_params(labelsize=8)
