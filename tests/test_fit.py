@@ -242,7 +242,15 @@ WRONG = {
     "no such file": ({"measured": {"file": "none.csv"}}, "is no regular file"),
     "no such column": ({"measured": {"columns": ["x", "y", "u", "v"]}}, "no 'u'"),
     "points elsewhere": ({"measured": {"margin": 100.0}}, "0 numbers of what was measured"),
-    "no such group": ({"force": {"group": 7, "value": [1.0, 0.0]}}, "no leader group 7"),
+    "no such group": (
+        {"force": {"group": 7, "value": [1.0, 0.0]}},
+        "^force.group: there is no leader group 7",
+    ),
+    "a force that is none": ({"force": {"group": 1, "value": [0.0, 0.0]}}, "leave it out"),
+    "a force the other way": ({"force": {"group": 1, "value": [-1.0, 0.0]}}, "turn its sign"),
+    "bounds too wide": ({"unknown": {"rule.poisson_ratio": [0.2, 0.9]}}, "bounds go beyond"),
+    "a term twice": ({"measured": {"distortion": {"ux": [[1, 0], [1, 0]]}}}, "twice"),
+    "of strength": ({"kind": "strength"}, "fit_strength"),
 }
 
 
@@ -260,6 +268,50 @@ def test_what_is_wrong_is_named(name, tmp_path):
         fit[key] = {**fit["measured"], **value} if key == "measured" else value
     with pytest.raises(pbdkit.ExperimentError, match=told):
         pbdkit.fit(fit)
+
+
+ROWS = {
+    "in metres": (lambda rows: 1e-3 * rows, {}, "lattice units"),
+    "fewer than unknowns": (
+        lambda rows: rows[20:23],
+        {"distortion": {"ux": [[p, q] for p in (0, 1) for q in range(4)]}},
+        "cannot tell 9 unknowns",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_that_cannot_do_are_named(name, tmp_path):
+    change, more, told = ROWS[name]
+    path = tmp_path / "field.csv"
+    measured(plate(), path)
+    rows = change(np.loadtxt(path, delimiter=",", skiprows=1))
+    np.savetxt(path, rows, delimiter=",", header="x,y,ux,uy", comments="")
+    given = {"file": str(path), "noise": 1e-3} | more
+    unknown = {"rule.poisson_ratio": [0.0, 0.49]}
+    with pytest.raises(pbdkit.ExperimentError, match=told):
+        pbdkit.fit({"experiment": plate(), "unknown": unknown, "measured": given, "modes": 0})
+
+
+@pytest.mark.parametrize("noise", [{}, {"noise": 1e-6}])
+def test_one_point_at_rest_tells_nothing_and_breaks_nothing(noise, tmp_path):
+    path = tmp_path / "field.csv"
+    path.write_text("x,y,ux,uy\n3,2,0,0\n")
+    bar = {
+        "name": "bar",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "rectangle", "width": 8.0, "height": 4.0},
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+        "steps": 1,
+        "solver": {"type": "equilibrium"},
+    }
+    unknown = {"rule.poisson_ratio": [0.01, 0.49]}
+    given = {"file": str(path)} | noise
+    found = pbdkit.fit({"experiment": bar, "unknown": unknown, "measured": given})
+    assert not found.values["rule.poisson_ratio"].told
 
 
 def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):

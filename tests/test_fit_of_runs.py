@@ -201,6 +201,17 @@ WRONG = {
 }
 
 
+def test_a_curve_of_the_other_sign_is_named(measured, monkeypatch):
+    monkeypatch.chdir(measured)
+    given = curve(measured)
+    rows = np.loadtxt(given["file"], delimiter=",", skiprows=1) * [1.0, -1.0]
+    np.savetxt("turned.csv", rows, delimiter=",", header="displacement,force", comments="")
+    unknown = {"rule.poisson_ratio": [0.0, 0.45]}
+    fit = {"experiment": bar(), "unknown": unknown, "measured": given | {"file": "turned.csv"}}
+    with pytest.raises(pbdkit.ExperimentError, match="the other sign"):
+        pbdkit.fit(fit)
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_is_named(name, measured, monkeypatch):
     monkeypatch.chdir(measured)

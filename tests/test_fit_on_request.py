@@ -10,6 +10,7 @@ from test_fit import NOISE, measured, plate
 
 import pbdkit
 from pbdkit.fitting.calling import problem_of
+from pbdkit.fitting.least_squares import rise_of_loss
 from pbdkit.fitting.sampling import _marginal
 from pbdkit.fitting.specification import described_fit
 
@@ -37,6 +38,23 @@ def test_a_profile_agrees_with_the_standard_error_where_the_problem_is_straight(
         profile.low,
         profile.high,
     ]
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "cauchy"])
+def test_a_profile_agrees_with_the_standard_error_of_a_loss(loss, fit):
+    found = pbdkit.fit(fit | {"loss": loss, "profile": ["rule.poisson_ratio"]})
+    estimate, profile = found.values["rule.poisson_ratio"], found.profiles["rule.poisson_ratio"]
+    assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.1)
+
+
+def test_the_rise_of_a_loss_is_that_of_its_scores():
+    """Huber's, of normal residuals: ψ² is z² within k, else k², and ψ' the share within."""
+    from scipy.stats import norm
+
+    z, k = norm.ppf((np.arange(200_000) + 0.5) / 200_000), 1.345
+    within = 2.0 * norm.cdf(k) - 1.0
+    square = within - 2.0 * k * norm.pdf(k) + k**2 * (1.0 - within)
+    assert rise_of_loss(z, "huber") == pytest.approx(square / within, rel=1e-3)
 
 
 def test_a_profile_with_two_parameters_fits_the_other_anew(fit):
@@ -67,6 +85,19 @@ def test_the_posterior_of_a_straight_problem_is_the_normal_one(fit):
     assert -first / (2 * second) == pytest.approx(estimate.value, abs=0.05 * estimate.error)
     assert found.ratio < 1.0
     assert np.sqrt(-0.5 / second) == pytest.approx(estimate.error, rel=0.03)
+
+
+def test_what_is_told_twice_leaves_the_posterior_as_it_is(fit):
+    """A shift of all is one of the boundaries, and one of the images."""
+    twice = fit["measured"] | {"distortion": {"ux": [[0, 0]], "uy": [[0, 0]]}}
+    values = 0.3 + 0.01 * np.linspace(-1.0, 1.0, 5)
+    logs = []
+    for given in (fit, fit | {"measured": twice}):
+        found = pbdkit.fit(given)
+        z = found.solution.z
+        logs.append([_marginal(found.problem, z, np.array([v]), 1.0) for v in values])
+    once, more = (np.array(each) - max(each) for each in logs)
+    np.testing.assert_allclose(more, once, atol=0.05)
 
 
 def test_the_sampler_draws_from_it(fit):
@@ -174,7 +205,7 @@ WRONG = {
     ),
     "a candidate without its unknown": (
         {"candidates": {"other": {"settings": {"rule": {"type": "springs"}}}}},
-        "no number of the experiment",
+        "^candidates.other: .*no number of the experiment.* of its own",
     ),
 }  # fmt: skip
 

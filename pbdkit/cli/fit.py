@@ -24,7 +24,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
     from pbdkit.cli.waiting import waiting
     from pbdkit.fitting.strength_specification import is_strength_fit
 
-    path = output or Path(Path(file).name).with_suffix(".json")
+    path = output or Path(Path(file).name or "fit").with_suffix(".json")
     refuse_output(path, force=force, experiment=Path(file))
     if picture:
         refuse_output(picture, force=force)

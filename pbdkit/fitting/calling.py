@@ -30,8 +30,11 @@ from pbdkit.stepping.state import Floats
 Components = Iterable[type[Component]]
 GIVEN = "as given"
 """What the experiment of the fit is called among candidates."""
+INSET = 1e-6
+"""How far within bounds, as a share of their span, a number has to be one of the experiment's."""
 TINY = 1e-6
-"""The noise as a share of what was measured, until residuals tell it: all of them are larger."""
+"""The noise as a share of what was measured, until residuals tell it: all of them are larger.
+Below that share of it again they are rounding."""
 
 
 def fit_experiment(fit: Fit, experiment: Experiment, components: Components = ()) -> Fitted:
@@ -40,16 +43,33 @@ def fit_experiment(fit: Fit, experiment: Experiment, components: Components = ()
     import scipy.linalg  # noqa: F401  # what is loaded later would work on all threads
 
     known = (*given_classes(experiment), *components)
-    with one_thread():
-        problem, solution = _solved(problem_of(fit, experiment, components=known), fit)
-        names = [*fit.unknown]
-        profiles = {
-            path: profiled(problem, solution, names.index(path), fit.loss) for path in fit.profile
-        }
-        sample = sampled(problem, solution, **dict(fit.sampler)) if fit.sampler else None
-        candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution), known)
-        found = fitted(fit, problem, solution)
-        return replace(found, profiles=profiles, sample=sample, candidates=candidates)
+    try:
+        with one_thread():
+            return _fitted(fit, experiment, known)
+    except ExperimentError as error:
+        raise _placed(error, experiment) from None
+
+
+def _placed(error: ExperimentError, experiment: Experiment) -> ExperimentError:
+    """With the place in the fit file, or in its experiment."""
+    if error.located or not error.where:
+        return error
+    if error.where[0] not in Fit.model_fields:
+        return experiment.located(error)
+    place = ".".join(map(str, error.where))
+    return ExperimentError(f"{place}: {error}", error.where)
+
+
+def _fitted(fit: Fit, experiment: Experiment, components: Components) -> Fitted:
+    problem, solution = _solved(problem_of(fit, experiment, components=components), fit)
+    names = [*fit.unknown]
+    profiles = {
+        path: profiled(problem, solution, names.index(path), fit.loss) for path in fit.profile
+    }
+    sample = sampled(problem, solution, **dict(fit.sampler)) if fit.sampler else None
+    candidates = _compared(fit, experiment, Posed(GIVEN, problem, solution), components)
+    found = fitted(fit, problem, solution)
+    return replace(found, profiles=profiles, sample=sample, candidates=candidates)
 
 
 def _compared(
@@ -62,7 +82,11 @@ def _compared(
     for name, rival in fit.candidates.items():
         where = f"candidates.{name}.settings"
         changed = _with_settings(experiment, rival.settings, fit, where, components)
-        problem = problem_of(fit, changed, rival.unknown, components)
+        try:
+            problem = problem_of(fit, changed, rival.unknown, components)
+        except ExperimentError as error:
+            hint = "" if rival.unknown else "; a candidate may name an `unknown` of its own"
+            raise ExperimentError(f"{error}{hint}", ("candidates", name)) from None
         pairs = zip(problem.observations, noises, strict=True)
         problem = replace(problem, observations=tuple(o.with_noise(n) for o, n in pairs))
         posed.append(Posed(name, problem, solved(problem, problem.start(), fit.loss)))
@@ -81,11 +105,12 @@ def problem_of(
     unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
     for unknown in unknowns:
         unknown.parameter.value_in(experiment)
+        _refuse_beyond(unknown, experiment)
     observations = []
     for measured in fit.measured:
         settings = measured.settings
         changed = _with_settings(experiment, settings, fit, "measured.settings", components)
-        found = measured.observation(changed, fit.modes)
+        found = replace(measured.observation(changed, fit.modes), weight=measured.weight)
         _refuse_too_few(found, len(unknowns))
         observations.append(found)
     if fit.force and isinstance(observations[0], FieldObservation):
@@ -93,7 +118,9 @@ def problem_of(
         if fit.force.group >= len(groups):
             text = f"there is no leader group {fit.force.group}"
             raise ExperimentError(text, ("force", "group"))
-    return Problem(unknowns, tuple(observations))
+    problem = Problem(unknowns, tuple(observations))
+    _refuse_underdetermined(problem)
+    return problem
 
 
 def _with_settings(
@@ -120,6 +147,28 @@ def _refuse_too_few(observation: Observation, unknowns: int) -> None:
         )
 
 
+def _refuse_beyond(unknown: Unknown, experiment: Experiment) -> None:
+    for end in (unknown.low, unknown.high):
+        inside = end + INSET * (unknown.low + unknown.high - 2.0 * end)
+        try:
+            unknown.parameter.put(experiment, inside)
+        except ExperimentError as error:
+            path = unknown.parameter.path
+            text = f"bounds go beyond what the experiment allows: {error}"
+            raise ExperimentError(text, ("unknown", path)) from None
+
+
+def _refuse_underdetermined(problem: Problem) -> None:
+    count = sum(len(o.measured) for o in problem.observations)
+    if count < problem.size:
+        own = problem.size - problem.shared
+        raise ExperimentError(
+            f"{count} numbers of what was measured cannot tell {problem.size} unknowns, {own} of "
+            "which are `modes` of boundaries and terms of `distortion`; take fewer of these",
+            ("measured", "file"),
+        )
+
+
 def _solved(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     """By the noise that residuals have, where none is given."""
     if fit.measured[0].noise is not None:
@@ -129,7 +178,9 @@ def _solved(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     solution = solved(problem, problem.start())
     for _ in range(1 if fit.loss == "linear" else 2):  # a loss tells outliers by the noise
         (only,) = problem.observations
-        problem = replace(problem, observations=(only.with_noise(solution.ratio * only.noise),))
+        problem = replace(
+            problem, observations=(only.with_noise(max(solution.ratio, TINY) * only.noise),)
+        )
         solution = solved(problem, solution.z, fit.loss)
     return problem, solution
 

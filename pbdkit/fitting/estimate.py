@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.errors import ExperimentError
 from pbdkit.fitting.evidence import Carried
 from pbdkit.fitting.least_squares import TELLS, Solution
 from pbdkit.fitting.problem import Problem
@@ -60,6 +61,12 @@ def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
     known = [*told, *range(count, problem.size)]
     part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])
+    if unit <= 0.0:
+        raise ExperimentError(
+            f"group {force.group} carries no force that way in this experiment, rather one the "
+            "other way; turn its sign, or look for it at another group",
+            ("force", "value"),
+        )
     size = float(np.hypot(*force.value))
     value = size / force.thickness / unit
     error = abs(value) * np.hypot(part / unit, force.noise / size)

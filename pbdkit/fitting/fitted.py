@@ -230,5 +230,5 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
 
 def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
     ratio = spread_of(residuals, 0, loss)
-    noise = observation.noise * observation.unit
+    noise = observation.noise * observation.unit * float(np.sqrt(observation.weight))
     return Met(observation.kind, noise, ratio, len(residuals), observation.left_out)

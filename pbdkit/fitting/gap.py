@@ -23,8 +23,9 @@ from pbdkit.stepping.state import Floats, initial_state
 
 TURNS, INSET = 3, 1e-3
 """Linear problems; the share of the way between bounds by which a start keeps away from them."""
-NEAREST, FAR = 12, 2.0
-"""Points that a plane goes through; farther than so many times their spacing none is known."""
+PLANE, NEAREST, FAR = 3, 12, 2.0
+"""How few points tell a plane, and how many it goes through; farther than so many times their
+spacing none is known."""
 
 
 def least_gap(
@@ -33,6 +34,8 @@ def least_gap(
     """The parameters between bounds, (parameter,); their middle where too little is known."""
     middle, inset = (low + high) / 2.0, INSET * (high - low)
     values = middle
+    if len(field.evidence.points) < PLANE:
+        return middle
     state = initial_state(field.scene)
     u = _on_particles(field)
 

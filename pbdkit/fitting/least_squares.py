@@ -170,6 +170,7 @@ def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...
     jacobian[:, count:] /= np.where(rest > 0.0, rest, 1.0)
     scale[count:] /= np.where(rest > 0.0, rest, 1.0)
     _, sizes, ways = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    sizes = np.append(sizes, np.zeros(len(ways) - len(sizes)))  # of fewer residuals than unknowns
     least = sizes.max(initial=0.0) * RANK
     variance = np.array([1.0 / s**2 if s > least else np.inf for s in sizes])
     variance *= _of_loss(at.residuals, loss)
@@ -185,8 +186,20 @@ def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...
 
 def _of_loss(residuals: Floats, loss: Loss) -> float:
     """By how much a loss makes the variance larger: mean ψ² / (mean ψ')², in units of the noise."""
+    square, slope = _scores(residuals, loss)
+    return square / slope**2
+
+
+def rise_of_loss(residuals: Floats, loss: Loss) -> float:
+    """By how much a loss makes -2 log L rise more than χ² does: mean ψ² / mean ψ'."""
+    square, slope = _scores(residuals, loss)
+    return square / slope
+
+
+def _scores(residuals: Floats, loss: Loss) -> tuple[float, float]:
+    """Mean ψ², in units of the noise, and mean ψ', of residuals as large as it."""
     if loss == "linear":
-        return 1.0
+        return 1.0, 1.0
     z = residuals / max(spread_of(residuals, 0, loss), 1e-300) / OUTLIERS
     if loss == "huber":
         psi, slope = np.clip(z, -1.0, 1.0), np.abs(z) <= 1.0
@@ -194,7 +207,7 @@ def _of_loss(residuals: Floats, loss: Loss) -> float:
         psi, slope = z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
     else:
         psi, slope = z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
-    return float(np.mean(psi**2) * OUTLIERS**2 / np.mean(slope) ** 2)
+    return float(np.mean(psi**2) * OUTLIERS**2), float(np.mean(slope))
 
 
 def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:

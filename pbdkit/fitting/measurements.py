@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -18,6 +19,7 @@ from pydantic import (
     model_validator,
 )
 
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Sites
 from pbdkit.experiment.columns import read_columns
 from pbdkit.experiment.model import Experiment
@@ -29,16 +31,28 @@ from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.fitting.tracks import TracksObservation
 from pbdkit.interfaces.component import Component, Strict
-from pbdkit.scene.scene import build_scene
+from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import Floats
 
 GUESS = 1.0
 """The noise where none is given, until residuals tell it."""
+FEW, TINY = 4, 2e-3
+"""More points than that within such a share of the body are points in another unit."""
 Positive = Annotated[float, Field(gt=0.0)]
 Term = Annotated[
     tuple[Annotated[int, Field(ge=0, le=4)], Annotated[int, Field(ge=0, le=4)]],
     Field(strict=False),
 ]
+
+
+def _once(terms: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+    for n, term in enumerate(terms):
+        if term in terms[:n]:
+            raise ValueError(f"names {list(term)} twice")
+    return terms
+
+
+Terms = Annotated[tuple[Term, ...], Field(strict=False), AfterValidator(_once)]
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 WAYS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
 
@@ -84,8 +98,8 @@ class Distortion(Strict):
     x and y, by their exponents, each as much as fits. A camera that turns, a lens, and bending out
     of the plane are such: `ux: [[2, 0]]` is a strain that rises evenly along x."""
 
-    ux: Annotated[tuple[Term, ...], Field(strict=False)] = ()
-    uy: Annotated[tuple[Term, ...], Field(strict=False)] = ()
+    ux: Terms = ()
+    uy: Terms = ()
 
 
 def _without_type(schema: dict[str, Any]) -> None:
@@ -94,8 +108,7 @@ def _without_type(schema: dict[str, Any]) -> None:
 
 
 class MeasuredField(Measured):
-    """Displacements at scattered points of the equilibrium, in lattice units or, with `units` in
-    the experiment, in what they say.
+    """Displacements at scattered points of the equilibrium, in lattice units.
 
     Points nearer to the outline of the body than `margin` are left out.
     """
@@ -118,6 +131,7 @@ class MeasuredField(Measured):
             far = _depth(scene.experiment, points) >= self.margin
         terms = self.distortion.ux, self.distortion.uy
         evidence = FieldEvidence.of(scene, points[far], displacements[far], terms)
+        _refuse_other_unit(evidence.points, scene)
         return FieldObservation.of(scene, evidence, self.weighted_noise, modes, far)
 
 
@@ -169,6 +183,17 @@ class MeasuredCurve(Measured):
             scaled=self.youngs_modulus is None,
         )
         return replace(found, unit=scale)
+
+
+def _refuse_other_unit(points: Floats, scene: Scene) -> None:
+    body = np.ptp(scene.raster.reference(scene.raster.body_rows), axis=0).max()
+    size = np.ptp(points, axis=0).max() if len(points) > FEW else body
+    if size < TINY * body:
+        raise ExperimentError(
+            f"the {len(points)} points lie within {size:.3g}, and the body is {body:.3g} long; "
+            "columns x, y, ux, uy count in the experiment's lattice units: multiply them",
+            ("measured", "file"),
+        )
 
 
 def _depth(experiment: Experiment, points: Floats) -> Floats:

@@ -49,6 +49,7 @@ class Observation(ABC):
     rows: NDArray[np.intp]
     left_out: int = 0
     unit: float = 1.0
+    weight: float = 1.0
 
     @property
     def needs_modulus(self) -> bool:

@@ -16,6 +16,7 @@ from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.source import Source
+from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.varying import ByRegion
 
@@ -54,8 +55,9 @@ class Parameter:
             try:
                 found = found[int(word) if isinstance(found, list) else word]
             except (KeyError, IndexError, ValueError, TypeError):
+                hint = did_you_mean(word, found) if isinstance(found, dict) else ""
                 raise ExperimentError(
-                    f"'{self.path}' is no number of the experiment: there is no '{word}'"
+                    f"'{self.path}' is no number of the experiment: there is no '{word}'{hint}"
                 ) from None
         if isinstance(found, bool) or not isinstance(found, (int, float)):
             raise ExperimentError(f"'{self.path}' is no number of the experiment")

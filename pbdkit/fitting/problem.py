@@ -106,6 +106,12 @@ class Problem:
         product, square = np.sum(terms, axis=0)
         if square == 0.0:
             raise ExperimentError("the group exerts no force in this experiment", ("measured",))
+        if product < 0.0:
+            raise ExperimentError(
+                "what was measured of the force has the other sign than in this experiment; turn "
+                "it, or name another `group` or `axis`",
+                ("measured",),
+            )
         z = z.copy()
         z[len(self.unknowns)] = product / square
         return z

@@ -2,7 +2,8 @@
 
 For each value all else is fitted anew. By how much -2 log L rises over its least value then, is
 below 3.84 within the interval that holds the true value in 95 of 100 cases (Wilks), however the
-parameter bends the predictions.
+parameter bends the predictions. With a loss the rise is that of M-estimators: it counts over
+mean ψ² / mean ψ'.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.fitting.least_squares import Loss, Solution, cost_of, solved
+from pbdkit.fitting.least_squares import Loss, Solution, cost_of, rise_of_loss, solved
 from pbdkit.fitting.problem import Problem
 from pbdkit.stepping.state import Floats
 
@@ -25,7 +26,8 @@ RISE = 3.841
 @dataclass(frozen=True)
 class Profile:
     """Values of a parameter, (value,), and by how much -2 log L rises there, (value,), with the
-    ends of the 95 % interval; None where data do not bound it within the bounds of the fit."""
+    ends of the 95 % interval; None where data do not bound it within the bounds of the fit, and
+    within REACH standard errors."""
 
     values: Floats
     rises: Floats
@@ -50,12 +52,14 @@ def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profil
     unknown, best = problem.unknowns[n], float(solution.z[n])
     reach = min(REACH * float(solution.errors[n]), unknown.span)
     values = np.unique(np.clip(np.linspace(best - reach, best + reach, POINTS), *_ends(unknown)))
-    least = cost_of(solution.at.residuals, loss)
+    residuals = solution.at.residuals
+    least, unit = cost_of(residuals, loss), rise_of_loss(residuals, loss)
+    unit *= max(1.0, solution.ratio) ** 2
     rises, z = np.zeros(len(values)), {True: solution.z, False: solution.z}
     for k in sorted(range(len(values)), key=lambda k: abs(values[k] - best)):
         side = bool(values[k] > best)
         cost, z[side] = _fitted_at(problem, n, float(values[k]), z[side], loss)
-        rises[k] = (cost - least) / max(1.0, solution.ratio) ** 2
+        rises[k] = (cost - least) / unit
     above, below = values >= best, values <= best
     high = _crossing(values[above], rises[above])
     low = _crossing(values[below][::-1], rises[below][::-1])

@@ -36,6 +36,8 @@ class FieldSeen(Seen):
     answers: tuple[Floats, ...] = field(repr=False)
     answering: Resting = field(repr=False)
     """Whose answers these are."""
+    away: float = 0.0
+    """How far these parameters are from there at most, as `Near.away` counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +112,11 @@ class FieldObservation(Observation):
         before = near.seen if near and isinstance(near.seen, FieldSeen) else None
         resting = Resting.of(experiment, before.resting if before else self.scene, DERIVATIVES)
         changes = [resting.change(parameter) for parameter in parameters]
-        lent = before is not None and near is not None and near.away < CLOSE
-        if before and lent and resting.finder.linear:
+        away = before.away + near.away if before and near else np.inf
+        if before and away < CLOSE and resting.finder.linear:
             answers, answering = before.answers, before.answering
         else:
-            answers, answering = self._answers(resting), resting
+            answers, answering, away = self._answers(resting), resting, 0.0
         by = [self.evidence.seen(du, resting) / self.noise for du in (*changes, *answers)]
         rows, count = len(self.measured), len(parameters)
         beside = self.evidence.distortions / self.noise
@@ -129,6 +131,7 @@ class FieldObservation(Observation):
             tuple(changes),
             answers,
             answering,
+            away,
         )
 
     def _answers(self, resting: Resting) -> tuple[Floats, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError
-from pbdkit.fitting.least_squares import Solution
+from pbdkit.fitting.least_squares import RANK, Solution
 from pbdkit.fitting.problem import Problem
 from pbdkit.registry.extras import refuse_without
 from pbdkit.stepping.state import Floats
@@ -88,7 +88,10 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
         return -np.inf
     left, log_volume = at.residuals, 0.0
     if rest.size:
-        basis, triangle = np.linalg.qr(at.jacobian)
-        left = left - basis @ (basis.T @ left)
-        log_volume = float(np.log(np.abs(np.diag(triangle))).sum())
+        size_of = np.linalg.norm(at.jacobian, axis=0)
+        size_of[size_of == 0.0] = 1.0
+        basis, sizes, _ = np.linalg.svd(at.jacobian / size_of, full_matrices=False)
+        own = sizes > RANK * sizes.max(initial=0.0)  # the others change nothing, in any way
+        left = left - basis[:, own] @ (basis[:, own].T @ left)
+        log_volume = float(np.log(size_of).sum() + np.log(sizes[own]).sum())
     return float(-0.5 * (left @ left) / size**2 - log_volume)

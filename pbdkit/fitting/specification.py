@@ -15,7 +15,7 @@ from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import report
 from pbdkit.experiment.source import Source, read_file
 from pbdkit.fitting.least_squares import Loss
-from pbdkit.fitting.measurements import MeasuredField, Measurements, Pair, Positive
+from pbdkit.fitting.measurements import MeasuredCurve, MeasuredField, Measurements, Pair, Positive
 from pbdkit.interfaces.component import Strict, did_you_mean
 
 FOLDER = Path(__file__).parent.parent / "fits"
@@ -99,6 +99,14 @@ class Fit(Strict):
                 "`force` is what a group carries at rest while a field is measured; give forces "
                 "over displacement as a curve"
             )
+        if self.force and self.force.value == (0.0, 0.0):
+            raise ValueError("`force` is 0 both ways, which tells no modulus; leave it out")
+        scaled = [m for m in self.measured if isinstance(m, MeasuredCurve) and not m.youngs_modulus]
+        if self.force and scaled:
+            raise ValueError(
+                "both `force` and a curve without `youngs_modulus` tell Young's modulus; leave "
+                "`force` out"
+            )
         if unknown := [path for path in self.profile if path not in self.unknown]:
             hint = did_you_mean(unknown[0], self.unknown)
             raise ValueError(f"`profile` names '{unknown[0]}', which is not unknown{hint}")
@@ -119,6 +127,10 @@ def described_fit(
     else:
         path = _file(str(description))
         source = of_kind(FIT, read_file(path))
+    if isinstance(source.data, dict) and source.data.get("kind") == "strength":
+        raise ExperimentError(
+            f"{source.name}: is a fit of strength; pbdkit.fit_strength carries it out", ("kind",)
+        )
     if given and isinstance(source.data, dict):
         source = Source(
             source.name, {"experiment": "", **source.data}, source.places, source.folder
