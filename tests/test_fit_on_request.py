@@ -54,7 +54,18 @@ def test_the_rise_of_a_loss_is_that_of_its_scores():
     z, k = norm.ppf((np.arange(200_000) + 0.5) / 200_000), 1.345
     within = 2.0 * norm.cdf(k) - 1.0
     square = within - 2.0 * k * norm.pdf(k) + k**2 * (1.0 - within)
-    assert rise_of_loss(z, "huber") == pytest.approx(square / within, rel=1e-3)
+    assert rise_of_loss(z, 0, "huber") == pytest.approx(square / within, rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
+def test_noise_that_is_understated_leaves_errors_as_they_are(loss, fit):
+    """They come from the residuals: those of half the noise are as good, or a little worse."""
+    found = [
+        pbdkit.fit(fit | {"loss": loss, "measured": fit["measured"] | {"noise": noise}})
+        for noise in (NOISE, NOISE / 2)
+    ]
+    right, understated = (f.values["rule.poisson_ratio"].error for f in found)
+    assert right * 0.95 < understated < right * 1.5
 
 
 def test_a_profile_with_two_parameters_fits_the_other_anew(fit):

@@ -31,6 +31,8 @@ SWING = 0.25
 """A step that takes back more than such a share of the last one swings: less of it is taken."""
 FROZEN = 1e-3
 """What changes all residuals together by less of their noise, from bound to bound, stays."""
+LEAST_SLOPE = 0.05
+"""Of a loss on the mean; below it nearly all residuals are outliers."""
 OUTLIERS = 1.345
 """Residuals beyond so many times their noise count less, where a loss says so (Huber)."""
 
@@ -58,8 +60,8 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     """By Gauss and Newton with exact derivatives: the problem as it is linear at z is solved
     between bounds, with its loss, until z stays where it is.
 
-    The covariance is (JᵀJ)⁻¹, or with a loss that of M-estimators (Huber), times the square of the
-    ratio where residuals are larger than their noise says (Birge). Raises UnconvergedError.
+    The covariance is (JᵀJ)⁻¹, times the square of the ratio where residuals are larger than their
+    noise says (Birge), or with a loss that of M-estimators (Huber). Raises UnconvergedError.
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
@@ -68,7 +70,7 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         step = _linear_step(at, low - z, high - z, loss)
         covariance, untold = _known(problem, at, loss)
         ratio = spread_of(at.residuals, problem.size, loss)
-        own = step / np.sqrt(np.diag(covariance)) / max(1.0, ratio)
+        own = step / np.sqrt(np.diag(covariance))
         if (np.abs(own) <= SETTLED).all():
             break
         swings = own @ before < -SWING * (before @ before)
@@ -77,7 +79,6 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         z, before, count = z + share * step, share * own, count + tried
     else:
         raise UnconvergedError(f"the fit still moves after {MOST_TURNS} turns")
-    covariance *= max(1.0, ratio) ** 2
     return Solution(z, at, covariance, ratio, untold, _on_bounds(problem, z), count)
 
 
@@ -158,7 +159,7 @@ def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
 
 
 def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...]]:
-    """The covariance of z for residuals as large as their noise, and whom the data cannot tell.
+    """The covariance of z for residuals at least as large as their noise, and whom the data cannot tell.
 
     Parameters count in the way between their bounds; what cannot be told is left at that way.
     """
@@ -173,7 +174,7 @@ def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...
     sizes = np.append(sizes, np.zeros(len(ways) - len(sizes)))  # of fewer residuals than unknowns
     least = sizes.max(initial=0.0) * RANK
     variance = np.array([1.0 / s**2 if s > least else np.inf for s in sizes])
-    variance *= _of_loss(at.residuals, loss)
+    variance *= _of_loss(at.residuals, problem.size, loss)
     own = ways[:, :count]
     unsure = (variance > TELLS**2) & (np.abs(own).max(axis=1, initial=0.0) > PART)
     untold = {n for row in own[unsure] for n in np.flatnonzero(np.abs(row) > PART).tolist()}
@@ -184,30 +185,32 @@ def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...
     return covariance, tuple(problem.unknowns[n].parameter.path for n in sorted(untold))
 
 
-def _of_loss(residuals: Floats, loss: Loss) -> float:
-    """By how much a loss makes the variance larger: mean ψ² / (mean ψ')², in units of the noise."""
-    square, slope = _scores(residuals, loss)
+def _of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
+    """By how much larger the variance is: mean ψ² / (mean ψ')², in units of the noise."""
+    square, slope = _scores(residuals, unknowns, loss)
     return square / slope**2
 
 
-def rise_of_loss(residuals: Floats, loss: Loss) -> float:
-    """By how much a loss makes -2 log L rise more than χ² does: mean ψ² / mean ψ'."""
-    square, slope = _scores(residuals, loss)
+def rise_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
+    """By how much more -2 log L rises than χ² does: mean ψ² / mean ψ'."""
+    square, slope = _scores(residuals, unknowns, loss)
     return square / slope
 
 
-def _scores(residuals: Floats, loss: Loss) -> tuple[float, float]:
-    """Mean ψ², in units of the noise, and mean ψ', of residuals as large as it."""
+def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]:
+    """Mean ψ², in units of the noise, and mean ψ', of residuals that are at least as large as it;
+    where the loss is linear the first is the square of Birge's ratio."""
+    spread = spread_of(residuals, unknowns, loss)
     if loss == "linear":
-        return 1.0, 1.0
-    z = residuals / max(spread_of(residuals, 0, loss), 1e-300) / OUTLIERS
+        return max(1.0, spread) ** 2, 1.0
+    z = residuals / min(1.0, max(spread, 1e-300)) / OUTLIERS
     if loss == "huber":
         psi, slope = np.clip(z, -1.0, 1.0), np.abs(z) <= 1.0
     elif loss == "soft_l1":
         psi, slope = z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
     else:
         psi, slope = z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
-    return float(np.mean(psi**2) * OUTLIERS**2), float(np.mean(slope))
+    return float(np.mean(psi**2) * OUTLIERS**2), max(float(np.mean(slope)), LEAST_SLOPE)
 
 
 def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:

@@ -53,8 +53,7 @@ def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profil
     reach = min(REACH * float(solution.errors[n]), unknown.span)
     values = np.unique(np.clip(np.linspace(best - reach, best + reach, POINTS), *_ends(unknown)))
     residuals = solution.at.residuals
-    least, unit = cost_of(residuals, loss), rise_of_loss(residuals, loss)
-    unit *= max(1.0, solution.ratio) ** 2
+    least, unit = cost_of(residuals, loss), rise_of_loss(residuals, problem.size, loss)
     rises, z = np.zeros(len(values)), {True: solution.z, False: solution.z}
     for k in sorted(range(len(values)), key=lambda k: abs(values[k] - best)):
         side = bool(values[k] > best)
