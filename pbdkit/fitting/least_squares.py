@@ -159,7 +159,8 @@ def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
 
 
 def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...]]:
-    """The covariance of z for residuals at least as large as their noise, and whom the data cannot tell.
+    """The covariance of z, for residuals at least as large as their noise, and whom the data cannot
+    tell.
 
     Parameters count in the way between their bounds; what cannot be told is left at that way.
     """

@@ -1,9 +1,10 @@
 """The posterior of the parameters by a sampler: a check of standard errors, which take the problem
 to be straight.
 
-All that comes in linearly - boundaries, distortions, Young's modulus - is integrated out exactly:
-with its derivatives J, what is left of the residuals r and a flat prior, log p = -½ |r|² - ½ log
-det JᵀJ. Walkers move by the affine-invariant stretch of Goodman and Weare (emcee).
+All that comes in linearly - boundaries of a linear rule, distortions, Young's modulus - is
+integrated out exactly, boundaries of other rules as far as they are straight around the fit: with
+its derivatives J, what is left of the residuals r and a flat prior, log p = -½ |r|² - ½ log det
+JᵀJ. Walkers move by the affine-invariant stretch of Goodman and Weare (emcee).
 """
 
 from __future__ import annotations
