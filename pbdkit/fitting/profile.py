@@ -8,17 +8,21 @@ mean ψ² / mean ψ'.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.fitting.least_squares import Loss, Solution, cost_of, rise_of_loss, solved
 from pbdkit.fitting.problem import Problem
 from pbdkit.stepping.state import Floats
 
-REACH, POINTS = 3.0, 9
-"""How many standard errors to both sides are looked at, and at how many values."""
+STEP, EVEN, MOST = 0.75, 4, 12
+"""Values are so many standard errors apart, and after so many twice as far each time."""
+ENOUGH = 8.0
+"""The rise after which no farther value is looked at."""
 RISE = 3.841
 """The 95 % quantile of χ² with one degree of freedom."""
 
@@ -26,8 +30,7 @@ RISE = 3.841
 @dataclass(frozen=True)
 class Profile:
     """Values of a parameter, (value,), and by how much -2 log L rises there, (value,), with the
-    ends of the 95 % interval; None where data do not bound it within the bounds of the fit, and
-    within REACH standard errors."""
+    ends of the 95 % interval; None where data do not bound it within the bounds of the fit."""
 
     values: Floats
     rises: Floats
@@ -48,21 +51,32 @@ class Profile:
 
 
 def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profile:
-    """The profile of parameter n. Raises UnconvergedError."""
-    unknown, best = problem.unknowns[n], float(solution.z[n])
-    reach = min(REACH * float(solution.errors[n]), unknown.span)
-    values = np.unique(np.clip(np.linspace(best - reach, best + reach, POINTS), *_ends(unknown)))
-    residuals = solution.at.residuals
-    least, unit = cost_of(residuals, loss), rise_of_loss(residuals, problem.size, loss)
-    rises, z = np.zeros(len(values)), {True: solution.z, False: solution.z}
-    for k in sorted(range(len(values)), key=lambda k: abs(values[k] - best)):
-        side = bool(values[k] > best)
-        cost, z[side] = _fitted_at(problem, n, float(values[k]), z[side], loss)
-        rises[k] = (cost - least) / unit
-    above, below = values >= best, values <= best
-    high = _crossing(values[above], rises[above])
-    low = _crossing(values[below][::-1], rises[below][::-1])
+    """The profile of parameter n: outward from the fit until it has risen enough, on both sides."""
+    best = (float(solution.z[n]), 0.0)
+    sides = [np.array([best, *_walk(problem, solution, n, way, loss)]) for way in (-1.0, 1.0)]
+    low, high = (_crossing(*side.T) for side in sides)
+    values, rises = np.concatenate([sides[0][:0:-1], sides[1]]).T
     return Profile(values, rises, low, high)
+
+
+def _walk(
+    problem: Problem, solution: Solution, n: int, way: float, loss: Loss
+) -> Iterator[tuple[float, float]]:
+    """Values one way, and the rise at each, as far as all else can be fitted."""
+    low, high = _ends(problem.unknowns[n])
+    value, z, step = float(solution.z[n]), solution.z, STEP * float(solution.errors[n])
+    unit = rise_of_loss(solution.at.residuals, problem.size, loss)
+    least = cost_of(solution.at.residuals, loss)
+    for count in range(MOST):
+        value = min(max(value + way * step, low), high)
+        try:
+            cost, z = _fitted_at(problem, n, value, z, loss)
+        except UnconvergedError:
+            return
+        yield value, (cost - least) / unit
+        if value in (low, high) or cost - least > ENOUGH * unit:
+            return
+        step *= 1.0 if count < EVEN else 2.0
 
 
 def _ends(unknown: Any) -> tuple[float, float]:
