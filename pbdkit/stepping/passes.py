@@ -8,6 +8,7 @@ those whom they follow. Only the order of particles differs: every number is the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,10 +21,23 @@ from pbdkit.scene.guides import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.clamps import Clamps
 
+CACHE = 2**20
+"""Bytes of displacements that stay near a processor."""
 FARTHEST = 8
 """Cells that frame points may lie from those whom they follow, and steps of a pass apart."""
 MOST_SLOTS = 32
 """Neighbours up to which a step is bound by the memory, and not by what it computes."""
+
+
+def cell_bytes(scene: Scene) -> int:
+    """What a step reads and writes of each repeat cell."""
+    real = np.dtype(scene.experiment.stepping.precision)
+    return 2 * scene.axes * real.itemsize * scene.raster.shape[0]
+
+
+def exceeds_cache(scene: Scene) -> bool:
+    """Whether displacements are too many for the cache, so that several steps a pass gain."""
+    return cell_bytes(scene) * math.prod(scene.raster.shape[1:]) > CACHE
 
 
 def single_steps(scene: Scene) -> str:

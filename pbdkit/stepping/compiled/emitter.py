@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pbdkit.stepping.compiled.blocks import goes_deep, write_deep_passes
+from pbdkit.stepping.compiled.blocks import goes_deep, write_deep_passes, write_part
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
 from pbdkit.stepping.compiled.following import write_frame
 from pbdkit.stepping.compiled.leading import write_guiding, write_leading, write_slants
@@ -33,8 +33,10 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
         passes.append(functions[-1])
     pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
     functions += [pushing] if pushing else []
+    part = write_part(plan, passes[0]) if goes_deep(plan) else None
+    functions += [part] if part else []
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes, pushing)
+    _write_run(run, plan, passes, pushing, part)
     return write_module(plan, functions, run)
 
 
@@ -75,11 +77,14 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
 
 
 def _write_run(
-    out: Function, plan: Plan, passes: Sequence[Function], pushing: Function | None
+    out: Function,
+    plan: Plan,
+    passes: Sequence[Function],
+    pushing: Function | None,
+    part: Function | None,
 ) -> None:
-    deep = goes_deep(plan)
-    if deep:
-        write_deep_passes(out, plan, passes[0])
+    if part:
+        write_deep_passes(out, plan, part)
     else:
         out.add(0, "for made in range(count):")
     out.add(1, "step += 1")
@@ -116,7 +121,7 @@ def _write_run(
     if plan.scene.frame:
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
-    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if deep else []))
+    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if part else []))
 
 
 def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, high: str) -> None:

@@ -56,8 +56,8 @@ def leading_arrays(
     led = ways[0]
     if not has_guides(plan.scene.leading):
         at = np.concatenate([np.empty(0, np.intp), *(each.place for each in led)])
-        none = np.empty((len(plan.axes), 0))
-        u = np.array([np.concatenate([none, *(w.u for w in way)], axis=1) for way in ways], real)
+        empty = np.empty((len(plan.axes), 0))
+        u = np.array([np.concatenate([empty, *(w.u for w in way)], axis=1) for way in ways], real)
         more: dict[str, Any] = {}
         if listed:
             order, more = band_arrays(plan, at)
