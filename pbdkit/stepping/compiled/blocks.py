@@ -30,7 +30,7 @@ AHEAD, ENTRIES = 64, 2**20
 
 def goes_deep(plan: Plan) -> bool:
     """Whether several steps of a scene go together in a pass."""
-    return not single_steps(plan.scene)
+    return not plan.parallel and not single_steps(plan.scene)
 
 
 def pass_arrays(plan: Plan) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def write_part(plan: Plan, sweep: Function) -> Function:
     (up, across), (rows, columns) = skew.along, skew.reach
     first = 2 * plan.scene.axes - 2
     out.add(0, "i_low, i_high, j_low, j_high = extent", "step = step + s + 1")
-    out.add(0, f"high = i_low + (band_ + 1) * sizes[1] - s * {_lag(plan, up)}")
+    out.add(0, f"high = i_low + (band_ + 1) * sizes[1] - s * {up}")
     out.add(0, f"right = j_low + (tile + 1) * sizes[2] - s * {across}")
     out.add(0, "low, left = high - sizes[1], right - sizes[2]")
     out.add(0, "held = led_values[min(made + s, led_values.shape[0] - 1)]")
@@ -98,12 +98,6 @@ def write_part(plan: Plan, sweep: Function) -> Function:
     return out
 
 
-def _lag(plan: Plan, up: int) -> str:
-    """How many rows a step of a pass is behind the one before: on several threads so many that all
-    move their parts at once."""
-    return f"({up} + sizes[1])" if plan.parallel else str(up)
-
-
 def _write_listed(out: Function, name: str, e: str = "e") -> None:
     """A loop over those of a list in the rows from i0 to i1, and columns from j0 to j1."""
     out.add(0, f"first_one = {name}_rows[min(max(i0, i_low), i_high)]")
@@ -121,7 +115,7 @@ def write_deep_passes(out: Function, plan: Plan, part: Function) -> None:
     out.depth += 2
     _write_extent(out, plan)
     out.add(0, "for tile in range(tiles):", "    for band_ in range(bands):")
-    out.add(2, f"for s in {'prange' if plan.parallel else 'range'}(deep):")
+    out.add(2, "for s in range(deep):")
     forth = part.call(*part.own)
     back = re.sub(r"\b[uv]_", lambda found: {"u_": "v_", "v_": "u_"}[found[0]], forth)
     out.add(3, "if s % 2 == 0:", "    " + forth, "else:", "    " + back)
@@ -145,6 +139,5 @@ def _write_extent(out: Function, plan: Plan) -> None:
         out.add(0, f"{name}_low = max(0, box[{at}] - {skew})")
         out.add(0, f"{name}_high = min(kind.shape[{axis}], box[{at + 1}] + {skew})")
     out.add(0, "extent = i_low, i_high, j_low, j_high")
-    bands, tiles = f"(deep - 1) * {_lag(plan, up)}", f"(deep - 1) * {across}"
-    out.add(0, f"bands = (i_high - i_low + {bands} + sizes[1] - 1) // sizes[1]")
-    out.add(0, f"tiles = (j_high - j_low + {tiles} + sizes[2] - 1) // sizes[2]")
+    out.add(0, f"bands = (i_high - i_low + (deep - 1) * {up} + sizes[1] - 1) // sizes[1]")
+    out.add(0, f"tiles = (j_high - j_low + (deep - 1) * {across} + sizes[2] - 1) // sizes[2]")

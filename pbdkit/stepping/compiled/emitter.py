@@ -97,14 +97,7 @@ def _write_run(
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
     if plan.bonds_first:
-        # Band by band, so that what the pass has read and written is still near when it is swept.
-        back, ahead = plan.home_reach
-        out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
-        out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
-        out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
-        write_pass(out, plan, 2, passes[0], "judged", "ready")
-        out.add(2, "judged = ready")
-        write_pass(out, plan, 2, passes[1], "low", "high")
+        _write_bands(out, plan, *passes)
     else:
         for n, sweep in enumerate(passes):
             write_pass(out, plan, 1, sweep, "i0", "i1")
@@ -122,6 +115,18 @@ def _write_run(
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
     out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if part else []))
+
+
+def _write_bands(out: Function, plan: Plan, judging: Function, sweep: Function) -> None:
+    """Band by band, so that what the pass over bonds has read and written is still near when it is
+    swept."""
+    back, ahead = plan.home_reach
+    out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
+    out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
+    out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
+    write_pass(out, plan, 2, judging, "judged", "ready")
+    out.add(2, "judged = ready")
+    write_pass(out, plan, 2, sweep, "low", "high")
 
 
 def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, high: str) -> None:
