@@ -109,7 +109,9 @@ def test_where_moving_leaders_go_is_known_for_many_steps(monkeypatch):
     assert counts == [9, 31]
 
 
-def test_compiled_in_the_sizes_that_were_measured():
+def test_compiled_in_the_sizes_that_were_measured(monkeypatch):
+    for module in (blocks, passes):
+        monkeypatch.setattr(module, "CACHE", 2**20)
     experiment = sheet(
         body={"type": "grid", "columns": 301, "rows": 257},
         leaders=[HOLD_LEFT, pull_right(0.3, 0.1, steps=50) | {"until": 45}],
