@@ -12,6 +12,7 @@ from pbdkit.experiment.newton import Newton
 from pbdkit.scene.guides import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.passes import exceeds_cache, single_steps
 from pbdkit.stepping.prescription import last_event
 
 PATIENCE_S = 3.0
@@ -55,7 +56,7 @@ def choose(scene: Scene) -> Choice:
     if threads == "auto":
         threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
-    return Choice("compiled", threads, reason)
+    return Choice("compiled", threads, reason + _about_passes(scene, threads))
 
 
 def seconds_of(scene: Scene, choice: Choice) -> float:
@@ -104,6 +105,13 @@ def what_kernels_lack(scene: Scene) -> str:
         if (now.weights, now.fracture) != (constants.weights, constants.fracture):
             return "numbers change in time that are written into kernels"
     return ""
+
+
+def _about_passes(scene: Scene, threads: int) -> str:
+    """Why each step goes over the memory by itself, where several in a pass would gain."""
+    several = "there are several threads" if threads > 1 else ""
+    why = exceeds_cache(scene) and (several or single_steps(scene))
+    return f"; one step a pass over the memory: {why}" if why else ""
 
 
 def _numpy_seconds(scene: Scene) -> float:

@@ -90,10 +90,10 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
         )
 
 
-def steady_steps(scene: Scene, step: int, most: int) -> int:
+def steady_steps(scene: Scene, step: int, most: int, moving: bool = False) -> int:
     """How many steps from `step` on have the same leaders and obstacles at the same places, the
     same loads and numbers and no cut but those that the first begins with, at most `most`, at least
-    1."""
+    1. Where leaders may be `moving`, they are elsewhere in every step, as is known beforehand."""
     most = min([most, *(cut.at - step for cut in scene.experiment.cuts if cut.at > step)])
     for leading in scene.driven:
         group = leading.group
@@ -101,7 +101,8 @@ def steady_steps(scene: Scene, step: int, most: int) -> int:
         if begins <= step <= ends:
             most = min(most, ends - step + 1)
             rests = group.motion.rests_after()
-            if rests is None or step - begins + 1 < rests:
+            known = moving and not isinstance(group.motion, Newton)
+            if not known and (rests is None or step - begins + 1 < rests):
                 return 1
         elif step < begins:
             most = min(most, begins - step)

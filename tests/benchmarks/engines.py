@@ -52,7 +52,7 @@ def threads() -> list[dict[str, Any]]:
 def limit() -> list[dict[str, Any]]:
     """How near the sweeps come to reading and writing every displacement once."""
     found = []
-    for size, steps in ((100, 200), (1000, 20), (3000, 3)):
+    for size, steps in ((100, 200), (1000, 32), (3000, 32)):
         wait_for_quiet()
         per_step = 1e9 / steps / size**2
         one, two = (Running(moving(size), steps, threads=n) for n in (1, 2))

@@ -188,7 +188,7 @@ class Everywhere:
     def begin(self, *state: Any) -> None:
         self.box, self.growth = self._everything.copy(), np.zeros_like(self._everything)
 
-    def before(self, led: Any, count: int) -> int:
+    def before(self, led: Any, load: Any, count: int) -> int:
         return count
 
     forget = after = begin

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from pbdkit.scene.homes import Home
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass
-from pbdkit.stepping.compiled.emitter import write_frame, write_module
+from pbdkit.stepping.compiled.emitter import write_module
+from pbdkit.stepping.compiled.following import write_frame
 from pbdkit.stepping.compiled.plan import Function, Plan
 from pbdkit.stepping.compiled.slot_loop import write_general
 

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import Slot
+from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.bonds import plane_block
+from pbdkit.scene.frame_points import Frame
 from pbdkit.scene.neighbourhood import BondPlane
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compiled.blocks import frame_order
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.state import Floats, State
 
@@ -43,10 +46,7 @@ def constant_arrays(plan: Plan) -> Arrays:
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
     if frame := scene.frame:
-        counts = np.bincount(frame.map.point, minlength=len(frame.place))
-        arrays |= {"points": frame.place, "bodies": frame.body_place}
-        arrays["entries"] = np.concatenate([[0], np.cumsum(counts)])
-        arrays["mapped"] = frame.map.weight.astype(real)
+        arrays |= _of_frame(frame, frame_order(plan), real)
     return arrays
 
 
@@ -58,6 +58,18 @@ def state_arrays(plan: Plan, u: Floats, v: Floats, state: State) -> Arrays:
         **{f"own{n}": value for n, value in enumerate(state.particle_values)},
         "broken": state.broken_step,
         "lengths": state.broken_length,
+    }
+
+
+def _of_frame(frame: Frame, order: Indices, real: np.dtype[Any]) -> Arrays:
+    """Its points in an order, and after each other their entries."""
+    counts = np.bincount(frame.map.point, minlength=len(frame.place))
+    entry = np.argsort(np.argsort(order)[frame.map.point], kind="stable")
+    return {
+        "points": frame.place[order],
+        "bodies": frame.body_place[entry],
+        "entries": np.concatenate([[0], np.cumsum(counts[order])]),
+        "mapped": frame.map.weight[entry].astype(real),
     }
 
 

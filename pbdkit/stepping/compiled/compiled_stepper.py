@@ -20,6 +20,7 @@ from pbdkit.stepping.compiled.arguments import (
     lost_bits,
     state_arrays,
 )
+from pbdkit.stepping.compiled.blocks import goes_deep, pass_arrays, room_for
 from pbdkit.stepping.compiled.emitter import write_kernel
 from pbdkit.stepping.compiled.leading import leading_arrays
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
@@ -68,6 +69,9 @@ class CompiledStepper(Engine):
         self._plan = plan = Plan(scene, levels, self.threads > 1)
         runs, starts, groups = find_runs(scene, plan.long)
         self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
+        self._deep = goes_deep(plan)
+        """Whether several steps may go in a pass."""
+        self._arrays |= pass_arrays(plan) if self._deep else {}
         if contact and contact.compliance is not None:
             self._arrays["compliance"] = contact.compliance
         start = unmoved_state(scene, (1,) * scene.axes)
@@ -79,10 +83,10 @@ class CompiledStepper(Engine):
         self._arrays |= {f"was{m}": np.zeros(scene.raster.shape, own[m].dtype) for m in plan.kept}
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
-        shared = (*plan.shared, *self._named(start, []))
+        shared = (*plan.shared, *self._named(start, [[]]))
         source, self._names = write_kernel(replace(plan, shared=shared), groups)
         # No step is made, so that what does not compile is known before the first.
-        self._run = load_blamed(levels, source, self._given(start, [], 0))
+        self._run = load_blamed(levels, source, self._given(start, [[]], 0))
 
     def advance(self, state: State, steps: int = 1) -> State:
         """As many steps a call as the leaders stay where they are."""
@@ -112,23 +116,38 @@ class CompiledStepper(Engine):
         load = self._load(state)
         if self._contact:
             self._reach.touch(self._contact.touched_at_rest(step))
-        count = self._reach.before(led, load, steady_steps(self._scene, step, end - state.step))
+        steady = steady_steps(self._scene, step, end - state.step)
+        ways = [led]
+        if steady == 1 and self._deep:
+            ways += self._foreseen(replace(state, starts=starts), led, end)
+        placed = [each for way in ways for each in way]
+        count = self._reach.before(placed, load, max(steady, len(ways)))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
-            self._run(*self._given(state, led, count))
+            self._run(*self._given(state, ways, count))
         u, new = state.u, state.previous
         now, before = (new, u) if count % 2 else (u, new)
         self._reach.after(now, before)
         return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
+
+    def _foreseen(self, state: State, led: Led, end: int) -> list[Led]:
+        """Where the leaders of the coming step are put in those after it, as long as it is the same
+        leaders, nothing else changes and their motions alone decide."""
+        if self._scene.leaders_overlap:  # who contradict each other are named in their own step
+            return []
+        step = state.step + 1
+        known = steady_steps(self._scene, step, end - state.step, moving=True)
+        last = state.step + min(known, room_for(led))
+        return [prescribe(self._scene, state, later)[0] for later in range(step + 1, last + 1)]
 
     def _renumber(self, scene: Scene) -> None:
         if scene is not self._numbered:
             self._arrays |= changing_arrays(self._plan.renumbered(scene))
             self._numbered = scene
 
-    def _named(self, state: State, led: Led) -> Arrays:
+    def _named(self, state: State, ways: list[Led]) -> Arrays:
         """The arrays of a kernel that steps in those of the state, by name."""
-        slants = self._guidance.slants(state.step + 1) if led and self._guidance.slanted else {}
-        leaders = leading_arrays(self._plan, led, slants, state.u.dtype)
+        slants = self._guidance.slants(state.step + 1) if ways[0] and self._guidance.slanted else {}
+        leaders = leading_arrays(self._plan, ways, slants, state.u.dtype, self._deep)
         reached = {"box": self._reach.box, "growth": self._reach.growth, "clamped": self._clamped}
         moved = state_arrays(self._plan, state.u, state.previous, state)
         load = self._load(state)
@@ -141,11 +160,11 @@ class CompiledStepper(Engine):
         loads = self._scene.loads
         return loads.at(state.step + 1, state.u.dtype) if loads else None
 
-    def _given(self, state: State, led: Led, count: int) -> tuple[Any, ...]:
+    def _given(self, state: State, ways: list[Led], count: int) -> tuple[Any, ...]:
         """The arguments of the kernel that makes `count` steps."""
         if self.threads > 1:
             numba.set_num_threads(self.threads)
-        arrays = self._named(state, led)
+        arrays = self._named(state, ways)
         given = tuple(arrays[name] for name in self._names)
         chunks, row = 4 * self.threads, math.prod(self._scene.raster.shape[2:])
         return given, state.step, count, chunks, max(1, BAND * self.threads**2 // row)

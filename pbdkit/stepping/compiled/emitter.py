@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from pbdkit.stepping.compiled.blocks import goes_deep, write_deep_passes, write_part
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
+from pbdkit.stepping.compiled.following import write_frame
 from pbdkit.stepping.compiled.leading import write_guiding, write_leading, write_slants
 from pbdkit.stepping.compiled.obstacle_pass import write_obstacle_pass
 from pbdkit.stepping.compiled.plan import Function, Level, Plan
@@ -31,8 +33,10 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
         passes.append(functions[-1])
     pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
     functions += [pushing] if pushing else []
+    part = write_part(plan, passes[0]) if goes_deep(plan) else None
+    functions += [part] if part else []
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes, pushing)
+    _write_run(run, plan, passes, pushing, part)
     return write_module(plan, functions, run)
 
 
@@ -73,26 +77,27 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
 
 
 def _write_run(
-    out: Function, plan: Plan, passes: Sequence[Function], pushing: Function | None
+    out: Function,
+    plan: Plan,
+    passes: Sequence[Function],
+    pushing: Function | None,
+    part: Function | None,
 ) -> None:
-    out.add(0, "for _ in range(count):", "    step += 1")
+    if part:
+        write_deep_passes(out, plan, part)
+    else:
+        out.add(0, "for made in range(count):")
+    out.add(1, "step += 1")
     for side in "uv":
         out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
     write_leading(out, plan, "led_kept[#, e] = fu_@[led[e]]")
-    write_leading(out, plan, "fu_@[led[e]] = led_values[#, e]")
+    write_leading(out, plan, "fu_@[led[e]] = held[#, e]")
     write_guiding(out, plan)
     out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
     out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
     out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
     if plan.bonds_first:
-        # Band by band, so that what the pass has read and written is still near when it is swept.
-        back, ahead = plan.home_reach
-        out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
-        out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
-        out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
-        write_pass(out, plan, 2, passes[0], "judged", "ready")
-        out.add(2, "judged = ready")
-        write_pass(out, plan, 2, passes[1], "low", "high")
+        _write_bands(out, plan, *passes)
     else:
         for n, sweep in enumerate(passes):
             write_pass(out, plan, 1, sweep, "i0", "i1")
@@ -105,11 +110,23 @@ def _write_run(
     if pushing:
         write_pass(out, plan, 1, pushing, "i0", "i1")
     write_slants(out, plan)
-    write_leading(out, plan, "fv_@[led[e]] = led_values[#, e]", "fu_@[led[e]] = led_kept[#, e]")
+    write_leading(out, plan, "fv_@[led[e]] = held[#, e]", "fu_@[led[e]] = led_kept[#, e]")
     if plan.scene.frame:
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
-    out.add(1, f"{u}, {v} = {v}, {u}")
+    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if part else []))
+
+
+def _write_bands(out: Function, plan: Plan, judging: Function, sweep: Function) -> None:
+    """Band by band, so that what the pass over bonds has read and written is still near when it is
+    swept."""
+    back, ahead = plan.home_reach
+    out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
+    out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
+    out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
+    write_pass(out, plan, 2, judging, "judged", "ready")
+    out.add(2, "judged = ready")
+    write_pass(out, plan, 2, sweep, "low", "high")
 
 
 def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, high: str) -> None:
@@ -120,18 +137,3 @@ def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, h
     out.add(depth, "for c in prange(chunks):")
     span = (f"{low} + ({high} - {low}) * {c} // chunks" for c in ("c", "(c + 1)"))
     out.add(depth + 1, one.call(*span))
-
-
-def write_frame(out: Function, plan: Plan, source: str, target: str) -> None:
-    """Frame points from flat planes of the body."""
-    assert plan.scene.frame
-    out.add(1, "for f in range(points.size):")
-    out.add(2, *plan.each(f"t_@ = {plan.number(0.0)}"))
-    out.add(2, "for e in range(entries[f], entries[f + 1]):")
-    for a, c in enumerate(plan.axes):
-        term = f"mapped[e] * {source}_{c}[bodies[e]]"
-        if plan.scene.frame.map.weight.ndim == 3:
-            terms = plan.each(f"mapped[e, {a}, #] * {source}_@[bodies[e]]")
-            term = f"({' + '.join(terms)})"
-        out.add(3, f"t_{c} = t_{c} + {term}")
-    out.add(2, *plan.each(f"{target}_@[points[f]] = t_@"))

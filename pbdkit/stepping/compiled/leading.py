@@ -5,20 +5,23 @@ Where some are guided, those that lead along an axis are listed for each axis by
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from pbdkit.scene.guides import has_guides
+from pbdkit.stepping.compiled.blocks import band_arrays
 from pbdkit.stepping.compiled.plan import Function, Plan
 from pbdkit.stepping.guidance import Guidance, Slants
 from pbdkit.stepping.prescription import Led
 
 
 def write_leading(out: Function, plan: Plan, *lines: str) -> None:
-    """Loops over the leaders `led`; lines are patterns for each axis."""
+    """Loops over the leaders `led`, put where they are `held`; lines are patterns for each axis."""
     if not has_guides(plan.scene.leading):
+        out.add(1, "held = led_values[min(made, led_values.shape[0] - 1)]")
         out.add(1, "for e in range(led.size):")
         for line in lines:
             out.add(2, *plan.each(line))
@@ -33,7 +36,7 @@ def write_leading(out: Function, plan: Plan, *lines: str) -> None:
 def write_guiding(out: Function, plan: Plan) -> None:
     """Who leads along an axis makes no way along it that could go on."""
     if has_guides(plan.scene.leading):
-        write_leading(out, plan, "fv_@[led[e]] = led_values[#, e]")
+        write_leading(out, plan, "fv_@[led[e]] = held[#, e]")
 
 
 def write_slants(out: Function, plan: Plan) -> None:
@@ -44,20 +47,29 @@ def write_slants(out: Function, plan: Plan) -> None:
         out.add(2, f"fv_{to}[p] = fv_{to}[p] + share_{to}{of}[e] * {way}")
 
 
-def leading_arrays(plan: Plan, led: Led, slants: Slants, real: Any) -> dict[str, Any]:
-    """By name the places of leaders, where they are put, and room for where they stood."""
+def leading_arrays(
+    plan: Plan, ways: Sequence[Led], slants: Slants, real: Any, listed: bool = False
+) -> dict[str, Any]:
+    """By name the places of leaders, where they are put, and room for where they stood. Each step
+    has its entry in `ways`, or one is for all. Where several steps may go in a pass, leaders are
+    `listed` by rows."""
+    led = ways[0]
     if not has_guides(plan.scene.leading):
-        places, values, _ = zip((np.empty(0, np.intp), np.empty((len(plan.axes), 0)), ()), *led,
-                                strict=True)  # fmt: skip
-        u = np.concatenate(values, axis=1).astype(real)
-        return {"led": np.concatenate(places), "led_values": u, "led_kept": np.empty_like(u)}
+        at = np.concatenate([np.empty(0, np.intp), *(each.place for each in led)])
+        empty = np.empty((len(plan.axes), 0))
+        u = np.array([np.concatenate([empty, *(w.u for w in way)], axis=1) for way in ways], real)
+        more: dict[str, Any] = {}
+        if listed:
+            order, more = band_arrays(plan, at)
+            at, u = at[order], np.ascontiguousarray(u[..., order])
+        return {"led": at, "led_values": u, "led_kept": np.empty_like(u[0])} | more
     found: dict[str, Any] = {}
     for a, axis in enumerate(plan.axes):
         some = [each for each in led if a in each.axes]
         at = np.concatenate([np.empty(0, np.intp), *(each.place for each in some)])
         u = np.concatenate([np.empty(0), *(each.u[each.axes.index(a)] for each in some)])
         u = u.astype(real)
-        found |= {f"led_{axis}": at, f"led_values_{axis}": u, f"led_kept_{axis}": np.empty_like(u)}
+        found |= {f"led_{axis}": at, f"held_{axis}": u, f"led_kept_{axis}": np.empty_like(u)}
     for to, of in permutations(range(len(plan.axes)), 2):
         name = plan.axes[to] + plan.axes[of]
         none = np.empty(0, np.intp), np.empty(0, real)
