@@ -1,0 +1,1 @@
+"""Kernels for a GPU, written from the same elementwise functions and in the same words."""

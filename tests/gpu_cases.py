@@ -1,0 +1,134 @@
+"""Scenes for the GPU engine. As a script: steps them in the simulator beside numpy, in a process of
+its own, as numba asks for (NUMBA_ENABLE_CUDASIM=1)."""
+
+import os
+
+import numpy as np
+import test_axes
+import test_courses
+import test_loads
+from property_cases import FRAMES, LATTICES, RULES
+from remembering_parts import Tiring, Weakest
+from test_cohesive_fracture import COHESIVE
+from test_composites import FIELDS, REGIONS
+from test_cuts import PLATE, cut
+from test_directions import CASES, vanes
+from test_engines import (
+    CUT,
+    DAMAGE,
+    ELASTIC,
+    MANY,
+    SCATTERED,
+    TORN,
+    TWICE,
+    assert_bitwise_equal,
+    sheet,
+)
+
+import pbdkit
+from pbdkit.scene.scene import build_scene
+
+SMALL = {"body": {"type": "grid", "columns": 5, "rows": 5}}
+MOVING = {"type": "stepping", "relaxation": 0.7, "memory": 0.2}
+TEARS = {"fracture": TORN | {"thresholds": [1.2]}}
+SHEETS = {
+    "still": {"initial": {"type": "noise", "amplitude": 0.1}},
+    "sublattices, lag, memory": {
+        "lattice": LATTICES["hexagonal"],
+        "rule": RULES["distance-weighted"],
+        "frame": FRAMES["lag"],
+        "solver": MOVING,
+    },
+    "by place": {"lattice": LATTICES["oblique"], "rule": RULES["mixed-coordinate-y"]},
+    "torn": TEARS,
+    "torn, no frame": TEARS | {"frame": {"type": "none"}},
+    "torn, traction-free": TEARS
+    | {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": ELASTIC,
+        "frame": {"type": "traction-free"},
+    },
+    "strength by bond, cut cells": CUT["square"]
+    | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
+    "triangles": CUT["hexagonal"],
+    "damage, numbers of particles": {
+        "rule": Tiring(spread=0.1),
+        "fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False},
+    },
+    "many neighbours, drawn and counted": {
+        "neighbours": MANY,
+        "rule": Tiring(spread=0.1),
+        "fracture": Weakest(spread=0.3, weak=0.7),
+    },
+    "moves of another": TWICE | {"frame": {"type": "mean"}},
+    "single precision": TEARS | {"solver": MOVING | {"precision": "float32"}},
+}
+COMPOSITE = {
+    "name": "composite",
+    "regions": REGIONS,
+    "body": {"type": "rectangle", "width": 6.7, "height": 5.0},
+    "leaders": sheet()["leaders"],
+    "steps": 12,
+    "solver": {"type": "stepping", "relaxation": 0.5},
+}
+COURSES = test_courses.sheet(**test_courses.CHANGING["both"])
+OTHERS = {
+    "composite": COMPOSITE | FIELDS["torn composite"],
+    "parameters by particle": COMPOSITE | FIELDS["K"],
+    "numbers that change": COURSES | SMALL,
+    "loads": test_loads.loaded(test_loads.TIP | {"from": 3}, solver={"type": "stepping"}, steps=20),
+    "cut on the way": PLATE | {"cuts": cut(3)},
+    "seen by neighbours": vanes(**CASES["hole"] | {"leaders": sheet()["leaders"]}),
+}
+
+WHOLE = {"neighbours": {"type": "chebyshev", "shells": 1}}
+SHIPPED = {
+    "barycentre": {"fracture": TORN, "frame": FRAMES["mean"]},
+    "mean-displacement": {"fracture": SCATTERED, "frame": {"type": "mirror"}},
+    "distance-weighted": {"lattice": LATTICES["hexagonal"], "fracture": DAMAGE}
+    | {"frame": FRAMES["lag"]},
+    "mixed-coordinate": {"rule": RULES["mixed-coordinate"]}
+    | {"fracture": TORN, "frame": FRAMES["first"]},
+    "springs": WHOLE | {"fracture": COHESIVE | {"energy": 1e-3}, "frame": {"type": "natural"}},
+    "elastic": WHOLE | {"rule": ELASTIC, "frame": {"type": "traction-free"}},
+    "orthotropic": WHOLE
+    | {"rule": FIELDS["orthotropic"]["rule"] | {"modulus_ratio": 0.5}, "frame": {"type": "none"}},
+    "strain-gradient": TWICE | {"solver": MOVING | {"precision": "float32"}},
+}
+"""Every rule that comes with pbdkit, and between them every fracture model and frame policy."""
+
+
+def shipped(rule):
+    return scene_of(sheet(**SMALL | {"rule": {"type": rule}} | SHIPPED[rule]))
+
+
+def scene_of(given):
+    return build_scene(pbdkit.Experiment(**given))
+
+
+def scenes():
+    """By name; each has something that others have not."""
+    found = {name: scene_of(sheet(**SMALL | parts)) for name, parts in SHEETS.items()}
+    found |= {name: scene_of(given) for name, given in OTHERS.items()}
+    return found | {"in space": test_axes.scene("numpy", 1.2)}
+
+
+def compare():
+    """Each kernel for one block and for several."""
+    from pbdkit.stepping.gpu import program
+    from pbdkit.stepping.gpu.gpu_stepper import GpuStepper
+
+    for name, scene in scenes().items():
+        for alone in (0, 4096) if name in ("torn", "moves of another") else (4096,):
+            program.ALONE = alone
+            with np.errstate(all="ignore"):
+                reference = assert_bitwise_equal(scene, GpuStepper(scene), calls=(1, 2, 4))
+            assert reference.u.any(), name
+            if name.startswith(("torn", "strength", "composite", "cut", "in space")):
+                assert (reference.broken_step > 0).any(), name
+        print(name)
+
+
+if __name__ == "__main__":
+    assert os.environ["NUMBA_ENABLE_CUDASIM"] == "1"
+    compare()
