@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import permutations
+from itertools import pairwise, permutations
 from operator import sub
 from typing import Any
 
@@ -74,12 +74,22 @@ def patches(raster: Raster, tiling: Tiling) -> tuple[Patch, ...]:
     found = []
     for polygon in tiling.polygons:
         block = _within(raster, polygon)
-        for part in block.rows(CELLS_AT_ONCE) if block else ():
+        for part in _bands(raster, block) if block else ():
             corners = tuple(part.seen_through(corner) for corner in polygon.corners)
             inside = [raster.kind[corner.slices()] == FOLLOWER for corner in corners]
             patch = Patch(polygon, corners, np.logical_and.reduce(inside))
             found += [patch] if patch.whole.any() else []
     return tuple(found)
+
+
+def _bands(raster: Raster, block: Block) -> Iterator[Block]:
+    """A block cut at rows that are the same whatever part of the lattice a raster holds: the order
+    of sums at a particle depends on where it is cut."""
+    (first, *start), (last, *stop) = block.start, block.stop
+    step = max(1, CELLS_AT_ONCE // math.prod(raster.shape[2:]))
+    cuts = [row for row in range(first + 1, last) if (raster.first[0] + row) % step == 0]
+    for low, high in pairwise([first, *cuts, last]):
+        yield Block(block.sublattice, (low, *start), (high, *stop))
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import FollowerRule, FrameMap, FramePolicy, FrameSites
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.places import distinct
+from pbdkit.scene.places import bounds, distinct
 from pbdkit.scene.raster import FOLLOWER, FRAME, Raster
 
 Floats = NDArray[np.floating[Any]]
@@ -59,8 +60,10 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     rows = np.flatnonzero(raster.table_kind == FRAME)
     if not len(rows):
         return None
-    inside = raster.site_of(raster.body_rows)
-    low, high = (tuple(end.tolist()) for end in (inside.min(axis=0), inside.max(axis=0)))
+    body = bounds(raster.sites == FOLLOWER)
+    assert body
+    low = tuple(map(add, raster.low, body[0]))
+    high = tuple(n + end - 1 for n, end in zip(raster.low, body[1], strict=True))
     site = raster.site_of(rows).astype(np.int32)
     return RasterFrame(raster.lattice.cell(), site, low, high, rule, raster, rows)
 

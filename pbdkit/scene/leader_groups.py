@@ -15,6 +15,7 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
 from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.force_shares import shares
 from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import LEADER, Raster
 from pbdkit.scene.selecting import Selecting, spacing
@@ -23,13 +24,15 @@ from pbdkit.scene.selecting import Selecting, spacing
 @dataclass(frozen=True)
 class Leading:
     """A leader group with the rows, places and reference positions (particle, axis) of its
-    particles, and the numbers of the axes along which it leads."""
+    particles, the numbers of the axes along which it leads and, where it moves by Newton's law, the
+    `share` of the force in all that falls to each particle."""
 
     group: LeaderGroup
     rows: Indices
     place: Indices
     reference: Floats
     axes: tuple[int, ...]
+    share: Floats | None = None
 
     def offset(self, n: float) -> Floats:
         """Of the motion from rest, (particle or 1, axis along which the group leads)."""
@@ -51,7 +54,8 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
         _refuse_unmeasured(group, at, rows, ("leaders", n, "motion"))
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
         axes = tuple("xy".index(axis) for axis in group.axes or ()) or range(at.shape[1])
-        found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes))))
+        share = shares(at) if isinstance(group.motion, Newton) else None
+        found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes)), share))
     for k, n in _meeting(found, steps):
         if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
             _refuse_contradiction(raster, found, k, n, steps)

@@ -69,6 +69,13 @@ class Neighbourhood:
         ends = enumerate(self.planes)
         return {slot: (n, slot is p.slot) for n, p in ends for slot in (p.slot, p.opposite)}
 
+    @property
+    def home_reach(self) -> tuple[Index, Index]:
+        """How many cells before and after a particle's own, along each axis, its bonds may live."""
+        steps = [slot.cell for slot, (_, here) in self.home.items() if not here]
+        cells = np.array([(0,) * self.cell.axes, *steps])
+        return tuple((-cells.min(axis=0)).tolist()), tuple(cells.max(axis=0).tolist())
+
     def shells(self) -> list[list[float]]:
         """The rest lengths of each shell, the first shell first."""
         found: list[list[float]] = [[] for _ in range(max(slot.shell for slot in self.every))]

@@ -29,7 +29,7 @@ class Raster:
     `shape` is (sublattices, cells, cells), `first` the repeat cell at place (0, 0), `kind` the kind
     at each place with EMPTY where no particle is (leaders count as followers here). `sites` is the
     same by site index (i, j) from `low` on; its particles, i then j, are the rows of the table in
-    the order of their numbers.
+    the order of their numbers, which count from 1 and those `before` the first row.
     """
 
     lattice: Lattice
@@ -38,6 +38,7 @@ class Raster:
     kind: NDArray[np.int8]
     low: Index
     sites: NDArray[np.int8]
+    before: int = 0
 
     @cached_property
     def count(self) -> int:
@@ -64,6 +65,12 @@ class Raster:
     def body_rows(self) -> Indices:
         """The rows of leaders and followers."""
         return np.flatnonzero(self.table_kind == FOLLOWER)
+
+    @property
+    def body_ends(self) -> Indices:
+        """The first and the last of them, without a table of all."""
+        body = self.table_kind == FOLLOWER
+        return np.array([body.argmax(), len(body) - 1 - body[::-1].argmax()])
 
     def chunks(self) -> Iterator[Indices]:
         """All rows, some at a time."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Components, Remembers
+from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
@@ -102,6 +102,11 @@ class Scene:
         return (lower + upper) / 2
 
     @cached_property
+    def setting(self) -> Setting:
+        """What a rule may derive its constants from."""
+        return setting_of(self.raster, self.neighbourhood)
+
+    @cached_property
     def leaders_overlap(self) -> bool:
         """Whether any particle belongs to two leader groups."""
         rows = [leading.rows for leading in self.leading]
@@ -170,11 +175,10 @@ def _build(experiment: Experiment) -> Scene:
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:
     """The scene with the numbers of an experiment that is like its own but for them."""
-    raster, around = scene.raster, scene.neighbourhood
-    setting = setting_of(raster, around)
-    constants = ask_for_constants(experiment, setting)
-    constants = with_fields(constants, experiment, raster, around, setting)
-    cells = weighed(experiment, raster, setting, scene.cells)
+    constants = ask_for_constants(experiment, scene.setting)
+    parts = (experiment, scene.raster, scene.neighbourhood, scene.setting)
+    constants = with_fields(constants, *parts)
+    cells = weighed(experiment, scene.raster, scene.setting, scene.cells)
     return with_inner(replace(scene, experiment=experiment, constants=constants, cells=cells))
 
 
@@ -225,6 +229,6 @@ def with_inner(scene: Scene) -> Scene:
                 (part,),
             )
     experiment = experiment.model_copy(update={"rule": inner})
-    constants = ask_for_constants(experiment, setting_of(scene.raster, scene.neighbourhood))
+    constants = ask_for_constants(experiment, scene.setting)
     below = replace(scene, experiment=experiment, constants=constants, inner=None, loads=None)
     return replace(scene, inner=with_inner(below))

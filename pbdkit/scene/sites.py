@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 from itertools import product
 from operator import add
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Box, Floats, Sites
@@ -68,7 +70,7 @@ def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) 
     cell = lattice.cell()
     inside = np.pad(filling.body, layers)
     low = tuple(n - layers for n in filling.first)
-    window = dilated(inside, layers) & (sublattices_from(cell, low, inside.shape) >= 0)
+    window = dilated(inside, layers) & has_sites(cell, low, inside.shape)
     sites = np.where(window, np.int8(FRAME), np.int8(EMPTY))
     sites[inside] = FOLLOWER
     first = np.floor_divide(low, cell.period) - reach
@@ -83,8 +85,18 @@ def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) 
 
 def sublattices_from(cell: Cell, low: Index, shape: Index) -> Indices:
     """The sublattice of each site of a window of indices, from `low` on; -1 at a hole."""
-    window = zip(low, shape, cell.period, strict=True)
-    return sublattices(cell)[np.ix_(*(np.arange(n, n + size) % p for n, size, p in window))]
+    return _repeated(sublattices(cell), low, shape)
+
+
+def has_sites(cell: Cell, low: Index, shape: Index) -> Mask:
+    """Which indices of such a window are sites, and no holes."""
+    return _repeated(sublattices(cell) >= 0, low, shape)
+
+
+def _repeated(values: NDArray[Any], low: Index, shape: Index) -> NDArray[Any]:
+    """Values of the repeat cell over a window."""
+    window = zip(low, shape, values.shape, strict=True)
+    return values[np.ix_(*(np.arange(n, n + size) % p for n, size, p in window))]
 
 
 def dilated(mask: Mask, layers: int) -> Mask:
@@ -121,7 +133,7 @@ def fill(body: Body, lattice: Lattice) -> Filling:
             ("body",),
         )
     shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-    inside = sublattices_from(cell, low, shape) >= 0
+    inside = has_sites(cell, low, shape)
     lines = max(1, CHUNK_ROWS // inside[0].size)
     for begin in range(0, len(inside), lines):
         part = inside[begin : begin + lines]
@@ -146,7 +158,14 @@ def has_narrow_slot(body: Mask, layers: int) -> bool:
 
 
 def _narrow(body: Mask, wide_enough: int) -> bool:
-    """Looks along the last axis: distance to the nearest particle behind and ahead."""
+    """Looks along the last axis, at some lines at a time and the next one."""
+    lines = max(1, CHUNK_ROWS // body[0].size)
+    parts = (body[begin : begin + lines + 1] for begin in range(0, len(body), lines))
+    return any(_narrow_lines(part, wide_enough) for part in parts)
+
+
+def _narrow_lines(body: Mask, wide_enough: int) -> bool:
+    """By the distance to the nearest particle behind and ahead."""
     place = np.arange(body.shape[-1])
     behind = np.maximum.accumulate(np.where(body, place, -body.size - 1), axis=-1)
     far = np.where(body, place, 2 * body.size + 1)[..., ::-1]

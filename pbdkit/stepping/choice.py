@@ -11,6 +11,7 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.newton import Newton
 from pbdkit.scene.guides import has_guides
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.gpu.limits import what_gpus_lack, what_is_missing
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.passes import exceeds_cache, single_steps
 from pbdkit.stepping.prescription import last_event
@@ -38,13 +39,17 @@ class Choice:
 def choose(scene: Scene) -> Choice:
     """What the experiment asks for, or what serves it best.
 
-    Raises ExperimentError where the compiled engine is asked for and cannot be had.
+    `auto` never takes the GPU: how fast that is has not been measured. Raises ExperimentError where
+    an engine is asked for that cannot be had.
     """
     solver = scene.experiment.stepping
+    if solver.engine == "gpu":
+        lacks = what_is_missing() or what_gpus_lack(scene) or what_kernels_lack(scene)
+        _refuse(scene, lacks and f"the GPU engine cannot be had: {lacks}; take `engine: auto`")
+        return Choice("gpu", 1, "asked for")
     hindrance = obstacle() or what_kernels_lack(scene)
-    if solver.engine == "compiled" and hindrance:
-        refusal = f"the compiled engine cannot be had: {hindrance}"
-        raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
+    if solver.engine == "compiled":
+        _refuse(scene, hindrance and f"the compiled engine cannot be had: {hindrance}")
     if solver.engine == "numpy":
         return Choice("numpy", 1, "asked for")
     seconds = _numpy_seconds(scene)
@@ -56,7 +61,12 @@ def choose(scene: Scene) -> Choice:
     if threads == "auto":
         threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
-    return Choice("compiled", threads, reason + _about_passes(scene, threads))
+    return Choice("compiled", threads, reason + _about_passes(scene))
+
+
+def _refuse(scene: Scene, refusal: str) -> None:
+    if refusal:
+        raise scene.experiment.located(ExperimentError(refusal, ("solver", "engine")))
 
 
 def seconds_of(scene: Scene, choice: Choice) -> float:
@@ -70,6 +80,10 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
     """The engine, and what it came to: where `auto` meets a rule that does not compile, numpy."""
     if choice.engine == "numpy":
         return Stepper(scene), choice
+    if choice.engine == "gpu":
+        from pbdkit.stepping.gpu.gpu_stepper import GpuStepper
+
+        return GpuStepper(scene), choice
     from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
     try:
@@ -107,10 +121,9 @@ def what_kernels_lack(scene: Scene) -> str:
     return ""
 
 
-def _about_passes(scene: Scene, threads: int) -> str:
+def _about_passes(scene: Scene) -> str:
     """Why each step goes over the memory by itself, where several in a pass would gain."""
-    several = "there are several threads" if threads > 1 else ""
-    why = exceeds_cache(scene) and (several or single_steps(scene))
+    why = exceeds_cache(scene) and single_steps(scene)
     return f"; one step a pass over the memory: {why}" if why else ""
 
 

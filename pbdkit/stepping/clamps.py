@@ -8,6 +8,7 @@ import numpy as np
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.directions import rotations_of
+from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Array, State
 
@@ -26,13 +27,15 @@ class Clamps:
         turns in it; returns their flat places."""
         found = [np.zeros(0, np.intp)]
         for leading in self._leading:
-            group, n_th = leading.group, step - leading.group.from_ + 1
-            if group.leads(step):
-                angle = group.motion.turned(n_th) - group.motion.turned(n_th - 1)
+            if leading.group.leads(step):
                 fresh = np.setdiff1d(leading.place, np.concatenate(found))
                 found.append(fresh)
-                self._turn(state, fresh, angle)
+                self._turn(state, fresh, _angle(leading, step))
         return np.concatenate(found)
+
+    def turning(self, step: int) -> bool:
+        """Whether anybody who is clamped in a step turns in it."""
+        return any(_angle(each, step) != 0.0 for each in self._leading if each.group.leads(step))
 
     def directions(self, state: State) -> list[Array]:
         """Flat views of what they prescribe."""
@@ -46,3 +49,9 @@ class Clamps:
         for cosine, sine in zip(flat[::2], flat[1::2], strict=True):
             x, y = cosine[place], sine[place]
             cosine[place], sine[place] = c * x - s * y, s * x + c * y
+
+
+def _angle(leading: Leading, step: int) -> float:
+    """By what a group's motion turns in a step."""
+    motion, n_th = leading.group.motion, step - leading.group.from_ + 1
+    return motion.turned(n_th) - motion.turned(n_th - 1)

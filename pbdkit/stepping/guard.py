@@ -40,26 +40,31 @@ class Guard:
     @classmethod
     def of(cls, scene: Scene, start: State) -> Guard:
         """The guard of a run from that state."""
-        ends = scene.raster.reference(scene.raster.body_rows[[0, -1]])
-        spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
-        size = float(np.abs(ends[1] - ends[0]).max()) + spacing + _most(start)
-        ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
         kept = start.copy() if start.step else None
-        return cls(size + sum(ways), start.step, start.step + EVERY, kept)
+        return cls(size_of(scene) + most_of(start), start.step, start.step + EVERY, kept)
 
     def look(self, scene: Scene, state: State) -> None:
         """Raises FloatingPointError, with particle and step, where a displacement is not finite or
         beyond all bounds."""
         self.next_look = state.step + EVERY
-        most = _most(state)
+        most = self.most(state)
         if most <= self.size:
             self.good_step = state.step
             if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
                 self.kept = state.copy(self.kept)
         if most <= BEYOND * self.size:
             return
-        worst = int(np.argmax(np.abs(scene.raster.table(state.u)).max(axis=1)))  # NaN is largest
-        raise FloatingPointError(f"particle {worst + 1}, found at step {state.step},")
+        worst = self.worst(scene, state)
+        raise FloatingPointError(f"particle {worst}, found at step {state.step},")
+
+    def most(self, state: State) -> float:
+        """The largest displacement along an axis."""
+        return most_of(state)
+
+    def worst(self, scene: Scene, state: State) -> int:
+        """The number of the particle that has it."""
+        table = scene.raster.table(state.u)
+        return scene.raster.before + int(np.argmax(np.abs(table).max(axis=1))) + 1  # NaN is largest
 
     def last_good(
         self, scene: Scene, engine: Engine, before: int, patience: int, stopping: Callable[[], bool]
@@ -72,13 +77,23 @@ class Guard:
         good = state.copy()
         while state.step + 1 < before and not stopping():
             state = engine.advance(state)
-            if not _most(state) <= self.size:
+            if not self.most(state) <= self.size:
                 break
             good = state.copy(good)
         return None if stopping() else good
 
 
-def _most(state: State) -> float:
+def size_of(scene: Scene) -> float:
+    """That of the body and its leaders' ways together."""
+    ends = scene.raster.reference(scene.raster.body_ends)
+    spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
+    ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
+    width = float(np.abs(ends[1] - ends[0]).max())
+    return width + float(spacing) + sum(ways)
+
+
+def most_of(state: State) -> float:
+    """The largest displacement along an axis."""
     return max(float(state.u.max()), -float(state.u.min()))
 
 

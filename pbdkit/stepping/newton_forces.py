@@ -7,7 +7,6 @@ import numpy as np
 
 from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.force_shares import shares
 from pbdkit.scene.places import Places
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator
@@ -28,14 +27,15 @@ class NewtonForces:
         some = {n: each for n, each in groups if isinstance(each.group.motion, Newton)}
         self.numbers = tuple(some)
         """Of the groups that move so."""
-        self._share = {n: shares(each.reference) for n, each in some.items()}
         self._parts = {n: _parts(scene, each.place) for n, each in some.items()}
         # A rule that works on the moves of another is asked everywhere.
         self._whole = SlotFollowers(scene) if some and scene.inner else None
 
     def share(self, n: int) -> Floats:
         """(particle,): of the force in all."""
-        return self._share[n]
+        share = self._scene.leading[n].share
+        assert share is not None
+        return share
 
     def on(self, n: int, state: State) -> Floats:
         """(particle, axis), over Young's modulus and thickness."""

@@ -32,6 +32,11 @@ class Engine(ABC):
         """The state so many steps on. It takes over the arrays of `state`, which is void
         afterwards."""
 
+    def renewed(self, state: State, rows: slice) -> None:
+        """Takes note that somebody has written these rows of cells of the state that it gave out
+        last; an engine that keeps nothing beside the state has nothing to do."""
+        return
+
 
 class Stepper(Engine):
     """The numpy engine: the oracle of every faster one. It holds what is constant and no state."""

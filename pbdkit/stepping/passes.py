@@ -11,15 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import RenewsBonds
-from pbdkit.interfaces.rule import shares_particles
-from pbdkit.scene.guides import has_guides
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.clamps import Clamps
 
 CACHE = 2**24
 """Bytes of displacements up to which a pass a step is as fast (measured)."""
@@ -42,47 +40,59 @@ def exceeds_cache(scene: Scene) -> bool:
 
 def single_steps(scene: Scene) -> str:
     """Why every step is a pass of its own; empty where several can go together."""
-    experiment = scene.experiment
-    if experiment.neighbours.nearness():
+    if scene.experiment.neighbours.nearness():
         return "neighbours are found anew"
-    if scene.inner:
-        return "the rule moves by another's moves"
-    if shares_particles(experiment.rule):
-        return "neighbours see what is remembered of each other"
-    if Clamps(scene).numbers:
-        return "leaders are clamped"
-    if has_guides(scene.leading):
-        return "leaders lead along an axis"
-    if scene.barriers:
-        return "obstacles push"
+    if scene.inner and scene.inner.inner:
+        return "the rule moves by the moves of one that moves by another's"
     if max(map(len, scene.neighbourhood.slots)) > MOST_SLOTS:
         return "there are many neighbours"
-    if scene.has_fracture and isinstance(experiment.fracture, RenewsBonds):
-        return "bonds remember"
-    if scene.frame and scene.frame.map.lag:
-        return "the frame lags"
     if max(Skew(scene).along) > FARTHEST:
         return "frame points follow particles far away"
     return ""
 
 
+class AxisSkew(NamedTuple):
+    """What decides along an axis how far steps are apart, in cells: how far neighbours are; how far
+    before and after a particle bonds are judged, or moves of the inner rule made, before it moves,
+    and how far `below` and `above` themselves those see; and how far frame points lie from those
+    whom they follow."""
+
+    reach: int
+    back: int
+    ahead: int
+    below: int
+    above: int
+    apart: int
+
+    @property
+    def step(self) -> int:
+        """How far each step is behind the one before."""
+        sees = max(self.reach, self.above + self.ahead, self.below + self.back)
+        return max(sees + self.apart, self.back + self.ahead)
+
+    @property
+    def sight(self) -> int:
+        """How far a step sees beyond where it has judged bonds, or made moves of the inner rule."""
+        return max(self.reach - self.ahead, self.above)
+
+
 @dataclass(frozen=True)
 class Skew:
-    """How far, in cells along the first axis and the last, the steps of a pass are apart."""
+    """How far the steps of a pass are apart, along the first axis and the last."""
 
     scene: Scene
 
-    @property
-    def reach(self) -> tuple[int, int]:
-        """How far neighbours are."""
-        reach = self.scene.neighbourhood.reach_in_cells
-        return int(reach[0]), int(reach[-1])
-
     @cached_property
+    def axes(self) -> tuple[AxisSkew, AxisSkew]:
+        """Along the first axis and the last."""
+        rows, columns = self._apart
+        return self._along(0, rows), self._along(-1, columns)
+
+    @property
     def along(self) -> tuple[int, int]:
-        """What neighbours reach and frame points lie apart from those whom they follow."""
-        (rows, columns), (up, across) = self.reach, self._apart
-        return rows + up, columns + across
+        """How far each step is behind the one before."""
+        rows, columns = self.axes
+        return rows.step, columns.step
 
     @cached_property
     def ready(self) -> NDArray[np.intp]:
@@ -90,14 +100,30 @@ class Skew:
         point follows."""
         return np.maximum.reduceat(self._body, self._first, axis=1)
 
+    @cached_property
+    def begun(self) -> NDArray[np.intp]:
+        """(2, frame point): the row and column at which the first of those has moved."""
+        return np.minimum.reduceat(self._body, self._first, axis=1)
+
+    def _along(self, axis: int, apart: int) -> AxisSkew:
+        around, fracture = self.scene.neighbourhood, self.scene.experiment.fracture
+        reach = around.reach_in_cells[axis]
+        if self.scene.inner:  # and its frame points follow
+            far = reach + apart
+            return AxisSkew(reach, far, far, reach, reach, apart)
+        if self.scene.has_fracture and isinstance(fracture, RenewsBonds):
+            back, ahead = (home[axis] for home in around.home_reach)
+            return AxisSkew(reach, back, ahead, ahead, back, apart)
+        return AxisSkew(reach, 0, 0, 0, 0, apart)
+
     @property
     def _apart(self) -> tuple[int, int]:
         frame = self.scene.frame
         if frame is None:
             return 0, 0
         point = self._cells(frame.place)
-        low = np.minimum(np.minimum.reduceat(self._body, self._first, axis=1), point)
-        up, across = (np.maximum(self.ready, point) - low).max(axis=1).tolist()
+        low, high = np.minimum(self.begun, point), np.maximum(self.ready, point)
+        up, across = (high - low).max(axis=1).tolist()
         return up, across
 
     @property

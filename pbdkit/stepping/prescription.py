@@ -82,10 +82,11 @@ def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:
     clashes = np.flatnonzero((np.diff(components[order]) == 0) & apart)
     if len(clashes):
         place = components[order[clashes]].min(keepdims=True) % size
-        number = int(scene.raster.rows_at(*np.unravel_index(place, scene.raster.shape))[0]) + 1
+        raster = scene.raster
+        row = int(raster.rows_at(*np.unravel_index(place, raster.shape))[0])
         raise ExperimentError(
-            f"two groups move particle {number} differently in step {step}; select it in one of "
-            "them only, or let one end before the other begins",
+            f"two groups move particle {raster.before + row + 1} differently in step {step}; "
+            "select it in one of them only, or let one end before the other begins",
             ("leaders",),
         )
 

@@ -64,16 +64,16 @@ class State:
         nobody needs any more: memory that is new costs several times as much as what is copied."""
         if over is None:
             return deepcopy(self)
-        for mine, others in zip(self._arrays(), over._arrays(), strict=True):
+        for mine, others in zip(self.arrays(), over.arrays(), strict=True):
             np.copyto(others, mine)
         return replace(over, step=self.step, starts=self.starts)
 
     def fits(self, other: State) -> bool:
         """Whether both can be of one scene, by the kinds and shapes of their arrays."""
-        layouts = [[(a.dtype, a.shape) for a in state._arrays()] for state in (self, other)]
+        layouts = [[(a.dtype, a.shape) for a in state.arrays()] for state in (self, other)]
         return layouts[0] == layouts[1] and len(self.starts) == len(other.starts)
 
-    def _arrays(self) -> list[Array]:
+    def arrays(self) -> list[Array]:
         """What steps are written into."""
         bonds = (self.broken_step, self.broken_length, *self.bond_values)
         carried = (self.u, self.previous, *bonds, *self.particle_values)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numba
 import numpy as np
-from pairing import best
 
 
 @numba.njit(error_model="numpy")
@@ -33,13 +34,18 @@ def sweeping(size: int, steps: int):
     return work
 
 
-def copy_ns(size: int) -> float:
-    """ns to read 16 bytes and write 16, as every particle and step must, by plain copying."""
-    u, v = np.random.default_rng(0).random((2, 2, size, size))
-    times = max(2, 10**7 // size**2)
+class Copying:
+    """A call reads 16 bytes and writes 16 for each of size² particles, so many times, as every step
+    must, by plain copying on one thread or two."""
 
-    def copying():
-        for n in range(times):
-            np.copyto(*((u, v) if n % 2 else (v, u)))
+    def __init__(self, size: int, times: int, threads: int = 1):
+        self.planes = np.random.default_rng(0).random((2, 2, size, size))
+        self.times, self.pool = times, ThreadPoolExecutor(2) if threads == 2 else None
 
-    return best(copying, 9) / times / size**2 * 1e9
+    def __call__(self) -> None:
+        for n in range(self.times):
+            to, of = self.planes if n % 2 else self.planes[::-1]
+            if self.pool:  # numpy copies without holding the interpreter
+                list(self.pool.map(np.copyto, to, of))
+            else:
+                np.copyto(to, of)

@@ -82,6 +82,30 @@ COMPOSITE = {
 SCATTERED = {"fracture": {"type": "strain", "failure": 2.0, "scatter": 0.1}}
 DAMAGE = {"fracture": {"type": "damage", "onset": 0.5, "failure": 2.0}}
 FRACTURE = {"fracture": {"type": "threshold", "thresholds": [3.0]}}
+SWUNG = {"solver": {"type": "stepping", "relaxation": 0.6, "memory": 0.2}}
+RULES = {
+    "barycentre": {},
+    "mean-displacement": {"rule": {"type": "mean-displacement"}},
+    "distance-weighted": DISTANCE,
+    "mixed-coordinate": {"rule": {"type": "mixed-coordinate", "K": -0.004}},
+    "springs": CELLS | {"rule": {"type": "springs"}},
+    "elastic": CELLS,
+    "orthotropic": CELLS
+    | {
+        "rule": {
+            "type": "orthotropic",
+            "poisson_ratio": 0.3,
+            "modulus_ratio": 2.0,
+            "shear_ratio": 0.4,
+        }
+    },
+    "strain-gradient": CELLS
+    | {
+        "rule": {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 0.5},
+        "solver": {"type": "stepping", "relaxation": 0.05},
+    },
+}
+"""Every shipped rule."""
 OWN = {"rule": {"type": "own-barycentre"}}
 
 

@@ -15,13 +15,14 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.bonds import plane_block
 from pbdkit.scene.frame_points import Frame
 from pbdkit.scene.neighbourhood import BondPlane
-from pbdkit.scene.places import slot_step
+from pbdkit.scene.places import Block, slot_step
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.blocks import frame_order
+from pbdkit.stepping.compiled.bands import frame_order
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.state import Floats, State
 
 Arrays = dict[str, Any]
+Bits = NDArray[np.unsignedinteger[Any]]
 
 
 def constant_arrays(plan: Plan) -> Arrays:
@@ -145,15 +146,26 @@ def bits_for(scene: Scene) -> np.dtype[Any]:
     return np.min_scalar_type(2 ** max(map(len, scene.neighbourhood.slots)) - 1)
 
 
-def lost_bits(scene: Scene, state: State) -> NDArray[np.unsignedinteger[Any]]:
+def lost_bits(scene: Scene, state: State) -> Bits:
     """Bit k of a particle: the bond along its slot k is broken; both ends know."""
-    assert state.broken_step is not None
     lost = np.zeros(scene.raster.shape, bits_for(scene))
-    for n, plane in enumerate(scene.neighbourhood.planes):
-        if block := plane_block(scene.raster, plane):
-            broken = (block.within(state.broken_step[n]) >= 0).astype(lost.dtype)
-            ends = (plane.slot, block), (plane.opposite, block.seen_through(plane.slot))
-            for slot, seen in ends:
-                bit = scene.neighbourhood.slots[slot.source].index(slot)
-                seen.of(lost)[...] |= broken << lost.dtype.type(bit)
+    renew_lost_bits(lost, scene, state, slice(0, lost.shape[1]))
     return lost
+
+
+def renew_lost_bits(lost: Bits, scene: Scene, state: State, rows: slice) -> None:
+    """Writes those of some rows of cells."""
+    assert state.broken_step is not None
+    around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
+    margin, *beside = around.reach_in_cells  # beyond it nobody is
+    first, last = max(rows.start, margin), min(rows.stop, height - margin)
+    stop = tuple(size - n for size, n in zip(across, beside, strict=True))
+    for s, slots in enumerate(around.slots):
+        block = Block(s, (first, *beside), (max(first, last), *stop))
+        found = np.zeros_like(block.of(lost))
+        for bit, slot in enumerate(slots):
+            plane, at_this_end = around.home[slot]
+            home = block if at_this_end else block.seen_through(slot)
+            broken = home.within(state.broken_step[plane]) >= 0
+            found |= broken.astype(lost.dtype) << lost.dtype.type(bit)
+        block.of(lost)[...] = found

@@ -1,136 +1,103 @@
-"""Several steps in one pass over the memory: writes it, and the arrays that it is given.
+"""Writes the loops of several steps in one pass over the memory.
 
 The lattice is cut along its last axis into tiles that stay in the cache, and each tile along its
 first into bands. Band after band every step of a pass moves a part of the tile, each as far behind
 the one before as `Skew` says, along both axes; then comes the next tile.
+
+On several threads the rows are cut into pieces that go side by side. Where they meet each step of a
+piece leaves out as many rows more than the one before as it must not see; these gaps, which grow as
+the pieces shrink, come after them, side by side again.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from pbdkit.stepping.compiled.following import write_point
+from pbdkit.stepping.compiled.following import write_lag
+from pbdkit.stepping.compiled.leading import held, leading_lines
+from pbdkit.stepping.compiled.part import write_part
 from pbdkit.stepping.compiled.plan import Function, Plan
-from pbdkit.stepping.passes import CACHE, Skew, cell_bytes, exceeds_cache, single_steps
-from pbdkit.stepping.prescription import Led
-
-DEEP, BAND, ROW = 16, 8, 96 * 2**10
-"""Steps of a pass, rows of a band, bytes of a row of a tile (measured: longer rows gain more than
-fewer bytes)."""
-SHORTEST = 256
-"""Columns of a tile at least."""
-AHEAD, ENTRIES = 64, 2**20
-"""Steps for which the places of leaders are known beforehand, and their numbers altogether."""
+from pbdkit.stepping.passes import Skew
 
 
-def goes_deep(plan: Plan) -> bool:
-    """Whether several steps of a scene go together in a pass."""
-    return not plan.parallel and not single_steps(plan.scene)
+def write_piece(plan: Plan, passes: Sequence[Function], pushing: Function | None) -> list[Function]:
+    """The functions for the steps of a pass in a piece, its own last: rows from `begin` to `end`,
+    of which either end goes further `down` or `up` in every step."""
+    part = write_part(plan, passes, pushing)
+    out = Function(plan.shared, "move_piece", "piece", "made", "deep", "extent", "boxes")
+    rows, columns = Skew(plan.scene).axes
+    margin = rows.back + rows.ahead + rows.apart
+    out.add(0, "begin, end, down, up = piece", "i_low, i_high, j_low, j_high = extent")
+    out.add(0, f"height = end - begin + (deep - 1) * (up + {rows.step}) + {margin}")
+    out.add(0, f"width = j_high - j_low + (deep - 1) * {columns.step} + {columns.ahead}")
+    out.add(0, "bands = (height + sizes[1] - 1) // sizes[1]")
+    out.add(0, "tiles = (width + sizes[2] - 1) // sizes[2]")
+    out.add(0, "for tile in range(tiles):", "    for band_ in range(bands):")
+    out.add(2, "for s in range(deep):")
+    forth = part.call(*part.own)
+    out.add(3, "if s % 2 == 0:", "    " + forth, "else:", "    " + _exchanged(plan, forth))
+    return [part, out]
 
 
-def pass_arrays(plan: Plan) -> dict[str, Any]:
-    """What does not change from step to step: the sizes of a pass, 1 step where all stays in the
-    cache anyway; and the column and the first of each row of frame points, which are sorted."""
-    scene = plan.scene
-    deep = DEEP if exceeds_cache(scene) else 1
-    between = math.prod(scene.raster.shape[2:-1])
-    tile = max(SHORTEST, ROW // (cell_bytes(scene) * between))
-    arrays: dict[str, Any] = {"sizes": np.array([deep, BAND, tile, CACHE // cell_bytes(scene)])}
-    if scene.frame:
-        row, column = Skew(scene).ready[:, frame_order(plan)]
-        arrays |= {"frame_rows": _firsts(plan, row), "frame_columns": column}
-    return arrays
+def _exchanged(plan: Plan, call: str) -> str:
+    """A call in which what is there before a step and after it change places."""
+    pairs = [*zip(plan.each("u_@"), plan.each("v_@"), strict=True)]
+    pairs += [(f"own{m}", f"was{m}") for m in plan.kept if plan.shares]
+    other = dict(pairs) | {after: before for before, after in pairs}
+    return re.sub(rf"\b({'|'.join(other)})\b", lambda found: other[found[0]], call)
 
 
-def frame_order(plan: Plan) -> NDArray[np.intp]:
-    """Frame points by the row and column at which they can follow."""
-    return np.lexsort(Skew(plan.scene).ready[::-1])
-
-
-def band_arrays(plan: Plan, led: NDArray[np.intp]) -> tuple[NDArray[np.intp], dict[str, Any]]:
-    """The order of leaders by row and column, and in that order the first of each row and their
-    columns."""
-    found = np.unravel_index(led, plan.scene.raster.shape)
-    order = np.lexsort((found[-1], found[1]))
-    return order, {"led_rows": _firsts(plan, found[1][order]), "led_columns": found[-1][order]}
-
-
-def _firsts(plan: Plan, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    return np.searchsorted(rows, np.arange(plan.scene.raster.shape[1] + 1))
-
-
-def room_for(leaders: Led) -> int:
-    """For how many steps the places of so many leaders are known beforehand."""
-    return max(1, min(AHEAD, ENTRIES // max(1, sum(each.u.size for each in leaders))))
-
-
-def write_part(plan: Plan, sweep: Function) -> Function:
-    """The function by which step s of a pass moves its part of a tile: leaders are placed as far as
-    its sweep will see, it sweeps, places leaders where it has swept, and frame points follow."""
-    out = Function(plan.shared, "move_part", "s", "made", "band_", "tile", "extent", "boxes")
-    skew = Skew(plan.scene)
-    (up, across), (rows, columns) = skew.along, skew.reach
-    first = 2 * plan.scene.axes - 2
-    out.add(0, "i_low, i_high, j_low, j_high = extent", "step = step + s + 1")
-    out.add(0, f"high = i_low + (band_ + 1) * sizes[1] - s * {up}")
-    out.add(0, f"right = j_low + (tile + 1) * sizes[2] - s * {across}")
-    out.add(0, "low, left = high - sizes[1], right - sizes[2]")
-    out.add(0, "held = led_values[min(made + s, led_values.shape[0] - 1)]")
-    out.add(0, f"i0, i1 = i_low if band_ == 0 else low + {rows}, high + {rows}")
-    out.add(0, f"j0, j1 = j_low if tile == 0 else left + {columns}, right + {columns}")
-    _write_listed(out, "led")
-    out.add(2, *plan.each("flat_u_@[led[e]] = held[#, e]"))
-    out.add(0, "box = boxes[s].copy()", f"box[{first}] = max(box[{first}], left)")
-    out.add(0, f"box[{first + 1}] = min(box[{first + 1}], right)")
-    out.add(0, "i0, i1 = max(0, low, box[0]), min(starts.shape[1] - 1, high, box[1])")
-    out.add(0, f"if i0 < i1 and box[{first}] < box[{first + 1}]:", "    " + sweep.call("i0", "i1"))
-    out.add(0, "i0, i1, j0, j1 = low, high, left, right")
-    _write_listed(out, "led")
-    out.add(2, *plan.each("flat_v_@[led[e]] = held[#, e]"))
-    if plan.scene.frame:
-        _write_listed(out, "frame", "f")
-        write_point(out, plan, "flat_v", "flat_v")
-    return out
-
-
-def _write_listed(out: Function, name: str, e: str = "e") -> None:
-    """A loop over those of a list in the rows from i0 to i1, and columns from j0 to j1."""
-    out.add(0, f"first_one = {name}_rows[min(max(i0, i_low), i_high)]")
-    out.add(0, f"for {e} in range(first_one, {name}_rows[max(min(i1, i_high), i_low)]):")
-    out.add(1, f"if j0 <= {name}_columns[{e}] < j1:")
-
-
-def write_deep_passes(out: Function, plan: Plan, part: Function) -> None:
+def write_deep_passes(out: Function, plan: Plan, piece: Function) -> None:
     """The beginning of a loop over steps: many in a pass, as long as there are several to make and
     what has been reached is more than stays in the cache."""
     out.add(0, "boxes, made = np.empty((sizes[0], box.size), np.int64), 0")
     out.add(0, "while made < count:", "    area = 1", "    for e in range(0, box.size, 2):")
     out.add(2, "area *= min(box[e + 1], kind.shape[e // 2 + 1]) - max(box[e], 0)")
-    out.add(1, "deep = min(sizes[0], count - made)", "if deep > 1 and area > sizes[3]:")
+    out.add(1, "deep = min(sizes[0], count - made)")
+    if plan.parallel:  # pieces meet only where there is room for their gaps
+        out.add(1, "height = min(box[1], kind.shape[1]) - max(box[0], 0)")
+        out.add(1, f"deep = min(deep, height // ({2 * Skew(plan.scene).along[0]} * sizes[4]) - 1)")
+    out.add(1, "if deep > 1 and area > sizes[3]:")
     out.depth += 2
     _write_extent(out, plan)
-    out.add(0, "for tile in range(tiles):", "    for band_ in range(bands):")
-    out.add(2, "for s in range(deep):")
-    forth = part.call(*part.own)
-    back = re.sub(r"\b[uv]_", lambda found: {"u_": "v_", "v_": "u_"}[found[0]], forth)
-    out.add(3, "if s % 2 == 0:", "    " + forth, "else:", "    " + back)
+    out.add(0, *(f"was{m}[:] = own{m}" for m in plan.kept))
+    if plan.scene.frame and plan.scene.frame.map.lag:
+        out.add(0, *plan.each("fu_@ = u_@.reshape(-1)"), "for f in range(points.size):")
+        out.depth -= 1
+        write_lag(out, plan, "fu")
+        out.depth += 1
+    _write_pieces(out, plan, piece)
+    if plan.shares:
+        out.add(0, "if deep % 2 == 0:", *(f"    own{m}[:] = was{m}" for m in plan.kept))
     u, v = (", ".join(plan.each(f"{side}_@")) for side in "uv")
     out.add(0, "if deep % 2:", f"    {u}, {v} = {v}, {u}", "made += deep", "step += deep")
     # Leaders of the step before the last stand where the last has placed them.
     out.add(0, *plan.each("fv_@ = v_@.reshape(-1)"))
-    out.add(0, "held = led_values[min(made - 2, led_values.shape[0] - 1)]")
-    out.add(0, "for e in range(led.size):", *plan.each("    fv_@[led[e]] = held[#, e]"))
+    for end, axes in plan.leads.items():
+        out.add(0, held(end, "made - 2"), f"for e in range(led{end}.size):")
+        out.add(1, *leading_lines(plan, end, axes, "fv_@[led[e]] = held[#, e]"))
     out.add(0, "continue")
     out.depth -= 2
 
 
+def _write_pieces(out: Function, plan: Plan, piece: Function) -> None:
+    """All at once, or the pieces of the threads, and then the gaps between them."""
+    more = ("made", "deep", "extent", "boxes")
+    if not plan.parallel:
+        out.add(0, piece.call("(i_low, i_high, 0, 0)", *more))
+        return
+    skew = Skew(plan.scene).along[0]
+    cut, after = (f"i_low + (i_high - i_low) * {n} // sizes[4]" for n in ("n", "(n + 1)"))
+    up = f"-{skew} if n + 1 < sizes[4] else 0"
+    out.add(0, "for c in prange(sizes[4]):", "    n = int64(c)")
+    out.add(1, piece.call(f"({cut}, {after}, {skew} if n > 0 else 0, {up})", *more))
+    out.add(0, "for c in prange(sizes[4] - 1):", "    n = int64(c)")
+    out.add(1, piece.call(f"({after}, {after}, -{skew}, {skew})", *more))
+
+
 def _write_extent(out: Function, plan: Plan) -> None:
-    """What each step of a pass has reached, and how many bands and tiles the last one makes it."""
+    """What each step of a pass has reached, and how far leaders and frame points can be from it."""
     up, across = Skew(plan.scene).along
     first = 2 * plan.scene.axes - 2
     out.add(0, "for s in range(deep):", "    for e in range(box.size):")
@@ -139,5 +106,3 @@ def _write_extent(out: Function, plan: Plan) -> None:
         out.add(0, f"{name}_low = max(0, box[{at}] - {skew})")
         out.add(0, f"{name}_high = min(kind.shape[{axis}], box[{at + 1}] + {skew})")
     out.add(0, "extent = i_low, i_high, j_low, j_high")
-    out.add(0, f"bands = (i_high - i_low + (deep - 1) * {up} + sizes[1] - 1) // sizes[1]")
-    out.add(0, f"tiles = (j_high - j_low + (deep - 1) * {across} + sizes[2] - 1) // sizes[2]")

@@ -3,6 +3,8 @@ sweeps, and what notes those that a sweep has broken."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from pbdkit.interfaces import RenewsBonds
 from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
@@ -11,8 +13,9 @@ from pbdkit.stepping.compiled.plan import Function, Plan, values
 
 
 def write_bond_pass(plan: Plan) -> Function:
-    """The function that renews the bonds of some rows, and breaks them."""
-    out = Function(plan.shared, "judge_bonds", "first_row", "last_row")
+    """The function that renews the bonds of some rows and columns, and breaks them."""
+    rows, columns = ("first_row", "last_row"), ("first_column", "last_column")
+    out = Function(plan.shared, "judge_bonds", *rows, *columns)
     axes = range(len(plan.axes))
     low, high = ([f"end_blocks[n, {2 * a + b}]" for a in axes] for b in (0, 1))
     out.add(0, parameters(plan, plan.levels[-1])[-1], "for n in range(len(ends)):")
@@ -22,7 +25,8 @@ def write_bond_pass(plan: Plan) -> Function:
         out.add(depth, f"for {name} in range({low[depth - 1]}, {high[depth - 1]}):")
     out.depth = len(plan.axes)
     step = [f"ends[n, {a + 2}]" for a in axes]
-    out.add(0, f"j0, j1 = {low[-1]}, {high[-1]}")
+    out.add(0, f"j0, j1 = max({low[-1]}, first_column), min({high[-1]}, last_column)")
+    out.add(0, "if j0 >= j1:", "    continue")
     out.add(0, *plan.each(f"h@ = {plan.row('u_@', 'ends[n, 0]')}"))
     out.add(0, *plan.each(f"n@ = {plan.row('u_@', 'ends[n, 1]', step)}"))
     out.add(0, f"one = {plan.row('kind', 'ends[n, 0]')}")
@@ -34,20 +38,25 @@ def write_bond_pass(plan: Plan) -> Function:
     return out
 
 
-def _write_judging(out: Function, plan: Plan) -> None:
-    """One row of bonds."""
-    model, numbers = plan.model, plan.levels[-1].seen.bond
+class Judging(NamedTuple):
+    """What is done with the bond j of plane n: the lines that look at it, whether it breaks and
+    whether what it remembers differs then, and the lines that write both."""
+
+    look: list[str]
+    breaks: str
+    differ: str
+    write: list[str]
+
+
+def judging(plan: Plan, d: str) -> Judging:
+    """For a bond whose d has this pattern."""
+    numbers = plan.levels[-1].seen.bond
     homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
     c = values(numbers, homes)
-    can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
-    if model.breaks_frame_bonds():
-        can = (
-            f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
-            f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
-        )
-    look = [f"d = {plan.vector('n@[j] - h@[j]')}"]
+    look = [f"d = {plan.vector(d)}"]
     kept = [number.changes for number in numbers if number.home is Home.BOND]
-    changing = [m for m, changes in enumerate(kept) if changes and isinstance(model, RenewsBonds)]
+    renews = isinstance(plan.model, RenewsBonds)
+    changing = [m for m, changes in enumerate(kept) if changes and renews]
     if changing:
         look.append(f"new = update(d, r, Constants({c}), q)")
     for position, m in enumerate(changing):
@@ -55,14 +64,26 @@ def _write_judging(out: Function, plan: Plan) -> None:
         c = c.replace(f"b{m}[j]", f"new{m}")
     breaks = f"breaks(d, r, Constants({c}), q)"
     differ = "".join(f" | (new{m} != b{m}[j])" for m in changing)
+    renewed = [f"b{m}[j] = new{m}" for m in changing]
+    broken = [f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)"]
+    return Judging(look, breaks, differ, [*look, *renewed, *broken])
+
+
+def _write_judging(out: Function, plan: Plan) -> None:
+    """One row of bonds."""
+    can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
+    if plan.model.breaks_frame_bonds():
+        can = (
+            f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
+            f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
+        )
+    own = judging(plan, "n@[j] - h@[j]")
     # One loop that looks, and vectorises; another one writes, where there is anything to write.
     out.add(0, "some = 0", "for j in range(j1 - j0):")
-    out.add(1, *look, f"fresh = (since[j] < 0) & {can} & ({breaks}{differ})")
+    out.add(1, *own.look, f"fresh = (since[j] < 0) & {can} & ({own.breaks}{own.differ})")
     out.add(1, "some = some | (1 if fresh else 0)")
     out.add(0, "if some:", "    for j in range(j1 - j0):")
-    out.add(2, f"if (since[j] < 0) & {can}:")
-    out.add(3, *look, *(f"b{m}[j] = new{m}" for m in changing))
-    out.add(3, f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)")
+    out.add(2, f"if (since[j] < 0) & {can}:", *("    " + line for line in own.write))
 
 
 def write_events(plan: Plan) -> Function:

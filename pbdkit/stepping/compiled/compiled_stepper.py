@@ -18,11 +18,12 @@ from pbdkit.stepping.compiled.arguments import (
     changing_arrays,
     constant_arrays,
     lost_bits,
+    renew_lost_bits,
     state_arrays,
 )
-from pbdkit.stepping.compiled.blocks import goes_deep, pass_arrays, room_for
+from pbdkit.stepping.compiled.bands import banded, goes_deep, pass_arrays
 from pbdkit.stepping.compiled.emitter import write_kernel
-from pbdkit.stepping.compiled.leading import leading_arrays
+from pbdkit.stepping.compiled.leading import foreseen, leading_arrays
 from pbdkit.stepping.compiled.levels import levels_of, load_blamed
 from pbdkit.stepping.compiled.obstacle_pass import wall_arrays
 from pbdkit.stepping.compiled.pair_loop import PairFollowers
@@ -71,7 +72,7 @@ class CompiledStepper(Engine):
         self._arrays = constant_arrays(plan) | {"runs": runs, "starts": starts}
         self._deep = goes_deep(plan)
         """Whether several steps may go in a pass."""
-        self._arrays |= pass_arrays(plan) if self._deep else {}
+        self._arrays |= pass_arrays(plan, self.threads) if self._deep else {}
         if contact and contact.compliance is not None:
             self._arrays["compliance"] = contact.compliance
         start = unmoved_state(scene, (1,) * scene.axes)
@@ -100,6 +101,13 @@ class CompiledStepper(Engine):
         self._last = state
         return state
 
+    def renewed(self, state: State, rows: slice) -> None:
+        """Lost bonds are bits here, and what has moved is in a box."""
+        if self._pairs is None and state is self._last:
+            if self._plan.judged:
+                renew_lost_bits(self._arrays["lost"], self._scene, state, rows)
+            self._reach.take_in(state, rows)
+
     def _begin(self, state: State) -> None:
         self._moves[...] = 0.0
         if self._plan.judged:
@@ -114,13 +122,15 @@ class CompiledStepper(Engine):
         led, starts = prescribe(self._scene, state, step, self._newton)
         self._clamped = self._clamps.turn(state, step)
         load = self._load(state)
-        if self._contact:
-            self._reach.touch(self._contact.touched_at_rest(step))
         steady = steady_steps(self._scene, step, end - state.step)
         ways = [led]
-        if steady == 1 and self._deep:
-            ways += self._foreseen(replace(state, starts=starts), led, end)
+        if steady == 1:
+            begun = replace(state, starts=starts)
+            ways += foreseen(self._scene, begun, led, end, self._clamps.turning)
         placed = [each for way in ways for each in way]
+        if self._contact:
+            for later in range(step, step + len(ways)):
+                self._reach.touch(self._contact.touched_at_rest(later))
         count = self._reach.before(placed, load, max(steady, len(ways)))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, ways, count))
@@ -128,16 +138,6 @@ class CompiledStepper(Engine):
         now, before = (new, u) if count % 2 else (u, new)
         self._reach.after(now, before)
         return replace(state, step=state.step + count, u=now, previous=before, starts=starts)
-
-    def _foreseen(self, state: State, led: Led, end: int) -> list[Led]:
-        """Where the leaders of the coming step are put in those after it, as long as it is the same
-        leaders, nothing else changes and their motions alone decide."""
-        if self._scene.leaders_overlap:  # who contradict each other are named in their own step
-            return []
-        step = state.step + 1
-        known = steady_steps(self._scene, step, end - state.step, moving=True)
-        last = state.step + min(known, room_for(led))
-        return [prescribe(self._scene, state, later)[0] for later in range(step + 1, last + 1)]
 
     def _renumber(self, scene: Scene) -> None:
         if scene is not self._numbered:
@@ -148,12 +148,21 @@ class CompiledStepper(Engine):
         """The arrays of a kernel that steps in those of the state, by name."""
         slants = self._guidance.slants(state.step + 1) if ways[0] and self._guidance.slanted else {}
         leaders = leading_arrays(self._plan, ways, slants, state.u.dtype, self._deep)
-        reached = {"box": self._reach.box, "growth": self._reach.growth, "clamped": self._clamped}
+        reached = {"box": self._reach.box, "growth": self._reach.growth}
+        if self._plan.rotations:
+            reached |= self._clamped_arrays()
         moved = state_arrays(self._plan, state.u, state.previous, state)
         load = self._load(state)
         loads = {} if load is None else dict(zip(self._plan.each("load_@"), load, strict=True))
-        walls = wall_arrays(self._scene, state.step + 1)
+        first = state.step + 1
+        walls = wall_arrays(self._scene, range(first, first + len(ways)))
         return self._arrays | moved | leaders | reached | loads | walls
+
+    def _clamped_arrays(self) -> Arrays:
+        if not self._deep:
+            return {"clamped": self._clamped}
+        order, rows = banded(self._plan, "clamped", self._clamped)
+        return {"clamped": self._clamped[order]} | rows
 
     def _load(self, state: State) -> Floats | None:
         """What acts in the step after a state."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pbdkit.stepping.compiled.blocks import goes_deep, write_deep_passes, write_part
+from pbdkit.stepping.compiled.bands import goes_deep
+from pbdkit.stepping.compiled.blocks import write_deep_passes, write_piece
 from pbdkit.stepping.compiled.bond_pass import write_bond_pass, write_events
 from pbdkit.stepping.compiled.following import write_frame
 from pbdkit.stepping.compiled.leading import write_guiding, write_leading, write_slants
+from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.compiled.obstacle_pass import write_obstacle_pass
-from pbdkit.stepping.compiled.plan import Function, Level, Plan
+from pbdkit.stepping.compiled.plan import Function, Plan
 from pbdkit.stepping.compiled.rows import GENERAL, write_row
 from pbdkit.stepping.compiled.slot_loop import write_general
 
@@ -33,16 +35,25 @@ def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
         passes.append(functions[-1])
     pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
     functions += [pushing] if pushing else []
-    part = write_part(plan, passes[0]) if goes_deep(plan) else None
-    functions += [part] if part else []
+    pieces = write_piece(plan, passes, pushing) if goes_deep(plan) else []
+    functions += pieces
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes, pushing, part)
+    _write_run(run, plan, passes, pushing, *pieces[-1:])
     return write_module(plan, functions, run)
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
     """The source of a module with these functions, of which `run` is called from outside, and the
     names of the arrays that it is given."""
+    jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)'
+    head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = given"]
+    return module_text(plan, functions, head, run), run.used
+
+
+def module_text(
+    plan: Plan, functions: Iterable[Function], head: Iterable[str], run: Function
+) -> str:
+    """The source of a module with these functions and `run`, which has a head of its own."""
     seen = plan.levels[-1].seen
     kinds = {"Fracture": seen.fracture, "Constants": seen.bond}
     for n, level in enumerate(plan.levels):
@@ -54,10 +65,8 @@ def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tu
     for kind, numbers in kinds.items():
         lines.append(f'{kind} = namedtuple("{kind}", {[number.name for number in numbers]!r})')
     lines += [line for function in functions for line in function.source]
-    jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=KEPT)'
-    head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = given"]
     lines += ["", "", *head, *("    " + line for line in run.lines)]
-    return "\n".join(lines) + "\n", run.used
+    return "\n".join(lines) + "\n"
 
 
 def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) -> list[Function]:
@@ -81,10 +90,10 @@ def _write_run(
     plan: Plan,
     passes: Sequence[Function],
     pushing: Function | None,
-    part: Function | None,
+    piece: Function | None = None,
 ) -> None:
-    if part:
-        write_deep_passes(out, plan, part)
+    if piece:
+        write_deep_passes(out, plan, piece)
     else:
         out.add(0, "for made in range(count):")
     out.add(1, "step += 1")
@@ -108,32 +117,34 @@ def _write_run(
         out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
         out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
     if pushing:
-        write_pass(out, plan, 1, pushing, "i0", "i1")
+        write_pass(out, plan, 1, pushing, "i0", "i1", "made")
     write_slants(out, plan)
     write_leading(out, plan, "fv_@[led[e]] = held[#, e]", "fu_@[led[e]] = led_kept[#, e]")
     if plan.scene.frame:
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
     u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
-    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if part else []))
+    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if piece else []))
 
 
 def _write_bands(out: Function, plan: Plan, judging: Function, sweep: Function) -> None:
     """Band by band, so that what the pass over bonds has read and written is still near when it is
     swept."""
-    back, ahead = plan.home_reach
+    back, ahead = (along[0] for along in plan.scene.neighbourhood.home_reach)
     out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
     out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
     out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
-    write_pass(out, plan, 2, judging, "judged", "ready")
+    write_pass(out, plan, 2, judging, "judged", "ready", "0", "kind.shape[-1]")
     out.add(2, "judged = ready")
     write_pass(out, plan, 2, sweep, "low", "high")
 
 
-def write_pass(out: Function, plan: Plan, depth: int, one: Function, low: str, high: str) -> None:
+def write_pass(
+    out: Function, plan: Plan, depth: int, one: Function, low: str, high: str, *more: str
+) -> None:
     """A call for rows from `low` to `high`, or for parts of them on all threads."""
     if not plan.parallel:
-        out.add(depth, one.call(low, high))
+        out.add(depth, one.call(low, high, *more))
         return
     out.add(depth, "for c in prange(chunks):")
     span = (f"{low} + ({high} - {low}) * {c} // chunks" for c in ("c", "(c + 1)"))
-    out.add(depth + 1, one.call(*span))
+    out.add(depth + 1, one.call(*span, *more))

@@ -82,11 +82,16 @@ def compiled(function: Function) -> Any:
     `error_model="numpy"` lets divisions and roots vectorise; fastmath stays off, so that every
     operation rounds as numpy's does.
     """
+    return numba.njit(error_model="numpy")(with_helpers_ready(function))
+
+
+def with_helpers_ready(function: Function) -> Function:
+    """The same, of which numba can compile every Python function that it reaches."""
     for helper in _reached(function):
         if helper is not function and helper not in _ready:
             register_jitable(helper)
             _ready.add(helper)
-    return numba.njit(error_model="numpy")(function)
+    return function
 
 
 def source_key(*functions: Function) -> str:

@@ -151,13 +151,21 @@ def _ready(
     file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")
     scope = vars(module)
-    scope |= {kind.__name__: kind for kind in KINDS.values()} | names
-    scope.update(Here=Here, length=compiled(length), namedtuple=namedtuple, KEPT=bool(folder))
-    scope.update(njit=numba.njit, prange=numba.prange, np=np)
-    scope.update(int64=np.int64, real=np.float32, double=np.float64)
+    scope |= words(compiled) | names
+    scope.update(njit=numba.njit, part=numba.njit(error_model="numpy"), prange=numba.prange)
+    scope["KEPT"] = bool(folder)
     if folder:
         module.__file__ = file
         sys.modules[module.__name__] = module  # numba looks for what it has kept by this name
     exec(compile(source, file, "exec"), scope)
     module.run(*arguments)
     return module.run
+
+
+def words(made: Callable[[Function], Any]) -> dict[str, Any]:
+    """What every kernel may name, with functions as they are `made` for whoever runs it."""
+    kinds = {kind.__name__: kind for kind in KINDS.values()}
+    numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}
+    return (
+        kinds | numbers | {"Here": Here, "length": made(length), "namedtuple": namedtuple, "np": np}
+    )

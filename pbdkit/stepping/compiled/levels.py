@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from pbdkit.scene import outlines
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.kernel_cache import load_kernel
-from pbdkit.stepping.compiled.plan import Level
+from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.followers import target
 from pbdkit.stepping.state import started
@@ -71,8 +72,15 @@ def load_blamed(
 ) -> Any:
     """The kernel, with `more` functions than those of its parts; what does not compile is named as
     the part's whose it is."""
-    try:
+    with blamed(levels):
         return load_kernel(source, functions_of(levels) | dict(more or {}), arguments)
+
+
+@contextmanager
+def blamed(levels: Sequence[Level]) -> Iterator[None]:
+    """What does not compile meanwhile is named as the part's whose it is."""
+    try:
+        yield
     except Exception as error:
         with blaming(_culprit(levels, error), "to compile"):
             raise

@@ -5,6 +5,8 @@ Rows whose particles reach no obstacle's box, as far as their displacements go, 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from pbdkit.scene.obstacles import outlines_at
@@ -15,18 +17,24 @@ from pbdkit.stepping.compiled.particle import local_places
 from pbdkit.stepping.compiled.plan import Function, Plan
 
 
-def wall_arrays(scene: Scene, step: int) -> Arrays:
-    """The outlines of the obstacles that are there in a step, one after the other."""
+def wall_arrays(scene: Scene, steps: Iterable[int]) -> Arrays:
+    """The outlines of the obstacles that are there in some steps, always the same, one after the
+    other; by step their points and boxes."""
     if not scene.barriers:
         return {}
-    found = [outline for _, outline in outlines_at(scene.barriers, step)]
+    moments = [[outline for _, outline in outlines_at(scene.barriers, step)] for step in steps]
+    found = moments[0]
     points = [np.empty((0, 2)), *(outline.points for outline in found)]
     return {
         "wall_kind": np.array([outline.kind for outline in found], np.int64),
         "wall_first": np.cumsum([len(own) for own in points]),
-        "wall_points": np.concatenate(points),
+        "wall_points": np.array(
+            [np.concatenate([points[0], *(o.points for o in now)]) for now in moments]
+        ),
         "wall_radii": np.array([(o.inner, o.outer) for o in found]).reshape(-1, 2),
-        "wall_box": np.array([outline.box for outline in found]).reshape(-1, 4),
+        "wall_box": np.array([[o.box for o in now] for now in moments]).reshape(
+            len(moments), -1, 4
+        ),
     }
 
 
@@ -34,7 +42,9 @@ def write_obstacle_pass(plan: Plan) -> Function:
     """The function that pushes the particles of some rows out of every obstacle, one after the
     other."""
     has_compliance = "compliance" in plan.shared
-    out = Function(plan.shared, "push_out", "first_row", "last_row")
+    out = Function(plan.shared, "push_out", "first_row", "last_row", "moment")
+    out.add(0, "m = min(moment, wall_box.shape[0] - 1)")
+    out.add(0, "points, edges = wall_points[m], wall_box[m]")
     out.add(0, "j0, j1 = max(0, box[2]), min(kind.shape[2], box[3])", "width = j1 - j0")
     out.add(0, "for s in range(kind.shape[0]):", "    for i in range(first_row, last_row):")
     out.add(2, "if width <= 0:", "    continue")
@@ -52,13 +62,13 @@ def write_obstacle_pass(plan: Plan) -> Function:
     out.add(3, *plan.each("p@ = A@ + o@[j]"), "for w in range(wall_kind.size):")
     out.add(4, f"if {_beyond('p', 'p')}:", "    continue")
     given = "wall_first[w], wall_first[w + 1], wall_radii[w, 0], wall_radii[w, 1]"
-    out.add(4, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], wall_points, {given})")
+    out.add(4, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], points, {given})")
     out.add(4, "if gap < 0.0:")
     if has_compliance:
         own = ", ".join(f"compliance[{n}, s, i, j0 + j]" for n in range(3))
         out.add(5, f"sx, sy = slide(gap, nx, ny, {own})")
         out.add(5, *plan.each("o@[j] = o@[j] - s@"), *plan.each("p@ = A@ + o@[j]"))
-        out.add(5, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], wall_points, {given})")
+        out.add(5, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], points, {given})")
     out.add(5, *plan.each("o@[j] = o@[j] - gap * n@"), *plan.each("p@ = A@ + o@[j]"))
     return out
 
@@ -71,6 +81,6 @@ def _places(plan: Plan, name: str) -> list[str]:
 def _beyond(low: str, high: str) -> str:
     """Whether what lies from one place to the other misses a box; not where it is not a number."""
     return (
-        f"{low}x > wall_box[w, 2] or {high}x < wall_box[w, 0] or "
-        f"{low}y > wall_box[w, 3] or {high}y < wall_box[w, 1]"
+        f"{low}x > edges[w, 2] or {high}x < edges[w, 0] or "
+        f"{low}y > edges[w, 3] or {high}y < edges[w, 1]"
     )

@@ -58,7 +58,7 @@ def _write_kernel(plan: Plan) -> tuple[str, list[str]]:
     (level,) = plan.levels
     sweep = Function(plan.shared, "sweep", "first_body", "last_body")
     sweep.add(0, *parameters(plan, level), *plan.each("o@ = flat_v_@"))
-    sweep.add(0, *(f"a{n} = flat_own{n}" for n in range(len(level.seen.own))))
+    sweep.add(0, *(f"a{n} = w{n} = flat_own{n}" for n in range(len(level.seen.own))))
     sweep.add(0, "for e in range(first_body, last_body):")
     sweep.add(1, "row = body[e]", "j = place[row]", f"u = {plan.vector('flat_u_@[j]')}")
     sweep.add(1, *(f"{t} = double(0.0)" for t in level.totals))

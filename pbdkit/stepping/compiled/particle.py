@@ -7,7 +7,8 @@ from itertools import islice
 
 from pbdkit.interfaces import RenewsParticles, Softens
 from pbdkit.scene.homes import Home
-from pbdkit.stepping.compiled.plan import Function, Level, Plan, listed, values
+from pbdkit.stepping.compiled.level import Level
+from pbdkit.stepping.compiled.plan import Function, Plan, listed, values
 
 RUNS = ("first_run", "last_run", "first_row", "last_row")
 """What functions of rows are given: some runs, and the rows of the first axis to keep to."""
@@ -47,7 +48,9 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
         rows["g@"] = "load_@"
     for row, of in rows.items():
         out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
-    out.add(0, *(f"a{m} = {plan.row(f'own{m}', s)}" for m in range(len(level.seen.own))))
+    for m in range(len(level.seen.own)):
+        before, after = (plan.row(array, s) for array in (plan.read[m], f"own{m}"))
+        out.add(0, f"a{m}, w{m} = {before}, {after}")
     out.add(0, *(f"g{m} = {plan.row(f'field{m}', s)}" for m in range(level.fields)))
 
 
@@ -148,7 +151,7 @@ def target_lines(
         for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
             lines += plan.each(pattern)
     return lines + [
-        f"a{n}[j] = {_chosen(f'new[{m}]', movable, f'a{n}[j]')}" for m, n in enumerate(changing)
+        f"w{n}[j] = {_chosen(f'new[{m}]', movable, f'a{n}[j]')}" for m, n in enumerate(changing)
     ]
 
 

@@ -7,67 +7,53 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import count
+from itertools import count, permutations
 from typing import Any
 
 from pbdkit.interfaces import RenewsBonds
 from pbdkit.interfaces.rule import shares_particles
-from pbdkit.scene.homes import Home, Number, Seen, numbers_of
+from pbdkit.scene.guides import has_guides
+from pbdkit.scene.homes import Home, Number
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.clamps import Clamps
+from pbdkit.stepping.compiled.level import Level
+from pbdkit.stepping.guidance import Guidance
 
 MOST_BITS = 32
 """Neighbours of a sublattice up to which its slots are written out and lost bonds are bits."""
 
 
 @dataclass(frozen=True)
-class Level:
-    """A rule whose moves one sweep makes; `scene` has it as its rule. The first works on
-    displacements, each other on the moves of the one before."""
-
-    number: int
-    scene: Scene
-    parts: tuple[int, ...]
-    """Of each contribution, the number of its components."""
-
-    @cached_property
-    def seen(self) -> Seen:
-        """The numbers that the rule sees."""
-        scene = self.scene
-        return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
-
-    @property
-    def fields(self) -> int:
-        """How many of the rule's parameters differ from place to place."""
-        return len(self.scene.constants.by_particle)
-
-    @property
-    def source(self) -> str:
-        """The planes that it works on; the first letter names what stands there at a particle."""
-        return f"z{self.number - 1}" if self.number else "u"
-
-    @property
-    def totals(self) -> list[str]:
-        """The names of the sums of contributions, component by component."""
-        return [f"t{n}" for n in range(sum(self.parts))]
-
-
-@dataclass(frozen=True)
 class Plan:
     """A scene's levels, the last of which moves the particles, whether it is stepped on several
-    threads, the names of what all functions of its kernel may use: mostly arrays; and whether
-    bonds are judged apart from moves, whatever the model."""
+    threads, the names of what all functions of its kernel may use: mostly arrays; whether
+    bonds are judged apart from moves, whatever the model; and whether the kernel is for a GPU,
+    whose threads take one place after the other from flat arrays."""
 
     scene: Scene
     levels: tuple[Level, ...]
     parallel: bool
     shared: tuple[str, ...] = ("step",)
     apart: bool = False
+    gpu: bool = False
 
     @property
     def axes(self) -> str:
         """The names of the axes, a letter each."""
         return "xyz"[: self.scene.axes]
+
+    @cached_property
+    def leads(self) -> dict[str, str]:
+        """The lists of leaders by the ending of their names, with the axes along which they lead:
+        one for all, or where some are guided one for each axis."""
+        return (
+            {f"_{c}": c for c in self.axes} if has_guides(self.scene.leading) else {"": self.axes}
+        )
+
+    @cached_property
+    def slanted(self) -> list[tuple[str, str]]:
+        """The axes along which moves may add to moves along others, with those others."""
+        return list(permutations(self.axes, 2)) if Guidance(self.scene).slanted else []
 
     @property
     def lead(self) -> tuple[str, ...]:
@@ -113,10 +99,16 @@ class Plan:
         return shares_particles(self.scene.experiment.rule)
 
     @property
+    def read(self) -> tuple[str, ...]:
+        """The arrays of what is remembered of particles, as it was before the step where neighbours
+        see it."""
+        kept, count = self.kept if self.shares else (), len(self.levels[-1].seen.own)
+        return tuple(f"was{m}" if m in kept else f"own{m}" for m in range(count))
+
+    @property
     def shown(self) -> tuple[str, ...]:
         """The arrays of what neighbours see of each other."""
-        count = len(self.levels[-1].seen.own) if self.shares else 0
-        return tuple(f"was{m}" if m in self.kept else f"own{m}" for m in range(count))
+        return self.read if self.shares else ()
 
     @property
     def limits(self) -> int:
@@ -135,13 +127,6 @@ class Plan:
         return self.model is not None and (self.apart or renews or self.long)
 
     @property
-    def home_reach(self) -> tuple[int, int]:
-        """How many rows before and after a particle's own its bonds may be kept."""
-        around = self.scene.neighbourhood
-        steps = [0, *(slot.cell[0] for slot, (_, here) in around.home.items() if not here)]
-        return -min(steps), max(steps)
-
-    @property
     def judged(self) -> bool:
         """Whether the sweep judges the bonds."""
         return self.model is not None and not self.bonds_first
@@ -150,6 +135,10 @@ class Plan:
     def real(self) -> str:
         """The kind of the scene's numbers."""
         return "real" if self.scene.experiment.stepping.precision == "float32" else "double"
+
+    def over(self, count: str) -> str:
+        """The numbers below a count; in a kernel for a GPU those of one of its threads."""
+        return f"range(me, {count}, threads)" if self.gpu else f"range({count})"
 
     def renumbered(self, scene: Scene) -> Plan:
         """The same with other numbers."""
@@ -167,9 +156,10 @@ class Plan:
         """A word for a value in the scene's precision: numbers of Python's count as such."""
         return f"real({value})" if self.real == "real" else value
 
-    def each(self, pattern: str) -> list[str]:
-        """The pattern for each axis, with its name for `@` and its number for `#`."""
-        return [pattern.replace("@", c).replace("#", str(a)) for a, c in enumerate(self.axes)]
+    def each(self, pattern: str, axes: str = "") -> list[str]:
+        """The pattern for each axis, or some, with its name for `@` and its number for `#`."""
+        named = enumerate(axes or self.axes)
+        return [pattern.replace("@", c).replace("#", str(a)) for a, c in named]
 
     def vector(self, pattern: str) -> str:
         """A vector whose components have this pattern."""
@@ -234,7 +224,7 @@ class Function:
         words = self._words()
         flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
         lines = ("    " + line for line in [*flat, *self.lines])
-        return ["", "", '@njit(error_model="numpy")', head, *lines]
+        return ["", "", "@part", head, *lines]
 
     def call(self, *own: str) -> str:
         """A call with these values of its own arguments."""

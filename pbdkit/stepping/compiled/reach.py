@@ -23,7 +23,7 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.compiled.plan import Level
+from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.prescription import Led
 from pbdkit.stepping.state import Floats, State
@@ -66,6 +66,13 @@ class Reach:
         if load is not None:
             self._join(np.nonzero((load != 0.0).any(axis=(0, 1))))
         return count
+
+    def take_in(self, state: State, rows: slice) -> None:
+        """Takes in what has moved in some rows of cells that somebody else has written."""
+        if self._known:
+            some = (u[:, :, rows] != 0.0 for u in (state.u, state.previous))
+            first, *cells = np.nonzero(np.logical_or(*some).any(axis=(0, 1)))
+            self._join((first + rows.start, *cells))
 
     def touch(self, touched: Iterable[tuple[NDArray[np.intp], ...]]) -> None:
         """Takes in the cells that obstacles push from where they rest."""

@@ -3,8 +3,12 @@ offsets, steps and weights are literals, so that what cancels at rest folds away
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 from pbdkit.interfaces import Slot
 from pbdkit.scene.homes import Home
+from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.compiled.particle import (
     RUNS,
     bond_lines,
@@ -15,11 +19,25 @@ from pbdkit.stepping.compiled.particle import (
     target_lines,
     write_row_loop,
 )
-from pbdkit.stepping.compiled.plan import Function, Level, Plan, listed, values
+from pbdkit.stepping.compiled.plan import Function, Plan, listed, values
 
 NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
 """Kinds of rows: those where no particle follows; where something may be missing; where all
 neighbours are there and cells are whole; where cells are not."""
+
+
+class Words(NamedTuple):
+    """The words for what one neighbour and its bond have: what stands there, with `@` for the axis;
+    what is remembered of it; the shares of the cells beside its slot, none where cells are whole;
+    with `{n}` for their numbers what is remembered of the bond, and its limits; and since when it
+    is broken."""
+
+    there: str
+    shown: Sequence[str]
+    shares: Sequence[str]
+    bond: str
+    limit: str
+    since: str
 
 
 def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | None) -> Function:
@@ -40,25 +58,40 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     if plan.judged:
         out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
     out.add(0, "for j in range(j1 - j0):")
-    out.add(1, *displacements(plan, level))
-    if plan.judged:
-        out.add(1, "bits = int64(gone[j])", "now = bits")
+    words = []
     for k, slot in enumerate(slots):
-        out.add(1, *_slot_lines(plan, level, k, slot, shares))
-    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
+        own = [f"e{k}_{m}[j]" for m in range(len(plan.shown))]
+        beside = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
+        bond = f"b{k}_{{n}}[j]", f"x{k}_{{n}}[j]", f"f{k}[j]"
+        words.append(Words(f"n{k}@[j]", own, beside, *bond))
+    write_whole(out, plan, level, s, words, "gone[j]")
     if events:
-        out.add(1, "changed = changed | (now ^ bits)", "gone[j] = now")
         out.add(0, "if changed:")
         out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
     return out
 
 
-def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, str]) -> list[str]:
-    """The contributions of one neighbour; `shares` are the names of rows of shares of cells."""
+def write_whole(
+    out: Function, plan: Plan, level: Level, s: int, words: Sequence[Words], lost: str
+) -> None:
+    """The lines, in a loop, for a particle that has all its neighbours, with the words for each and
+    for its `lost` bonds."""
+    out.add(1, *displacements(plan, level))
+    if plan.judged:
+        out.add(1, f"bits = int64({lost})", "now = bits")
+    for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
+        out.add(1, *_slot_lines(plan, level, k, slot, words[k]))
+    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
+    if plan.judged:
+        out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
+
+
+def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, words: Words) -> list[str]:
+    """The contributions of one neighbour."""
     bond = {
         Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
-        Home.BOND: f"b{k}_{{n}}[j]",
-        Home.FIXED_BOND: f"x{k}_{{n}}[j]",
+        Home.BOND: words.bond,
+        Home.FIXED_BOND: words.limit,
     }
     c = f"Constants({values(level.seen.bond, bond)})"
     # A bond is judged as its home end sees it, so that both ends agree to the last bit.
@@ -66,13 +99,13 @@ def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, shares: dict[str, 
     seen = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
     literal = level.scene.constants.weights[slot]._asdict()
     weights = {name: plan.number(value) for name, value in literal.items()}
-    if shares:
-        weights["left"], weights["right"] = (f"{shares[row]}[j]" for row in _beside(plan, slot))
-    r, there = plan.literal(slot.rest), (f"e{k}_{m}[j]" for m in range(len(plan.shown)))
+    if words.shares:
+        weights["left"], weights["right"] = words.shares
+    r = plan.literal(slot.rest)
     return [
-        difference(plan, level, f"n{k}@[j]"),
-        *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", f"f{k}[j]"),
-        contributions(plan, level, r, listed(weights.values()), there),
+        difference(plan, level, words.there),
+        *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", words.since),
+        contributions(plan, level, r, listed(weights.values()), words.shown),
         *(
             f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
             for n in range(len(level.totals))

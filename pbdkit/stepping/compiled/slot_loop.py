@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
+from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.compiled.particle import (
     RUNS,
     bond_lines,
@@ -23,7 +24,7 @@ from pbdkit.stepping.compiled.particle import (
     target_lines,
     write_row_loop,
 )
-from pbdkit.stepping.compiled.plan import Function, Level, Plan, values
+from pbdkit.stepping.compiled.plan import Function, Plan, values
 
 
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
@@ -31,14 +32,18 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
     write_row_loop(out, plan, level, "s")
     out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
-    (_write_slot_after_slot if plan.long else _write_one_by_one)(out, plan, level)
+    if _is_slot_after_slot(plan):
+        _write_slot_after_slot(out, plan, level)
+    else:
+        out.add(0, "changed = 0", "for j in range(width):")
+        write_one(out, plan, level)
     if events:
         out.add(0, "if changed:", "    " + events.call("s", "base", "width"))
     return out
 
 
-def _write_one_by_one(out: Function, plan: Plan, level: Level) -> None:
-    out.add(0, "changed = 0", "for j in range(width):")
+def write_one(out: Function, plan: Plan, level: Level) -> None:
+    """The lines, in a loop, for one particle of sublattice s."""
     # -0.0 + x is x, whatever its sign.
     out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
     if plan.judged:
@@ -63,11 +68,16 @@ def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
     out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
 
 
+def _is_slot_after_slot(plan: Plan) -> bool:
+    """Whether all particles of a row take in one slot after the other."""
+    return plan.long and not plan.gpu
+
+
 def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
     """The word for a value of an array, `away` from the particle's place in flat arrays: looked up,
     or from a row of them where all particles take in one slot after the other. `@` in the name is
     each axis."""
-    if not plan.long:
+    if not _is_slot_after_slot(plan):
         return f"flat_{array}[at_j + {away}]"
     row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"
     out.add(1, *dict.fromkeys(plan.each(row)))
@@ -78,7 +88,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     there = _seen(out, plan, f"{level.source}_@", "away[s, k]")
     kind = _seen(out, plan, "kind", "away[s, k]")
     named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
-    depth = 1 if plan.long else 2
+    depth = 1 if _is_slot_after_slot(plan) else 2
     if any(number.home is Home.CELL for number in level.seen.weights):
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
@@ -87,7 +97,7 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
     since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
     out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
-    if plan.long:
+    if _is_slot_after_slot(plan):
         out.add(1, "for j in range(width):")
         out.add(2, *displacements(plan, level))
     out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, there))

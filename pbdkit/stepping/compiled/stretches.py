@@ -27,7 +27,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
     rows = np.arange(scene.raster.shape[1] + 1)
     for s in range(scene.raster.shape[0]):
         if block := scene.raster.body_block(s):
-            lines = _lines_of(_kinds(scene, block, all_general))
+            lines = _lines_of(kinds_of(scene, block, all_general))
             lines[:, :-1] += [*block.start, block.start[-1]]
             for kind in np.unique(lines[:, -1]).tolist():
                 own = _joined(lines[lines[:, -1] == kind, :-1])
@@ -52,7 +52,7 @@ def _joined(lines: Ints) -> Ints:
     return np.take(runs, np.lexsort(tuple(runs.T[::-1])), axis=0)
 
 
-def _kinds(scene: Scene, block: Block, all_general: bool) -> Ints:
+def kinds_of(scene: Scene, block: Block, all_general: bool) -> Ints:
     """The kind of row that serves each place of a block."""
     raster, slots = scene.raster, scene.neighbourhood.slots[block.sublattice]
     follows = block.of(raster.kind) == FOLLOWER
