@@ -10,10 +10,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+from pbdkit.analysis.stencil import Bound, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.prediction.forecast import prediction, quick_warnings
+from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Outcome, Recorder
 from pbdkit.results.sink import KeepingSink, MemorySink, Sink
@@ -67,10 +70,33 @@ class Run:
         """The engine, its threads, and why."""
         return self.driver.choice
 
+    @property
+    def particles(self) -> int:
+        """How many there are, frame included."""
+        return self.scene.raster.count
+
+    def recorder(self, sink: Sink) -> Recorder:
+        """What takes from its states what the dataset holds."""
+        return Recorder(self.scene, sink)
+
+    def sink(self, file: KeepingSink) -> KeepingSink:
+        """What writes into a file beside the run."""
+        return OverlappingSink(file)
+
+    @cached_property
+    def prediction(self) -> dict[str, Any]:
+        """What was known of it before the first step."""
+        return prediction(self.scene, self.waves)
+
+    @cached_property
+    def waves(self) -> Bound | None:
+        """What plane waves say of its stability."""
+        return wave_bound(self.scene)
+
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What is to be said before the first step: of the scene, and of stability."""
-        return quick_warnings(self.scene)
+        return quick_warnings(self.scene, self.waves)
 
 
 @dataclass(frozen=True)
@@ -118,11 +144,11 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
 
     def report(outcome: Outcome, warnings: tuple[str, ...] = ()) -> Report:
         wall_s = time.perf_counter() - begun
-        return Report(outcome, scene.raster.count, wall_s, run.choice, warnings, first)
+        return Report(outcome, run.particles, wall_s, run.choice, warnings, first)
 
     try:
         if recorder is None:
-            recorder = Recorder(scene, sink)
+            recorder = run.recorder(sink)
             with _located(scene):
                 recorder.begin()
         for state in run:
@@ -144,7 +170,7 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
         if keeping:
             keeping.note_end(standing_of(run.driver, recorder))
         with _located(scene):
-            recorder.finish(run.state, run.outcome, prediction(scene))
+            recorder.finish(run.state, run.outcome, run.prediction)
     except BaseException:
         sink.abandon()
         raise

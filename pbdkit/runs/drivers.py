@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Mapping
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -88,8 +89,8 @@ class Stepwise(Driver):
         begun to settle, when to look."""
         self.state, self.kept = standing["state"], standing["kept"]
         is_good = standing["guard"]["good_step"] == self.state.step
-        kept = self.state.copy() if is_good else None
-        self.guard = Guard(self.guard.size, kept=kept, **standing["guard"])
+        kept = self.state.copy() if is_good else self.guard.kept
+        self.guard = replace(self.guard, kept=kept, **standing["guard"])
         if self.settling and "pace" in standing and standing["pace"].seen:
             self.settling.pace, self.settling.obstacle = standing["pace"], standing["obstacle"]
 

@@ -1,19 +1,13 @@
-"""Where a run stands, between two steps: taken from a run, and given to another."""
+"""Where a run stands, between two steps."""
 
 from __future__ import annotations
 
 import time
 from importlib.metadata import version
-from typing import Any
 
-from pbdkit.errors import StorageError
-from pbdkit.results.recorder import Recorder, Seen
+from pbdkit.results.recorder import Recorder
 from pbdkit.runs.drivers import Driver
-from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import State
-from pbdkit.storage.standing import Arrays, Standing, put_together, taken_apart
-
-KINDS: dict[str, type] = {"State": State, "Seen": Seen}
+from pbdkit.storage.standing import Arrays, Standing, taken_apart
 
 
 def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standing:
@@ -35,70 +29,3 @@ def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standi
         "pbdkit": version("pbdkit"),
     }
     return Standing(about, facts, arrays)
-
-
-def take_up(
-    driver: Driver, recorder: Recorder, standing: Standing, recorded: int | None = None
-) -> None:
-    """Lets a run that has not begun go on from there; `recorded` is the last step recorded, where
-    that is another one than was kept. Raises StorageError for the standing of another scene."""
-    parts = _parts(driver, standing)
-    state, seen = parts.get("state"), parts.get("seen")
-    if not isinstance(seen, Seen) or not isinstance(state, State) or not state.fits(driver.state):
-        raise StorageError("the state that was kept is not one of this experiment")
-    if not _is_possible(driver.scene, state, seen, parts):
-        raise StorageError("the state that was kept is damaged: it is none that a run comes to")
-    if recorded is not None:
-        parts["kept"] = seen.recorded = recorded
-    driver.take_up(parts)
-    recorder.seen = seen
-
-
-def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) -> bool:
-    """Whether steps follow each other, so that a run that goes on comes to its end."""
-    now, steps = state.step, scene.experiment.steps
-    guard, pace = parts.get("guard", {"good_step": 0, "next_look": now + 1}), parts.get("pace")
-    try:
-        past = [seen.step, seen.recorded, parts.get("kept", -1), guard["good_step"]]
-        coming = [guard["next_look"], pace.next_look if pace else now, steps]
-        whole = all(isinstance(step, int) for step in (now, *past, *coming))
-        in_order = min(past) >= -1 and max(past) <= now <= min(coming)
-        in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
-        return whole and in_order and (now < guard["next_look"] or now == steps)
-    except (KeyError, TypeError, AttributeError):
-        return False
-
-
-def _is_like(found: Any, own: Any) -> bool:
-    """Whether facts are of the kinds of a run's own; what it does not know yet may be a number, an
-    array, or numbers."""
-    if isinstance(own, dict) and "array" not in own:
-        same = isinstance(found, dict) and found.keys() == own.keys()
-        return same and all(_is_like(found[key], part) for key, part in own.items())
-    if isinstance(found, list):
-        return (own is None or isinstance(own, list)) and all(
-            _is_like(part, None) for part in found
-        )
-    if isinstance(found, dict):
-        return found.keys() == {"array"} and (own is None or isinstance(own, dict))
-    if isinstance(own, str) or isinstance(found, str):
-        return isinstance(own, str) and isinstance(found, str)
-    return found is None or (isinstance(found, int | float) and abs(found) < 2**63)
-
-
-def _parts(driver: Driver, standing: Standing) -> dict[str, Any]:
-    kinds = dict(KINDS)
-    own = taken_apart(driver.standing(), "run", Arrays())
-    scene = driver.scene
-    if scene.experiment.stepping.settle:
-        from pbdkit.equilibrium.settlement import Pace
-
-        kinds["Pace"] = Pace
-    try:
-        facts = {**standing.facts["run"], "seen": standing.facts["seen"]}
-    except (KeyError, TypeError) as error:
-        raise StorageError(f"the state that was kept is damaged: {error}") from None
-    if not _is_like(standing.facts["run"], own):
-        raise StorageError("the state that was kept is damaged: it is of other kinds")
-    found: dict[str, Any] = put_together(facts, standing.arrays, kinds)
-    return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import xxhash
 
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import FULL, is_full, is_local
+from pbdkit.storage.pieced_array import PiecedArray
 
 FORMAT = "2"
 """Of the store; a newer one is refused."""
@@ -32,7 +33,7 @@ JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
 MARK = 0x70626472
 """The application_id of the file: `pbdr`."""
 
-Pieces = Mapping[str, bytes | memoryview]
+Piece = tuple[str, bytes | memoryview]
 
 
 class RunStore:
@@ -80,18 +81,18 @@ class RunStore:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def commit(self, pieces: Pieces, gone: Iterable[str] = ()) -> None:
+    def commit(self, pieces: Iterable[Piece], gone: Iterable[str] = ()) -> None:
         """Puts pieces in the place of those of the same keys, and takes others away."""
-        new = {key: _digest(key, data) for key, data in pieces.items()}
-        changed = [key for key, found in new.items() if self._digests.get(key) != found]
+        new: dict[str, bytes] = {}
         with self._sqlite():
             self._file.execute("BEGIN IMMEDIATE")
             try:
                 self._file.executemany("DELETE FROM pieces WHERE key = ?", ((k,) for k in gone))
-                self._file.executemany(
-                    "REPLACE INTO pieces VALUES (?, ?, ?)",
-                    ((key, pieces[key], new[key]) for key in changed),
-                )
+                for key, data in pieces:
+                    new[key] = found = _digest(key, data)
+                    if self._digests.get(key) != found:
+                        row = (key, data, found)
+                        self._file.execute("REPLACE INTO pieces VALUES (?, ?, ?)", row)
                 self._file.execute("COMMIT")
             except BaseException:
                 with suppress(sqlite3.Error):
@@ -152,11 +153,16 @@ def json_piece(facts: Any) -> bytes:
     return json.dumps(facts).encode()
 
 
-def parts_of(name: str, array: np.ndarray[Any, Any]) -> dict[str, memoryview]:
-    """An array as pieces of bounded size."""
-    data: memoryview = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-    starts = range(0, len(data), PART_BYTES)
-    return {f"{name}/{n}": data[at : at + PART_BYTES] for n, at in enumerate(starts)}
+def parts_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> Iterator[Piece]:
+    """An array as pieces of bounded size, made one after the other."""
+    pieced = array if isinstance(array, PiecedArray) else PiecedArray.of(array)
+    for key, block in zip(keys_of(name, array), pieced.blocks(PART_BYTES), strict=True):
+        yield key, block.data
+
+
+def keys_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> list[str]:
+    """The keys of its pieces."""
+    return [f"{name}/{n}" for n in range(-(-array.nbytes // PART_BYTES))]
 
 
 def array_of(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, Any]
+"""Arrays by name; some are joined from parts when they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Standing:
 
 def taken_apart(value: Any, name: str, arrays: Arrays) -> Any:
     """A value as facts; its arrays go into `arrays`, under names that begin with `name`."""
-    if isinstance(value, np.ndarray):
+    if hasattr(value, "dtype") and not isinstance(value, np.generic):
         arrays[name] = value
         return {"array": name}
     if is_dataclass(value):

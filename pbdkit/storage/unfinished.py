@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from pbdkit.storage.run_files import (
 )
 from pbdkit.storage.run_store import (
     FORMAT,
+    Piece,
     RunStore,
     array_of,
     json_piece,
+    keys_of,
     parts_of,
 )
 from pbdkit.storage.seal import Extent
@@ -108,24 +111,25 @@ class UnfinishedRun:
         arrays = batches | standing.arrays
         kinds = {n: [a.dtype.str, list(a.shape)] for n, a in arrays.items()}
         facts = standing.facts | {"arrays": kinds, "written": dict(written)}
-        pieces = {k: v for n, a in arrays.items() for k, v in parts_of(ARRAYS + n, a).items()}
-        gone, self._arrays = self._arrays - {*pieces}, {*pieces}
-        about = {"about": json_piece(standing.about | {"format": FORMAT})}
-        self._commit(file, about | pieces | {"facts": json_piece(facts)}, gone)
+        keys = {key for n, a in arrays.items() for key in keys_of(ARRAYS + n, a)}
+        gone, self._arrays = self._arrays - keys, keys
+        said = [("about", json_piece(standing.about | {"format": FORMAT}))]
+        parts = (parts_of(ARRAYS + n, a) for n, a in arrays.items())
+        self._commit(file, chain(said, *parts, [("facts", json_piece(facts))]), gone)
 
     def conclude(self, file: PagedFile, status: str) -> None:
         """Commits the file of a finished run, whose pages hold all of it."""
-        self._commit(file, {"facts": json_piece({"finished": status})}, set())
+        self._commit(file, [("facts", json_piece({"finished": status}))], set())
 
-    def _commit(self, file: PagedFile, pieces: Mapping[str, Any], gone: set[str]) -> None:
+    def _commit(self, file: PagedFile, pieces: Iterable[Piece], gone: set[str]) -> None:
         file.sync()
         numbers = file.changed if self.kept else file.pages
-        pages = {f"{PAGES}{n}": bytes(file.pages[n]) for n in numbers}
+        pages = [(f"{PAGES}{n}", bytes(file.pages[n])) for n in numbers]
         added = file.added if self.kept else file.extents
-        extents = {f"{EXTENTS}{len(file.extents)}": np.array(added, EXTENT).tobytes()}
+        extents = [(f"{EXTENTS}{len(file.extents)}", np.array(added, EXTENT).tobytes())]
         layout = {"size": file.size, "pages": len(file.pages), "extents": len(file.extents)}
-        described = {"file": json_piece(layout)}
-        self._store.commit({**pieces, **pages, **(extents if added else {}), **described}, gone)
+        described = [*pages, *(extents if added else []), ("file", json_piece(layout))]
+        self._store.commit(chain(pieces, described), gone)
         file.commit()
         if not self.kept:
             sync_folder(self.output.absolute().parent)

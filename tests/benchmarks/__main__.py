@@ -21,9 +21,11 @@ import numba
 import numpy as np
 from cost import cost
 from elements import elements
-from engines import engines, limit, threads
+from engines import cache, engines, limit, threads
 from goals import all_goals
+from gpu import gpu
 from peers import peers
+from ranks import ranks
 
 from pbdkit.stepping.choice import processors
 
@@ -43,11 +45,14 @@ def goals() -> list[dict[str, Any]]:
 PARTS = {
     "goals": goals,
     "limit": limit,
+    "cache": cache,
     "threads": threads,
     "cost": cost,
     "engines": engines,
     "peers": peers,
     "elements": elements,
+    "gpu": gpu,
+    "ranks": ranks,
 }
 
 
@@ -78,17 +83,21 @@ def main() -> None:
     chosen = parser.parse_args().only
     file, page = DOCS / "performance.json", DOCS / "performance.md"
     data = json.loads(file.read_text()) if file.exists() else {}
-    data["machine"] = machine()
+    here = machine()
     for name in chosen:
         begun = time.perf_counter()
-        data[name] = PARTS[name]()
+        found = PARTS[name]()
+        if found is None:
+            continue
+        data[name] = found
         print(f"-- {name}: {time.perf_counter() - begun:.0f} s", flush=True)
         if name != "goals":
             print(document.TABLES[name](data[name]), flush=True)
-        data["machine"]["load_after"] = os.getloadavg()[0]
+        data["machine"] = here | {"load_after": os.getloadavg()[0]}
         file.write_text(json.dumps(data, indent=1) + "\n")
     if page.exists():
-        document.refresh(page, data)
+        document.refresh(page, data, {*document.TABLES} - document.SCALE)
+        document.refresh(DOCS / "scale.md", data, document.SCALE)
 
 
 main()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,13 @@ from front import fronts
 Data = dict[str, Any]
 
 
-def refresh(path: Path, data: Data) -> None:
-    """Replaces what stands between `<!-- measured: name -->` and `<!-- end -->`."""
+def refresh(path: Path, data: Data, tables: Container[str]) -> None:
+    """Replaces what stands between `<!-- measured: name -->` and `<!-- end -->`, of these names."""
     text = path.read_text("utf-8")
     derived = {"choice": "engines", "interval": "cost"}
     data = data | {name: data[source] for name, source in derived.items() if source in data}
     for name, write in TABLES.items():
-        if name in data:
+        if name in data and name in tables:
             marked = re.compile(rf"(<!-- measured: {name} -->\n).*?(<!-- end -->)", re.S)
             if not marked.search(text):
                 raise SystemExit(f"{path}: has no place for the table '{name}'")
@@ -85,21 +85,27 @@ def _threads(rows: list[Data]) -> str:
 
 def _limit(rows: list[Data]) -> str:
     head = (
-        "size",
-        "copying, ns",
-        "bare sweep, ns",
-        "pbdkit, ns",
-        "of the limit",
-        "two threads, ns",
-    )
-    return _table(
-        head,
-        (
-            (f"{r['size']}²", f"{r['copy_ns']:.2f}", f"{r['bare_ns']:.2f}", f"{r['pbdkit_ns']:.2f}",
-             f"{r['copy_ns'] / r['pbdkit_ns']:.0%}", f"{r['two_threads_ns']:.2f}")
-            for r in rows
-        ),
+        "size", "copying, ns", "bare sweep, ns", "pbdkit, ns", "of the limit",
+        "copying on two threads, ns", "pbdkit, ns", "of the limit",
     )  # fmt: skip
+
+    def cells(r: Data) -> tuple[str, ...]:
+        ns = {name: f"{r[f'{name}_ns']:.2f}" for name in ("copy", "bare", "pbdkit")}
+        one, two = r["copy_ns"] / r["pbdkit_ns"], r["copy_two_ns"] / r["two_threads_ns"]
+        both = f"{r['copy_two_ns']:.2f}", f"{r['two_threads_ns']:.2f}"
+        return f"{r['size']}²", *ns.values(), f"{one:.0%}", *both, f"{two:.0%}"
+
+    return _table(head, map(cells, rows))
+
+
+def _cache(rows: list[Data]) -> str:
+    def cells(r: Data) -> tuple[str, ...]:
+        ns = f"{r['small_ns']:.2f}", f"{r['large_ns']:.2f}"
+        return r["rule"], r["with"], *ns, f"{r['small_ns'] / r['large_ns']:.0%}"
+
+    return _table(
+        ("rule", "with", "100², ns", "3000², ns", "of its rate in the cache"), map(cells, rows)
+    )
 
 
 def _cost(found: Data) -> str:
@@ -183,15 +189,42 @@ def _interval(found: Data) -> str:
     return f"{text}steps:\n\n" + _table(("recorded every", "longer by"), rows)
 
 
+def _gpu(rows: list[Data]) -> str:
+    lines = ((r["what"], f"{r['size']}²", r["precision"], f"{r['ps']:.3g}") for r in rows)
+    return _table(("what", "size", "precision", "ps a particle and step"), lines)
+
+
+def _ranks(found: Data) -> str:
+    ns = {k: found[k] * 1e9 / found["steps"] / found["size"] ** 2 for k in ("1", "2", "shared")}
+    mib = [held / 2**20 for held in (found["alone_bytes"], *found["rank_bytes"])]
+    rows = [
+        ("one process, one thread", f"{ns['1']:.2f} ns a particle and step", ""),
+        ("one process, two threads", f"{ns['2']:.2f} ns", f"{ns['1'] / ns['2']:.2f} × one thread"),
+        ("two processes", f"{ns['shared']:.2f} ns",
+         f"{ns['1'] / ns['shared']:.2f} × one, {ns['2'] / ns['shared']:.2f} × two threads"),
+        ("an exchange", f"{found['exchange'] * 1e3:.2f} ms",
+         f"{found['sent_bytes'] / 1e6:.1f} MB each way, every {found['between']} steps"),
+        ("4000² in one process", f"{mib[0]:.0f} MiB", ""),
+    ]  # fmt: skip
+    for n, held in enumerate(mib[1:]):
+        rows.append((f"process {n} of {len(mib) - 1}", f"{held:.0f} MiB", f"{held / mib[0]:.1%}"))
+    return _table(("", "", ""), rows)
+
+
+SCALE = {"ranks"}
+"""Those of docs/scale.md."""
 TABLES: dict[str, Callable[[Any], str]] = {
     "machine": _machine,
     "goals": _goals,
     "engines": _engines,
     "threads": _threads,
     "limit": _limit,
+    "cache": _cache,
     "cost": _cost,
     "peers": _peers,
     "choice": _choice,
     "interval": _interval,
     "elements": _elements,
+    "gpu": _gpu,
+    "ranks": _ranks,
 }

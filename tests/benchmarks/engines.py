@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import tempfile
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bare import copy_ns, sweeping
-from pairing import best, ratio, wait_for_quiet
-from sheets import DISTANCE, FRACTURE, Running, moving
+from bare import Copying, sweeping
+from pairing import best_in_turns, ratio, wait_for_quiet
+from sheets import DAMAGE, DISTANCE, FRACTURE, RULES, SWUNG, Running, moving
 
 from pbdkit.bench.measurement import measure
 
@@ -20,6 +21,7 @@ SHEETS = {
     "distance-weighted": (DISTANCE, (100, 1000)),
     "barycentre with fracture": (FRACTURE, (100, 1000)),
 }
+WITH = {"": {}, "memory": SWUNG, "fracture": FRACTURE, "damage": DAMAGE}
 
 
 def engines() -> list[dict[str, Any]]:
@@ -52,17 +54,36 @@ def threads() -> list[dict[str, Any]]:
 def limit() -> list[dict[str, Any]]:
     """How near the sweeps come to reading and writing every displacement once."""
     found = []
-    for size, steps in ((100, 200), (1000, 32), (3000, 32)):
+    for size, steps in ((1000, 32), (3000, 16)):
+        copies = max(2, 10**7 // size**2)
         wait_for_quiet()
-        per_step = 1e9 / steps / size**2
-        one, two = (Running(moving(size), steps, threads=n) for n in (1, 2))
-        found.append(
-            {
-                "size": size,
-                "copy_ns": copy_ns(size),
-                "bare_ns": best(sweeping(size, steps), 9) * per_step,
-                "pbdkit_ns": best(one, 9) * per_step,
-                "two_threads_ns": best(two, 9) * per_step,
-            }
-        )
+        works = {
+            "copy": (Copying(size, copies), copies),
+            "copy_two": (Copying(size, copies, threads=2), copies),
+            "bare": (sweeping(size, steps), steps),
+            "pbdkit": (Running(moving(size), steps), steps),
+            "two_threads": (Running(moving(size), steps, threads=2), steps),
+        }
+        seconds = best_in_turns([work for work, _ in works.values()], 25)
+        counts = (count for _, count in works.values())
+        ns = (s * 1e9 / n / size**2 for s, n in zip(seconds, counts, strict=True))
+        found.append({"size": size} | dict(zip((f"{w}_ns" for w in works), ns, strict=True)))
+    return found
+
+
+def cache() -> list[dict[str, Any]]:
+    """Every rule on 3000², against its own rate on 100², which stays in the cache, in processor
+    time of one thread."""
+    found = []
+    for rule, parts in RULES.items():
+        for more, besides in WITH.items():
+            if (
+                rule == "strain-gradient" and more
+            ):  # nothing breaks there, and it needs its own solver
+                continue
+            sheet = parts | besides
+            small, large = Running(moving(100, **sheet), 400), Running(moving(3000, **sheet), 16)
+            seconds = best_in_turns([small, large], 5, time.process_time)
+            ns = [s * 1e9 / n for s, n in zip(seconds, (400 * 100**2, 16 * 3000**2), strict=True)]
+            found.append({"rule": rule, "with": more, "small_ns": ns[0], "large_ns": ns[1]})
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +40,20 @@ def of_times(first: list[float], second: list[float]) -> Ratio:
     single = [a / b for a, b in zip(first, second, strict=True)]
     low, _, high = statistics.quantiles(single, n=4)
     return Ratio(min(first) / min(second), low, high, min(first), min(second))
+
+
+def best_in_turns(
+    works: Sequence[Work], turns: int, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
+    """The best seconds of each, one warm-up of each before."""
+    found = [float("inf")] * len(works)
+    for turn in range(turns + 1):
+        for n, work in enumerate(works):
+            begun = clock()
+            work()
+            if turn:
+                found[n] = min(found[n], clock() - begun)
+    return found
 
 
 def best(work: Work, turns: int = 5) -> float:

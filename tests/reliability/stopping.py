@@ -19,8 +19,9 @@ from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Recorder, columns_of
 from pbdkit.runs import drivers
+from pbdkit.runs.continuation import take_up
 from pbdkit.runs.course import Report, Run, record
-from pbdkit.runs.standing import take_up
+from pbdkit.runs.processes import Processes
 from pbdkit.scene.scene import build_scene
 from pbdkit.storage.run_files import is_unfinished
 from pbdkit.storage.unfinished import UnfinishedRun
@@ -72,7 +73,7 @@ def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any])
         scene, standing = build_scene(experiment), left.standing()
         sink = NetcdfSink(output)
         run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
-        take_up(run.driver, recorder, standing)
+        take_up(run.driver, recorder, standing, Processes())
         sink.go_on(left, standing, columns_of(scene), compression_of(experiment))
     except BaseException:
         left.close()

@@ -33,6 +33,8 @@ from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink
 from pbdkit.storage.seal import SealedFile, opened
 
 OUTPUT = "out.nc"
+OF_A_RUN = ("created", "ranks")
+"""The attributes that say when and by how many processes it was made."""
 BASE: dict[str, Any] = {
     "name": "trial",
     "lattice": {"type": "square", "a": 1.0},
@@ -190,7 +192,7 @@ def _different(first: Any, second: Any) -> Iterator[str]:
 
 
 def _attributes(of: Any) -> dict[str, Any]:
-    return {k: np.asarray(v).tolist() for k, v in of.attrs.items() if k != "created"}
+    return {k: np.asarray(v).tolist() for k, v in of.attrs.items() if k not in OF_A_RUN}
 
 
 def _bytes(values: Any) -> bytes:

@@ -1,0 +1,122 @@
+"""The processes that share a run, each by its rank, and what they say to each other by MPI."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+import numpy as np
+
+from pbdkit.errors import PbdkitError
+from pbdkit.runs.processes import Processes
+from pbdkit.storage.pieced_array import Bytes
+
+FAILED = 1
+"""The exit status of a run that is given up because one process failed."""
+
+
+class Ranks(Processes):
+    """The processes of a communicator, of which this one is `rank` of `size`. All but `agreeing`
+    raise nothing; each call is made by all of them, in the same order."""
+
+    def __init__(self, comm: Any) -> None:
+        self._comm = comm
+        self.rank, self.size = int(comm.rank), int(comm.size)
+        self.first = self.rank == 0
+
+    def told(self, value: Any) -> Any:
+        """The first process's value, to all."""
+        return self._comm.bcast(value)
+
+    def every(self, value: Any) -> list[Any]:
+        """The values of all processes, by rank, to all."""
+        return list(self._comm.allgather(value))
+
+    def most(self, value: float) -> float:
+        """The largest number of all; not a number where one is none."""
+        return float(np.max(self.every(value)))
+
+    def any(self, value: bool) -> bool:
+        """Whether it is so in any process."""
+        mine, found = np.array([value], np.uint8), np.empty(self.size, np.uint8)
+        self._comm.Allgather(mine, found)
+        return bool(found.any())
+
+    def send(self, block: Bytes, rank: int) -> None:
+        """To one process, which receives as many bytes."""
+        self._comm.Send(block, rank)
+
+    def receive(self, into: Bytes, rank: int) -> None:
+        """From one process, as many bytes as there is room for."""
+        self._comm.Recv(into, rank)
+
+    def dealt(self, each: Iterable[Any] | None) -> Any:
+        """To each process what the first has for it, made one after the other."""
+        if each is None:
+            return self._comm.recv(source=0)
+        own: Any = None
+        for rank, value in enumerate(each):
+            if rank == 0:
+                own = value
+            else:
+                self._comm.send(value, rank)
+        return own
+
+    def exchange(self, sent: dict[int, Bytes], received: dict[int, Bytes]) -> None:
+        """Sends bytes to some ranks, and fills what is to be received from them."""
+        waiting = [self._comm.Irecv(into, rank) for rank, into in received.items()]
+        waiting += [self._comm.Isend(of, rank) for rank, of in sent.items()]
+        for request in waiting:
+            request.Wait()
+
+    @contextmanager
+    def agreeing(self) -> Iterator[None]:
+        """What is raised in the block, in any process, is raised in all of them at its end: the
+        error of the lowest rank."""
+        error: Exception | None = None
+        try:
+            yield
+        except Exception as raised:
+            error = raised
+        self.raise_first(error)
+
+    def raise_first(self, error: Exception | None) -> None:
+        """Raises the error of the lowest rank that has one, in all processes."""
+        if not self.any(error is not None):
+            return
+        errors = self.every(error and _carried(error))
+        first = next(n for n, one in enumerate(errors) if one is not None)
+        raised: Exception = error if first == self.rank and error else errors[first]
+        raise raised
+
+    @contextmanager
+    def speaking(self) -> Iterator[None]:
+        """The first process alone says what ends the block. What is no PbdkitError ends all
+        processes at once: others would wait for this one for ever."""
+        try:
+            yield
+        except PbdkitError as error:
+            error.told = not self.first
+            raise
+        except BaseException:
+            self.abort()
+
+    def abort(self) -> NoReturn:
+        """Ends all processes, after saying why."""
+        traceback.print_exc()
+        sys.stderr.flush()
+        self._comm.Abort(FAILED)
+        raise SystemExit(FAILED)
+
+
+def _carried(error: Exception) -> Exception:
+    """An error that can be sent: itself, or one that says the same."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return PbdkitError(str(error))
+    return error

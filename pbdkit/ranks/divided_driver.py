@@ -1,0 +1,177 @@
+"""The driver of a part: what all processes decide together about a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pbdkit.equilibrium.certificate import Certificate
+from pbdkit.equilibrium.settlement import Settling
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.solvers import Settle
+from pbdkit.interfaces import Draws
+from pbdkit.ranks.communicator import Ranks
+from pbdkit.ranks.divided_stepper import DividedStepper
+from pbdkit.ranks.halo import Halo, part_of_state
+from pbdkit.ranks.part import part_of
+from pbdkit.ranks.subdomain import subdomains
+from pbdkit.results.progress import StoppedError, Watch
+from pbdkit.runs.drivers import SECONDS_A_VALUE, Driver, Stepwise
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.choice import Choice, choose, make_engine
+from pbdkit.stepping.guard import EVERY, Guard, most_of, size_of
+from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.state import State, initial_state
+
+
+class Division:
+    """A scene cut up among processes: this one's part, and how a state of it is put together with
+    those of the others. The first process keeps the `whole` scene where somebody measures on it."""
+
+    def __init__(self, ranks: Ranks, scene: Scene) -> None:
+        self.ranks, self.count = ranks, scene.raster.count
+        measured = any(not each.local for each in scene.experiment.diagnostics)
+        self.whole = scene if ranks.first and measured else None
+        self.subdomains = subdomains(scene, ranks.size)
+        self.part = part_of(scene, self.subdomains[ranks.rank])
+        self.scene = self.part.scene
+        self.halo = Halo(ranks, self.subdomains, self.part)
+
+    def begun(self, scene: Scene) -> tuple[State, bool]:
+        """The part of the state at time 0, and whether it can be made again from the part alone:
+        random numbers are drawn for the whole."""
+        experiment = scene.experiment
+        if experiment.initial.at_rest and not any(
+            isinstance(part, Draws) for part in (experiment.rule, experiment.fracture)
+        ):
+            return initial_state(self.scene), True
+        return part_of_state(initial_state(scene), self.part), False
+
+    def dealt(self, whole: State | None) -> State:
+        """The part of a state that the first process has."""
+        members = self.ranks.every(self.part.members)
+        if whole is None or not self.ranks.first:
+            return self._state(None)
+        cut = (
+            part_of_state(whole, replace(self.part, subdomain=own, members=some))
+            for own, some in zip(self.subdomains, members, strict=True)
+        )
+        return self._state(cut)
+
+    def _state(self, each: Iterable[State] | None) -> State:
+        found: State = self.ranks.dealt(each)
+        return found
+
+    def gathered(self, state: State) -> State | None:
+        """The whole state, in the first process."""
+        return self.halo.gathered(state)
+
+
+class DividedWatch(Watch):
+    """All stop where one is asked to; the first shows how far the run is."""
+
+    def __init__(self, ranks: Ranks, watch: Watch) -> None:
+        super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
+
+
+@dataclass
+class DividedGuard(Guard):
+    """Looks at all parts."""
+
+    ranks: Ranks
+
+    def most(self, state: State) -> float:
+        """The largest of all."""
+        return self.ranks.most(super().most(state))
+
+    def worst(self, scene: Scene, state: State) -> int:
+        """That of the part with the largest, the first on ties."""
+        found = self.ranks.every((super().most(state), super().worst(scene, state)))
+        return int(found[int(np.argmax([most for most, _ in found]))][1])  # NaN is largest
+
+
+class DividedSettling(Settling):
+    """The first process looks whether the whole has settled."""
+
+    def __init__(self, division: Division, scene: Scene, settle: Settle) -> None:
+        self._division, self._settling = division, None
+        if division.ranks.first:
+            self._settling = Settling(scene, settle, initial_state(scene), Watch())
+        self._agree(None)
+
+    def _agree(self, found: Certificate | None) -> Certificate | None:
+        """On what the first process has found."""
+        own = self._settling
+        told = self._division.ranks.told(own and (found, own.pace, own.obstacle))
+        certificate: Certificate | None = told[0]
+        self.pace, self.obstacle = told[1:]
+        return certificate
+
+    def look(self, state: State) -> Certificate | None:
+        """As one process does. Raises StoppedError in all."""
+        whole, found, ranks = self._division.gathered(state), None, self._division.ranks
+        error: Exception | None = None
+        if self._settling and whole is not None:
+            self._settling.pace, self._settling.obstacle = self.pace, self.obstacle
+            try:
+                found = self._settling.look(whole)
+            except StoppedError as stopped:
+                error = stopped
+        ranks.raise_first(error)
+        return self._agree(found)
+
+
+class DividedStepwise(Stepwise):
+    """Steps a part; decides with the others."""
+
+    def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
+        ranks, self._division = division.ranks, division
+        _refuse(scene)
+        start, anew = division.begun(scene)
+        Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
+        self._engine, self.choice = self._made(ranks.told(choose(scene)))
+        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count / ranks.size)
+        size = size_of(scene) + ranks.most(most_of(start))
+        self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
+        self.settling, self.kept = None, -1
+        if asked := scene.experiment.stepping.settle:
+            self.settling = DividedSettling(division, scene, asked)
+
+    def _made(self, choice: Choice) -> tuple[Engine, Choice]:
+        """A thread a process, unless more are asked for."""
+        division, ranks = self._division, self._division.ranks
+        if self.scene.experiment.stepping.threads == "auto":
+            choice = replace(choice, threads=1)
+        with ranks.agreeing():
+            engine, choice = make_engine(division.scene, choice)
+        steps = division.part.subdomain.steps
+        return DividedStepper(ranks, division.scene, engine, division.halo, steps), choice
+
+    def _steps_in(self, seconds_a_step: float) -> int:
+        """As the first process finds it."""
+        return int(self._division.ranks.told(super()._steps_in(seconds_a_step)))
+
+    def standing(self) -> dict[str, Any]:
+        """With the state of the whole, as it is joined."""
+        return super().standing() | {"state": self._division.halo.joined(self.state)}
+
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """From the state of the whole, which the first process has."""
+        ranks = self._division.ranks
+        rest = ranks.told({key: part for key, part in standing.items() if key != "state"})
+        state = self._division.dealt(standing.get("state") if ranks.first else None)
+        super().take_up(rest | {"state": state})
+
+
+def _refuse(scene: Scene) -> None:
+    experiment = scene.experiment
+    unfit = ((experiment.neighbours.nearness(), "neighbours", "are found anew in every step"),)
+    for clash, field, text in unfit:
+        if clash:
+            raise ExperimentError(
+                f"{field} {text}, which several processes cannot share yet; run it in one process",
+                (field,),
+            )

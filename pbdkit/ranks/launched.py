@@ -1,0 +1,38 @@
+"""Whether several processes were started together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pbdkit.registry.extras import refuse_without
+from pbdkit.runs.processes import Processes
+
+SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
+"""How many processes launchers of MPI programs say in the environment that there are."""
+RANK = "PMIX_RANK"
+"""What others leave there."""
+
+
+@contextmanager
+def launched() -> Iterator[Processes]:
+    """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
+    and this one alone where it was not.
+
+    Raises ExperimentError where mpi4py is missing.
+    """
+    if RANK not in os.environ and all(os.environ.get(name, "1") == "1" for name in SIZES):
+        yield Processes()
+        return
+    refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
+    from mpi4py import MPI
+
+    if MPI.COMM_WORLD.size == 1:
+        yield Processes()
+        return
+    from pbdkit.ranks.divided_run import SharingRanks
+
+    ranks = SharingRanks(MPI.COMM_WORLD)
+    with ranks.speaking():
+        yield ranks

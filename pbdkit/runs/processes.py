@@ -1,0 +1,30 @@
+"""Those who carry out a run together: here one process, alone."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import Run
+from pbdkit.scene.scene import Scene
+
+
+class Processes:
+    """One process, which has nobody to talk to. Each call is made by all of several processes."""
+
+    first: bool = True
+    """Whether this one speaks for all: it reads, writes and talks to the user."""
+    size: int = 1
+
+    def told(self, value: Any) -> Any:
+        """The value that the first process has."""
+        return value
+
+    def agreeing(self) -> AbstractContextManager[None]:
+        """What is raised in the block, in any process, is raised in all of them at its end."""
+        return nullcontext()
+
+    def run(self, scene: Scene, watch: Watch) -> Run:
+        """The run of a scene that they make together."""
+        return Run(scene, watch=watch)

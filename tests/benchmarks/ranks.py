@@ -1,0 +1,134 @@
+"""Several processes on one lattice: against one and against threads, what an exchange costs, and
+what each holds in memory."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from sheets import Running, moving, scene_of
+
+from pbdkit.ranks.divided_driver import Division
+from pbdkit.ranks.divided_run import SharingRanks
+from pbdkit.ranks.divided_stepper import DividedStepper
+from pbdkit.runs.course import peak_memory
+from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+
+SIZE, STEPS, TURNS = 3000, 32, 9
+HELD, PARTS, SMALL = 4000, 4, 200
+PAUSE_S = 0.01
+
+
+def ranks() -> dict[str, Any] | None:
+    """None where there is no mpiexec, which is said."""
+    if not shutil.which("mpiexec"):
+        print("ranks: not measured: there is no mpiexec: pip install mpich")
+        return None
+    found = _on(2, "speed")[0]
+    one, every = _on(1, "memory")[0], _on(PARTS, "memory")
+    return found | {"alone_bytes": one, "rank_bytes": every}
+
+
+def _on(size: int, what: str) -> list[Any]:
+    """What the processes of a launch have noted, by rank."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, __file__, what, folder]
+        subprocess.run([*(["mpiexec", "-n", str(size)] * (size > 1)), *command], check=True)
+        return [json.loads((Path(folder) / str(n)).read_text()) for n in range(size)]
+
+
+class Sharing:
+    """A sheet under way on all ranks; a call makes so many steps more."""
+
+    def __init__(self, ranks: SharingRanks) -> None:
+        scene = scene_of(moving(SIZE))
+        self.division = Division(ranks, scene)
+        part, self.halo = self.division.scene, self.division.halo
+        engine, steps = CompiledStepper(part, 1), self.division.part.subdomain.steps
+        self.steps = steps
+        self._stepper = DividedStepper(ranks, part, engine, self.halo, steps)
+        self.state, _ = self.division.begun(scene)
+
+    def __call__(self) -> None:
+        self.state = self._stepper.advance(self.state, STEPS)
+
+
+def speed(ranks: SharingRanks) -> dict[str, float]:
+    """Best seconds of so many steps, in turns; while one process works the others sleep."""
+    shared = Sharing(ranks)
+    alone = [Running(moving(SIZE), STEPS, threads=n) for n in (1, 2)] if ranks.first else []
+    seconds: dict[str, list[float]] = {"shared": [], "exchange": [], "1": [], "2": []}
+    for turn in range(TURNS + 1):
+        for name, work in (
+            ("shared", shared),
+            ("exchange", lambda: shared.halo.renew(shared.state)),
+        ):
+            ranks.any(False)
+            begun = time.perf_counter()
+            work()
+            ranks.any(False)
+            seconds[name] += [time.perf_counter() - begun] * (turn > 0)
+        for running in alone:
+            begun = time.perf_counter()
+            running()
+            seconds[str(running.engine.threads)] += [time.perf_counter() - begun] * (turn > 0)
+        _wait(ranks)
+    best = {name: min(taken, default=0.0) for name, taken in seconds.items()}
+    sent = sum(rows.stop - rows.start for rows in shared.halo.received.values()) * SIZE * 32
+    return best | {"steps": STEPS, "size": SIZE, "between": shared.steps, "sent_bytes": sent}
+
+
+def _wait(ranks: SharingRanks) -> None:
+    """For the first process, asleep."""
+    if ranks.first:
+        for rank in range(1, ranks.size):
+            ranks._comm.send(None, rank)
+    else:
+        while not ranks._comm.iprobe(source=0):
+            time.sleep(PAUSE_S)
+        ranks._comm.recv(source=0)
+
+
+def memory(ranks: SharingRanks | None) -> float:
+    """Bytes that a run of a large body takes in this process beyond one of a small body."""
+    from pbdkit.experiment.model import Experiment
+    from pbdkit.results.netcdf_sink import NetcdfSink
+    from pbdkit.results.progress import Watch
+    from pbdkit.runs.course import record
+    from pbdkit.runs.processes import Processes
+    from pbdkit.scene.scene import build_scene
+
+    held = []
+    for size in (SMALL, HELD):
+        with tempfile.TemporaryDirectory() as folder:
+            parts = moving(size, initial={"type": "reference"}, steps=20, record={"every": 20})
+            solver = {"type": "stepping", "engine": "compiled", "threads": 1}
+            experiment = Experiment.model_validate(parts | {"solver": solver})
+            run = (ranks or Processes()).run(build_scene(experiment), Watch())
+            record(run, run.sink(NetcdfSink(Path(folder) / "out.nc")))
+            held.append(peak_memory())
+    return float(held[1] - held[0])
+
+
+def main() -> None:
+    """One of the processes of a launch."""
+    what, folder = sys.argv[1:]
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    found: Any
+    if comm.size == 1:
+        found = memory(None)
+    else:
+        found = {"speed": speed, "memory": memory}[what](SharingRanks(comm))
+    (Path(folder) / str(comm.rank)).write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Random scenes run by one process and by several, which must give the same file.
+
+    mpiexec -n 3 python tests/reliability/rank_runs.py [--trials N] [--seed S] [--only NUMBER]
+
+Variables, attributes and the final state are compared bit for bit, but for `created` and `ranks`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from mpi4py import MPI
+from trials import differences, row
+
+# isort: split
+from scene_strategies import calibrated_experiments, experiments, pulled_apart  # beside trials
+
+from pbdkit.errors import PbdkitError
+from pbdkit.experiment.model import Experiment
+from pbdkit.ranks.divided_run import SharingRanks
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import record
+from pbdkit.runs.processes import Processes
+from pbdkit.scene.scene import build_scene
+
+Parts = dict[str, Any]
+ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])
+
+
+def drawn(count: int, number: int) -> list[Parts]:
+    """So many experiments from a seed, each with one of the engines."""
+    found: list[Parts] = []
+    kinds = st.one_of(
+        experiments(),
+        experiments(leaders=pulled_apart(), fracturing=st.just(True)),
+        calibrated_experiments(),
+    )
+
+    @seed(number)
+    @settings(
+        max_examples=count, database=None, deadline=None, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(kinds, ENGINES)
+    def draw(parts: Parts, engine: str) -> None:
+        solver = {"type": "stepping"} | parts.get("solver", {}) | {"engine": engine}
+        found.append(parts | {"solver": solver})
+
+    draw()
+    return found
+
+
+def ran(parts: Parts, output: Path, processes: Processes) -> str:
+    """Runs it into a file; what was refused, and in whose words."""
+    try:
+        scene = build_scene(Experiment.model_validate(parts))
+        run = processes.run(scene, Watch())
+        record(run, run.sink(NetcdfSink(output, replace=True)))
+    except PbdkitError as error:
+        return str(error)
+    return ""
+
+
+def tried(parts: Parts, folder: Path, ranks: SharingRanks) -> tuple[str, list[str]]:
+    """What came of it, and in what the file of several processes differs."""
+    alone = ranks.told(ran(parts, folder / "one.nc", Processes()) if ranks.first else "")
+    several = ran(parts, folder / "several.nc", ranks)
+    if alone or several:
+        shared = "several processes" in several or "too few for" in several
+        differs = [] if alone == several or (shared and not alone) else [alone, several]
+        return ("not shared" if shared else "refused"), differs
+    return "compared", differences(folder / "one.nc", folder / "several.nc") if ranks.first else []
+
+
+def main() -> None:
+    """As many trials as asked for, or one."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--trials", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", type=int)
+    asked = parser.parse_args()
+    ranks = SharingRanks(MPI.COMM_WORLD)
+    with ranks.speaking():
+        every = ranks.told(drawn(asked.trials, asked.seed) if ranks.first else None)
+        chosen = range(len(every)) if asked.only is None else [asked.only]
+        counts, wrong = Counter[str](), 0
+        with tempfile.TemporaryDirectory() as folder:
+            for number in chosen:
+                outcome, found = ranks.told(tried(every[number], Path(folder), ranks))
+                counts[outcome] += 1
+                wrong += bool(found)
+                if found and ranks.first:
+                    print(f"number {number}: {'; '.join(found)}", file=sys.stderr, flush=True)
+                if asked.only is not None and ranks.first:
+                    print(every[number])
+        if ranks.first:
+            row(f"random scenes on {ranks.size} processes {dict(counts)}: that differ", str(wrong))
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Several processes played by threads of one: what mpi4py's communicator does, over queues."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from queue import Queue
+from typing import Any
+
+from pbdkit.ranks.divided_run import SharingRanks
+
+PATIENCE_S = 120.0
+
+
+class ThreadComm:
+    """Of one thread; all share `boxes`, a queue for each pair."""
+
+    def __init__(self, rank: int, size: int, boxes: dict[tuple[int, int], Queue[Any]]) -> None:
+        self.rank, self.size, self._boxes = rank, size, boxes
+
+    def send(self, value: Any, dest: int) -> None:
+        self._boxes[self.rank, dest].put(pickle.dumps(value))
+
+    def recv(self, source: int) -> Any:
+        return pickle.loads(self._boxes[source, self.rank].get(timeout=PATIENCE_S))
+
+    def Send(self, array: Any, dest: int) -> None:  # noqa: N802
+        self.send(array.copy(), dest)
+
+    def Recv(self, into: Any, source: int) -> None:  # noqa: N802
+        into[...] = self.recv(source)
+
+    def Isend(self, array: Any, dest: int) -> Request:  # noqa: N802
+        self.Send(array, dest)
+        return Request(lambda: None)
+
+    def Irecv(self, into: Any, source: int) -> Request:  # noqa: N802
+        return Request(lambda: self.Recv(into, source))
+
+    def allgather(self, value: Any) -> list[Any]:
+        for rank in range(self.size):
+            self.send(value, rank)
+        return [self.recv(rank) for rank in range(self.size)]
+
+    def Allgather(self, mine: Any, found: Any) -> None:  # noqa: N802
+        found[...] = [value[0] for value in self.allgather(mine)]
+
+    def bcast(self, value: Any) -> Any:
+        if self.rank == 0:
+            for rank in range(self.size):
+                self.send(value, rank)
+        return self.recv(0)
+
+    def Abort(self, code: int) -> None:  # noqa: N802
+        raise SystemExit(code)
+
+
+class Request:
+    """What is waited for."""
+
+    def __init__(self, wait: Callable[[], None]) -> None:
+        self.Wait = wait
+
+
+def on_ranks(size: int, work: Callable[[SharingRanks], Any]) -> list[Any]:
+    """What the work comes to in each of so many processes; raises what the first of them raises."""
+    boxes: dict[tuple[int, int], Queue[Any]] = {
+        (a, b): Queue() for a in range(size) for b in range(size)
+    }
+    with ThreadPoolExecutor(size) as threads:
+        comms = [ThreadComm(rank, size, boxes) for rank in range(size)]
+        every = [threads.submit(work, SharingRanks(comm)) for comm in comms]
+        return [one.result() for one in every]
