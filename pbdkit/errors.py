@@ -23,6 +23,8 @@ class PbdkitError(Exception):
     """
 
     exit_status: ClassVar[int] = 1
+    told: bool = False
+    """Whether the user knows of it already, from another process."""
 
     def __init__(self, message: str, where: Sequence[str | int] = ()) -> None:
         super().__init__(printable(message))

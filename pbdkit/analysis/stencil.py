@@ -75,30 +75,34 @@ def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any],
     return evaluator.move(summed(parts), here._replace(own=evaluator.initial_own()))
 
 
-def _derivative(scene: Scene, slots: Sequence[Slot], of: Slot | None, at: Here) -> Floats:
-    """∂move/∂u_k at rest, or ∂move/∂u_j with all neighbours where they are, (axis, axis)."""
-    columns = []
-    for along in np.eye(scene.axes):
+def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
+    """∂move/∂u_j at rest with all neighbours where they are, and after it ∂move/∂u_k of each slot,
+    (1 + slot, axis of the move, axis of u); all of them are asked for at once."""
+    count, axes = 1 + len(slots), scene.axes
+    nudges = np.eye(count * axes).reshape(count, axes, -1)
+    seen = dict(zip(slots, nudges[1:] - nudges[0], strict=True))
 
-        def moved(step: complex, along: Floats = along) -> Any:
-            nudge = vector(np.multiply(step, component) for component in along)
-            still = vector(np.zeros(scene.axes))
+    def moved(step: complex) -> Any:
+        def difference(slot: Slot) -> Any:
+            return vector(step * seen[slot])
 
-            def difference(slot: Slot) -> Any:
-                return -nudge if of is None else nudge if slot is of else still
+        return move(scene, slots, difference, at._replace(u=vector(step * nudges[0])))
 
-            return move(scene, slots, difference, at._replace(u=nudge if of is None else still))
-
-        columns.append(derivative(moved))
-    return np.array(columns).T
+    found = derivative(moved, nudges.shape[-1:])
+    return found.reshape(axes, count, axes).swapaxes(0, 1)
 
 
 def linearised(scene: Scene, at: Here = NOWHERE) -> Stencil:
     """The stencil of the scene's rule, of all its rules together where it works on the moves of
     another; `at` says where for rules that ask."""
     every = scene.neighbourhood.slots
-    own = np.array([_derivative(scene, slots, None, at) for slots in every])
-    neighbours = {s: _derivative(scene, slots, s, at) for slots in every for s in slots}
+    found = [_derivatives(scene, slots, at) for slots in every]
+    own = np.array([answers[0] for answers in found])
+    neighbours = {
+        slot: answer
+        for slots, answers in zip(every, found, strict=True)
+        for slot, answer in zip(slots, answers[1:], strict=True)
+    }
     stencil = Stencil(own, neighbours)
     return _composed(stencil, linearised(scene.inner, at)) if scene.inner else stencil
 

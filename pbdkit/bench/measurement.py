@@ -19,6 +19,7 @@ from pbdkit.bench.size import resized
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.stepping.choice import processors
+from pbdkit.stepping.gpu.limits import what_is_missing
 
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 METHODS = ("lu", "multigrid", "conjugate-gradients")
@@ -75,6 +76,7 @@ class Row:
 def engines() -> list[tuple[str, str, int]]:
     """Engine, precision and threads of all ways to step, the reference first."""
     ways = [("numpy", 1), *(("compiled", n) for n in dict.fromkeys((1, processors())))]
+    ways += [] if what_is_missing() else [("gpu", 1)]
     return [(name, kind, threads) for name, threads in ways for kind in ("float64", "float32")]
 
 

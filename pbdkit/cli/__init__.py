@@ -186,7 +186,7 @@ def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: 
 
 def _report(error: BaseException) -> int:
     if isinstance(error, errors.PbdkitError):
-        return _failed(str(error), error.exit_status)
+        return error.exit_status if error.told else _failed(str(error), error.exit_status)
     if _of_memory(error):
         told = f"out of memory: {error}" if str(error) else "out of memory"
         return _failed(f"{told}; `pbdkit check` estimates what an experiment needs", 6)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CURVES = ("stress-strain", "load-displacement", "energies")
-CRACKS = {"crack": "map", "crack-length": "length", "broken-bonds": "bonds"}
+CRACKS: dict[str, Any] = {"crack": "map", "crack-length": "length", "broken-bonds": "bonds"}
 HISTORY = "history"
 
 
@@ -74,19 +74,19 @@ def _named(kind: str | None, asked: dict[str, Any]) -> str:
 
 def _drawn(
     dataset: xarray.Dataset,
-    kind: str | None,
+    kind: Any,
     x: str | None,
     y: str | None,
     particles: tuple[int, ...],
     bond: tuple[int, int] | None,
-    **chosen: int | None,
+    **chosen: Any,
 ) -> Axes:
     from pbdkit.drawing.crack import crack
     from pbdkit.drawing.curve import curve
     from pbdkit.drawing.history import history
 
     if kind in CRACKS:
-        return crack(dataset, kind=CRACKS[kind])  # type: ignore[arg-type]  # one of its kinds
+        return crack(dataset, kind=CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):
         return history(dataset, y, particle=particles or None, bond=bond)
-    return curve(dataset, x, y, kind=kind, **chosen)  # type: ignore[arg-type]  # one of its kinds
+    return curve(dataset, x, y, kind=kind, **chosen)

@@ -46,26 +46,31 @@ def run(
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output, refuse_unfinished
+    from pbdkit.ranks.launched import launched
     from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.results.overlapping_sink import OverlappingSink
-    from pbdkit.runs.course import Run, record
+    from pbdkit.runs.course import record
     from pbdkit.scene.scene import build_scene
 
-    with folder_kept():
-        loaded = load(experiment, settings=settings)
-        path = output or Path(loaded.name.replace("/", "-") + ".nc")
-    refuse_output(path, force=force, experiment=Path(experiment))
-    scene = build_scene(loaded)
-    refuse_unfinished(path, force=force)
-    given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
-    origin = {"experiment": given, "settings": list(settings)}
-    file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
-    _warn(disk_warnings(path, scene), quiet)
-    with _watched(path, quiet or as_json, file) as (stop, watch):
-        one = Run(scene, watch=watch)
-        _warn(one.warnings, quiet)
-        report = record(one, OverlappingSink(file))
-    return _tell(one, report, file, path, stop, quiet, as_json)
+    with launched() as processes:
+        with processes.agreeing():
+            with folder_kept():
+                loaded = load(experiment, settings=settings)
+                path = output or Path(loaded.name.replace("/", "-") + ".nc")
+            if processes.first:
+                refuse_output(path, force=force, experiment=Path(experiment))
+            scene = build_scene(loaded)
+            if processes.first:
+                refuse_unfinished(path, force=force)
+        given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
+        origin = {"experiment": given, "settings": list(settings)}
+        file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
+        quiet = quiet or not processes.first
+        _warn(disk_warnings(path, scene), quiet)
+        with _watched(path, quiet or as_json, file) as (stop, watch):
+            one = processes.run(scene, watch)
+            _warn(one.warnings, quiet)
+            report = record(one, one.sink(file))
+        return _tell(one, report, file, path, stop, quiet, as_json and processes.first)
 
 
 @click.command()
@@ -76,18 +81,21 @@ def run(
 @json_option
 def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:
     """Go on with an interrupted run that was to write OUT.nc, to the same result bit for bit."""
+    from pbdkit.ranks.launched import launched
     from pbdkit.runs.resumption import resumption
 
-    with _watched(output, quiet or as_json) as (stop, watch):
-        found = resumption(output, watch, steps=steps, anyway=anyway)
-        if found is None:
-            if not quiet:
-                click.echo(f"{output}: was finished, and is whole")
-            return 0
-        _warn(found.run.warnings, quiet)
-        with _told_what_is_kept(output, found.sink):
-            report = found.record()
-    return _tell(found.run, report, found.sink, output, stop, quiet, as_json)
+    with launched() as processes:
+        quiet, as_json = quiet or not processes.first, as_json and processes.first
+        with _watched(output, quiet or as_json) as (stop, watch):
+            found = resumption(output, watch, steps=steps, anyway=anyway, processes=processes)
+            if found is None:
+                if not quiet:
+                    click.echo(f"{output}: was finished, and is whole")
+                return 0
+            _warn(found.run.warnings, quiet)
+            with _told_what_is_kept(output, found.sink):
+                report = found.record()
+        return _tell(found.run, report, found.sink, output, stop, quiet, as_json)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ class PE1(Diagnostic):
 
     type: Literal["pe1"] = "pe1"
 
+    local: ClassVar[bool] = True
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
@@ -40,6 +41,7 @@ class PE1Intact(Diagnostic):
 
     type: Literal["pe1-intact"] = "pe1-intact"
 
+    local: ClassVar[bool] = True
     needs: ClassVar[frozenset[Need]] = frozenset({"bonds"})
 
     def variables(self) -> tuple[Variable, ...]:
@@ -57,6 +59,8 @@ class PE2(Diagnostic):
 
     type: Literal["pe2"] = "pe2"
 
+    local: ClassVar[bool] = True
+
     def variables(self) -> tuple[Variable, ...]:
         """`pe2`."""
         return (Variable("pe2", ("particle",), "pseudo-energy PE2", LENGTH.lattice),)
@@ -71,6 +75,8 @@ class Displacement(Diagnostic):
     """u = x - X, with all its digits however far from the origin the body lies."""
 
     type: Literal["displacement"] = "displacement"
+
+    local: ClassVar[bool] = True
 
     def variables(self) -> tuple[Variable, ...]:
         """`u`."""

@@ -45,6 +45,7 @@ class Strain(Diagnostic):
     type: Literal["strain"] = "strain"
     measure_: Measure = "small"
 
+    local: ClassVar[bool] = True
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
@@ -67,6 +68,7 @@ class Rotation(Diagnostic):
 
     type: Literal["rotation"] = "rotation"
 
+    local: ClassVar[bool] = True
     needs: ClassVar[frozenset[Need]] = frozenset({"cells"})
 
     def variables(self) -> tuple[Variable, ...]:
@@ -92,6 +94,7 @@ class Stress(Diagnostic):
     youngs_modulus: Modulus = Field(default_factory=unset)
     measure_: Measure = "small"
 
+    local: ClassVar[bool] = True
     needs: ClassVar[frozenset[Need]] = frozenset({"cells", "material"})
 
     def variables(self) -> tuple[Variable, ...]:

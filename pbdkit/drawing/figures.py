@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -19,6 +20,13 @@ def figure_of(ax: Axes) -> Figure:
     """The whole that axes are in."""
     found = ax.get_figure(root=True)
     assert found is not None
+    return found
+
+
+def renderer_of(figure: Figure) -> RendererBase:
+    """What measures text: figures made here have Agg's."""
+    canvas: Any = figure.canvas
+    found: RendererBase = canvas.get_renderer()
     return found
 
 

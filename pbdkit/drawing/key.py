@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
+from pbdkit.drawing.figures import renderer_of
 from pbdkit.drawing.layers import INK
 from pbdkit.drawing.palette import Palette
 from pbdkit.drawing.scale import Scale
@@ -29,7 +30,7 @@ TEXT_PT, SMALL_PT = 9.0, 8.0
 
 def inches(figure: Figure, artist: Artist) -> tuple[float, float]:
     """How wide and tall something is, with all that belongs to it."""
-    box = artist.get_tightbbox(figure.canvas.get_renderer())  # type: ignore[attr-defined]  # Agg's
+    box = artist.get_tightbbox(renderer_of(figure))
     return (box.width / figure.dpi, box.height / figure.dpi) if box else (0.0, 0.0)
 
 
@@ -99,7 +100,7 @@ class ScaleBar:
     def put(self, left: float, bottom: float, room: float) -> None:
         """There, in inches from the lower left corner of the whole; along it in the middle of
         that `room`."""
-        page, renderer = self._figure.get_size_inches(), self._figure.canvas.get_renderer()  # type: ignore[attr-defined]
+        page, renderer = self._figure.get_size_inches(), renderer_of(self._figure)
         width, height = (THICK_IN, self._length) if self.beside else (self._length, THICK_IN)
         self._ax.set_position((left / page[0], bottom / page[1], width / page[0], height / page[1]))
         box = self._ax.get_tightbbox(renderer)
@@ -147,7 +148,7 @@ def text_inches(figure: Figure, text: str, points: float) -> tuple[float, float]
     """How wide and tall a line of text is."""
     probe = Text(0, 0, text, fontsize=points)
     probe.set_figure(figure)
-    box = probe.get_window_extent(figure.canvas.get_renderer())  # type: ignore[attr-defined]
+    box = probe.get_window_extent(renderer_of(figure))
     return box.width / figure.dpi, box.height / figure.dpi
 
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator
 
-from pbdkit.drawing.figures import new_figure
+from pbdkit.drawing.figures import new_figure, renderer_of
 from pbdkit.drawing.key import Legend, ScaleBar, shortened, text_inches
 from pbdkit.drawing.plan import Panels, Plan, Room, best_plan
 from pbdkit.errors import ExperimentError
@@ -57,8 +57,8 @@ class Page:
         return ax
 
     def _text(self, text: str, **more: Any) -> Text:
-        style = {"fontsize": TEXT_PT, "ha": "center", "va": "center"} | more
-        return self.figure.text(0, 0, text, **style)  # type: ignore[arg-type]  # style is mixed
+        style: dict[str, Any] = {"fontsize": TEXT_PT, "ha": "center", "va": "center"} | more
+        return self.figure.text(0, 0, text, **style)
 
     def arrange(self, bar: ScaleBar | None, legend: Legend | None, larger: float = 1.0) -> Plan:
         """Puts everything in its place, on a page so many times `larger` than that of a journal,
@@ -200,7 +200,7 @@ class Page:
 
     def _measure(self, plan: Plan) -> None:
         """What ticks take beside the panels."""
-        dpi, renderer = self.figure.dpi, self.figure.canvas.get_renderer()  # type: ignore[attr-defined]
+        dpi, renderer = self.figure.dpi, renderer_of(self.figure)
         left = bottom = over = 0.0
         for ax in self.axes:
             for axis in (ax.xaxis, ax.yaxis):

@@ -55,8 +55,8 @@ def _shape(value: Any, info: ValidationInfo) -> Any:
         return Facing.model_validate(value, context=info.context)
     if isinstance(value, dict) and (kind := str(value.get("type"))) in NO_OBSTACLES:
         raise fault(NO_OBSTACLES[kind], key="type")
-    # pydantic's type allows for a function that is given no info, which this one is.
-    return _bodies.func(value, info)  # type: ignore[call-arg]
+    build: Any = _bodies.func  # pydantic's type allows for a function that is given no info
+    return build(value, info)
 
 
 AnyShape = Annotated[

@@ -94,14 +94,14 @@ class Stepping(Solver):
 
     `relaxation` w and `memory` b apply to any rule's move, for followers only:
     x(t+1) = m + w · move + b · (x(t) - x(t-1)); each may be a course in time. `engine`: numpy,
-    compiled, or what serves the scene best; `precision` is that of the run's own numbers; `threads`
-    for the compiled engine. With
-    `settle` the run ends where it has settled, after `steps` at the latest. `auto` for `relaxation`
-    or `memory` takes what lets the slowest mode of the scene shrink fastest; results hold numbers.
+    compiled, gpu, or what serves the scene best, never gpu; `precision` is that of the run's own
+    numbers; `threads` for the compiled engine. With `settle` the run ends where it has settled,
+    after `steps` at the latest. `auto` for `relaxation` or `memory` takes what lets the slowest
+    mode of the scene shrink fastest; results hold numbers.
     """
 
     type: Literal["stepping"] = "stepping"
-    engine: Literal["auto", "numpy", "compiled"] = "auto"
+    engine: Literal["auto", "numpy", "compiled", "gpu"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     threads: Threads = "auto"
     asked_relaxation: Relaxation = Field(default=1.0, alias="relaxation")

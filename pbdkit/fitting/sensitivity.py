@@ -141,10 +141,6 @@ class Resting:
         moves = self.along(self._moves, led) if pushed is None else pushed
         return self._with_frame(0.0, led + self._answer(moves, led.tobytes()))
 
-    def answers(self, led: Sequence[Floats]) -> list[Floats]:
-        """Those of several."""
-        return [self.answer(each) for each in led]
-
     def along(self, function: Callable[[Floats], Floats], way: Floats) -> Floats:
         """The derivative of a function of displacements along a way from here: of a linear scene
         its difference, else by central differences."""

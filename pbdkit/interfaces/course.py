@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any, Generic, TypeVar
@@ -57,14 +58,16 @@ class Course(Strict, Generic[Value]):
     def bends(self) -> tuple[int, ...]:
         """The steps at whose end it begins to change, changes otherwise or ceases to."""
         knots = list(zip(self.steps, self._values, strict=True))
-        slopes = [0.0, *((d - b) / (c - a) for (a, b), (c, d) in pairwise(knots)), 0.0]
+        flat = (0.0, False)  # what is so small that its slope is zero is not flat
+        slopes = [flat, *(((d - b) / (c - a), d != b) for (a, b), (c, d) in pairwise(knots)), flat]
         ways = zip(self.steps, pairwise(slopes), strict=True)
         return tuple(step for step, (before, after) in ways if before != after)
 
     def next_change(self, step: int) -> float:
         """The first step after `step` at whose end it is another than at that one's; infinite where
         there is none."""
-        if self.at(step + 1) != self.at(step):
+        k = bisect_right(self.steps, step)
+        if 0 < k < len(self.steps) and self.values[k - 1] != self.values[k]:
             return step + 1
         return min((bend + 1 for bend in self.bends[:-1] if bend > step), default=math.inf)
 
@@ -75,8 +78,9 @@ class Course(Strict, Generic[Value]):
 
     @property
     def _values(self) -> tuple[float, ...]:
-        values: Any = self.values
-        return values  # type: ignore[no-any-return]  # what stands for Value is a number
+        values: Any = self.values  # what stands for Value is a number
+        found: tuple[float, ...] = values
+        return found
 
 
 class NumberCourse(Course[float]):

@@ -224,6 +224,9 @@ class Diagnostic(Component):
     """Measure at every step (dimension `step`) instead of at recorded ones (`time`)."""
     at_end: ClassVar[bool] = False
     """Measure once, after the last step; the variables have no leading dimension."""
+    local: ClassVar[bool] = False
+    """Whether what it measures at a particle depends on that and its neighbours alone. Each process
+    then measures on its own part of a lattice that is cut up; else one gathers the whole."""
     own_dimension: ClassVar[str] = ""
     """With `at_end`: a dimension that gets its length from the values, known only then."""
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL
-from pbdkit.analysis.stencil import bounds_the_body, wave_bound
+from pbdkit.analysis.stencil import Bound, bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.units import LENGTH
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
@@ -83,7 +83,7 @@ def forecast(scene: Scene) -> Forecast:
     analysis, solver = Analysis(scene), scene.experiment.stepping
     sizes = _sizes(analysis)
     swing = analysis.swing(solver.relaxation, solver.memory) if solver.memory else None
-    waves = [] if analysis.spectrum else _growing_waves(scene)
+    waves = [] if analysis.spectrum else _growing_waves(scene, wave_bound(scene))
     return Forecast(
         particles=scene.raster.count,
         followers=int(np.count_nonzero(kinds == FOLLOWER)),
@@ -131,15 +131,15 @@ def _sizes(analysis: Analysis) -> Sizes:
     return sizes_of(scene.experiment, scene.neighbourhood, count, grids=grids)
 
 
-def quick_warnings(scene: Scene) -> tuple[str, ...]:
-    """What can be said in milliseconds, before a run."""
-    return (*_doubts(scene), *_growing_waves(scene))
+def quick_warnings(scene: Scene, bound: Bound | None) -> tuple[str, ...]:
+    """What can be said in milliseconds, before a run, with its bound from plane waves."""
+    return (*_doubts(scene), *_growing_waves(scene, bound))
 
 
-def prediction(scene: Scene) -> dict[str, Any]:
+def prediction(scene: Scene, bound: Bound | None) -> dict[str, Any]:
     """What the dataset keeps of the bound from plane waves; empty where there is none. `stable` is
     None where no wave grows and waves do not bound the body."""
-    bound, memory = wave_bound(scene), scene.experiment.stepping.memory
+    memory = scene.experiment.stepping.memory
     if bound is None:
         return {}
     return {
@@ -203,8 +203,8 @@ def _doubts(scene: Scene) -> list[str]:
     return warnings
 
 
-def _growing_waves(scene: Scene) -> list[str]:
-    bound, solver = wave_bound(scene), scene.experiment.stepping
+def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
+    solver = scene.experiment.stepping
     if bound is None or bound.radius <= 1.0 + NEUTRAL:
         return []
     stable = bound.largest_stable_relaxation(solver.memory)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import Moment, RenewsBonds, RenewsParticles, Variable
+from pbdkit.interfaces import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values, When
@@ -115,8 +116,10 @@ class Measured:
             values[column.name] = np.where(now.body, value, np.nan) if of_body else value
         return values
 
-    def diagnosed(self, when: When, now: Moment) -> Values:
-        """What the diagnostics of that time measure, by variable.
+    def diagnosed(
+        self, when: When, now: Moment, which: Callable[[Diagnostic], bool] = lambda _: True
+    ) -> Values:
+        """What the diagnostics of that time measure, by variable; of all, or of those `which`.
 
         Raises PluginError for another shape than declared, and FloatingPointError for what is not
         finite; at the end such values stay: the run may have ended because of them.
@@ -124,7 +127,7 @@ class Measured:
         values: Values = {}
         told = "at the end" if when is When.END else f"at step {now.step}"
         for n, diagnostic in enumerate(self._diagnostics):
-            if layout.when_measured(diagnostic) is not when:
+            if layout.when_measured(diagnostic) is not when or not which(diagnostic):
                 continue
             sizes, own = dict(self.sizes), diagnostic.own_dimension
             with blaming(diagnostic, told, "diagnostics", n):
@@ -141,7 +144,7 @@ class Measured:
                             f"'{variable.name}' has the shape {np.shape(value)}, not {shape}"
                         )
                     if when is not When.END:
-                        _refuse_infinite(variable, value, now)
+                        _refuse_infinite(variable, value, now, self._scene.raster.before)
                     values[variable.name] = (
                         np.array(value) if factor == 1.0 else np.multiply(value, factor)
                     )
@@ -157,9 +160,11 @@ def _refuse_taken(name: str, taken: set[str], what: str) -> None:
     taken.add(name)
 
 
-def _refuse_infinite(variable: Variable, value: Any, now: Moment) -> None:
+def _refuse_infinite(variable: Variable, value: Any, now: Moment, before: int) -> None:
     fine = variable.is_recordable(value, now.body)
     if not fine.all():
         place = np.argwhere(~fine)[0]
-        whose = f"particle {place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
+        whose = (
+            f"particle {before + place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
+        )
         raise FloatingPointError(f"{variable.name} of {whose} at step {now.step}")

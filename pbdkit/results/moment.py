@@ -43,6 +43,10 @@ class StateMoment(Moment):
         self._state, self._tables = state, tables.at(state.step)
         self._scene, self._raster = tables.scene, tables.scene.raster
 
+    def of(self, state: State, tables: Tables) -> StateMoment:
+        """The same moment of another state."""
+        return StateMoment(state, tables, self._no_later_than)
+
     @property
     def body(self) -> NDArray[np.bool_]:
         """The same at every moment."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column, Values, When
 from pbdkit.storage.paged_file import PagedFile
+from pbdkit.storage.pieced_array import PiecedArray
 
 CHUNK_BYTES = 2**20
 """About a chunk: several entries where they are small, a part of one where they are large. Reading
@@ -68,7 +69,8 @@ class NetcdfFile:
         """Keeps growing columns until a chunk is full."""
         for name, value in values.items():
             if self._columns[name].grows:
-                self.waiting[name].append(value)
+                one = isinstance(value, PiecedArray) and self._batch[name] == 1
+                self.waiting[name].append(value if one else np.asarray(value))
                 if len(self.waiting[name]) >= self._batch[name]:
                     self._append(name)
             else:
@@ -94,7 +96,7 @@ class NetcdfFile:
         self._content.close()
         self._h5.close()
 
-    def add_group(self, name: str, facts: str, arrays: Mapping[str, Array]) -> None:
+    def add_group(self, name: str, facts: str, arrays: Mapping[str, Any]) -> None:
         """Arrays, and what else there is to say of them, apart from the dataset."""
         group = self._content.create_group(name)
         group.attrs["facts"] = facts
@@ -103,7 +105,8 @@ class NetcdfFile:
             group.dimensions.update(dims)
             # The library would give empty arrays chunks larger than they are.
             heuristic = {"chunking_heuristic": "h5py"}
-            group.create_variable(key, tuple(dims), array.dtype, data=array, **heuristic)
+            variable = group.create_variable(key, tuple(dims), array.dtype, **heuristic)
+            _fill(variable, array)
 
     def give_up(self) -> None:
         """What was put is not wanted; nothing is raised."""
@@ -150,13 +153,10 @@ class NetcdfFile:
         variable, dim = self._content[name], self._columns[name].dims[0]
         if (end := begin + len(entries)) > self._content.dimensions[dim].size:
             self._lengthen(dim, 2 * end)
-        # A large one is stored as it is, not copied.
-        values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
         dataset = variable._h5ds
-        values, across = values.astype(dataset.dtype, copy=False), (0,) * (values.ndim - 1)
-        for first in range(0, max(1, values.shape[1]), dataset.chunks[1]) if across else [0]:
-            part = values[:, first : first + dataset.chunks[1]] if across else values
-            place = (begin, first, *across[1:]) if across else (begin,)
+        for first, part in _parts(entries, dataset.chunks):
+            place = (begin, first, *(0,) * part.ndim)[: part.ndim]
+            part = part.astype(dataset.dtype, copy=False)
             self._write_chunk(dataset, place, _padded(part, dataset.chunks))
         self.written[name], self.waiting[name] = end, []
 
@@ -175,12 +175,35 @@ class NetcdfFile:
         if column.dtype == "str":
             variable[...] = np.asarray(value, dtype=object)
             return
-        values = np.asarray(value, variable.dtype)
+        values = value if isinstance(value, PiecedArray) else np.asarray(value, variable.dtype)
         if column.when is When.END and column.dims and variable.shape != values.shape:
             for dim, length in zip(column.dims, values.shape, strict=True):
                 self._lengthen(dim, length)
-        if values.size:
-            variable[...] = values
+        _fill(variable, values)
+
+
+def _fill(variable: Any, values: Array | PiecedArray) -> None:
+    """Writes all of a variable, as it comes."""
+    if isinstance(values, PiecedArray):
+        for place, tile in values.tiles(CHUNK_BYTES):
+            variable[place] = tile
+    elif values.size:
+        variable[...] = values
+
+
+def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
+    """Entries, (entry, ...), chunk by chunk along their first dimension, and where each begins."""
+    if isinstance(entries[0], PiecedArray):
+        for n, rows in enumerate(entries[0].rows(chunks[1])):
+            yield n * chunks[1], rows[None]
+        return
+    # A large one is stored as it is, not copied.
+    values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
+    if values.ndim == 1:
+        yield 0, values
+        return
+    for first in range(0, max(1, values.shape[1]), chunks[1]):
+        yield first, values[:, first : first + chunks[1]]
 
 
 def _chunks(

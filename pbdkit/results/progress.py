@@ -27,7 +27,7 @@ class Watch:
         show: Callable[[str, float], None] = lambda what, share: None,
     ) -> None:
         self.load, self._what = "", ""
-        self.stopping, self._show = stopping, show
+        self.stopping, self.show = stopping, show
 
     def begin(self, what: str) -> None:
         """Something else is done from now on. Raises StoppedError."""
@@ -38,7 +38,7 @@ class Watch:
         self._what = what or self._what
         if self.stopping():
             raise StoppedError
-        self._show(self.load + self._what, min(1.0, max(0.0, share)))
+        self.show(self.load + self._what, min(1.0, max(0.0, share)))
 
 
 @contextmanager

@@ -65,7 +65,7 @@ class Recorder:
     def _known(self) -> Iterator[Values]:
         """What is known before the first step; made one after the other, and not all at once."""
         raster, scene = self._scene.raster, self._scene
-        numbers = np.arange(1, raster.count + 1)
+        numbers = raster.before + np.arange(1, raster.count + 1)
         yield {"particle": numbers, "number": numbers}
         yield {"axis": np.array(list("xyz"[: scene.axes]))}
         site = raster.site_table()
@@ -75,7 +75,11 @@ class Recorder:
         if scene.experiment.shows_bonds:
             bonds = scene.bonds
             yield {"bond": np.arange(1, len(bonds.ends) + 1, dtype=np.int32), "shell": bonds.shell}
-            yield {"bond_ends": np.add(bonds.ends, 1, dtype=np.int32, casting="same_kind")}
+            yield {
+                "bond_ends": np.add(
+                    bonds.ends, 1 + raster.before, dtype=np.int32, casting="same_kind"
+                )
+            }
         if self._measured.shows_leaders:
             yield {"leader_group": np.arange(len(scene.leading))}
         if self._measured.shows_loads:
@@ -90,8 +94,16 @@ class Recorder:
         its end, which may have come before without that; else a step that was seen is left out.
         Raises FloatingPointError where a recorded value has left the finite numbers; nothing of
         that step is kept."""
-        if state.step <= self.seen.step and not last:
-            return
+        if state.step > self.seen.step or last:
+            self._put(state, self._taken(state, last))
+
+    def _put(self, state: State, values: Values) -> None:
+        if values:
+            self.sink.put(self._twins.beside(values))
+        self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
+
+    def _taken(self, state: State, last: bool) -> Values:
+        """What is wanted of a step."""
         moment, experiment = StateMoment(state, self._tables), self._scene.experiment
         values: Values = {}
         late = last and state.step > self.seen.recorded
@@ -99,17 +111,19 @@ class Recorder:
         if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
+                before = self._scene.raster.before
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
-                raise FloatingPointError(f"particle {row + 1} at step {state.step}")
+                raise FloatingPointError(f"particle {before + row + 1} at step {state.step}")
             values = {"time": state.step, "position": position, "kind": moment.kind()}
             values |= self._measured.remembered(moment, first=self.seen.recorded < 0)
-            values |= self._measured.diagnosed(When.RECORD, moment)
+            values |= self._diagnosed(When.RECORD, moment)
         stepped = recorded or experiment.solver.makes_steps
         if self._measured.every_step and stepped and not last:
-            values |= {"step": state.step} | self._measured.diagnosed(When.STEP, moment)
-        if values:
-            self.sink.put(self._twins.beside(values))
-        self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
+            values |= {"step": state.step} | self._diagnosed(When.STEP, moment)
+        return values
+
+    def _diagnosed(self, when: When, moment: StateMoment) -> Values:
+        return self._measured.diagnosed(when, moment)
 
     def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
         """Hands over what is known at the end, and the attributes, with what was predicted before
@@ -117,14 +131,17 @@ class Recorder:
         # Where a run diverged, what broke since the last record is no result.
         diverged = outcome.status == "diverged"
         moment = StateMoment(state, self._tables, self.seen.recorded if diverged else state.step)
-        if not diverged and (warning := moment.cells.inside_out()):
+        if not diverged and (warning := self._inside_out(state)):
             self.warnings = (warning,)
         if self._scene.has_fracture:
             steps, strains = moment.broken_step(), moment.broken_strain()
             self.sink.put({"broken_step": steps, "broken_strain": strains})
         with np.errstate(all="ignore"):
-            self.sink.put(self._twins.beside(self._measured.diagnosed(When.END, moment)))
+            self.sink.put(self._twins.beside(self._diagnosed(When.END, moment)))
         self.sink.finish(self._attributes(outcome, prediction))
+
+    def _inside_out(self, state: State) -> str | None:
+        return StateMoment(state, self._tables).cells.inside_out()
 
     def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment

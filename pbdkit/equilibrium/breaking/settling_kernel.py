@@ -36,7 +36,7 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
     run.add(0, "for n in range(most):", f"    {mark.call()}")
     run.add(1, f"if not {known.call()} or not {settle.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")
-    run.add(1, judge.call(*ROWS), f"if not {changed.call('slack')}:")
+    run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
     run.add(2, f"return n, {SETTLED}")
     run.add(0, f"return most, {GOES_ON}")
     functions = [general, moves, derive, judge, mark, changed, known, settle]

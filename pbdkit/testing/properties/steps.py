@@ -22,8 +22,10 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import MemorySink
 from pbdkit.results.tables import Tables
+from pbdkit.runs.continuation import take_up
 from pbdkit.runs.course import Run, record
-from pbdkit.runs.standing import standing_of, take_up
+from pbdkit.runs.processes import Processes
+from pbdkit.runs.standing import standing_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.evaluator import Evaluator
@@ -193,7 +195,8 @@ def _refuse_other_records(scene: Scene, again: Scene) -> None:
     kept = standing_of(left.driver, recorder)
     facts = json.loads(json.dumps(kept.facts))
     rest, recorder = Run(again), Recorder(again, parts)
-    take_up(rest.driver, recorder, Standing(kept.about, facts, kept.copied().arrays))
+    standing = Standing(kept.about, facts, kept.copied().arrays)
+    take_up(rest.driver, recorder, standing, Processes())
     record(rest, parts, recorder=recorder)
     found, needed = (
         {str(name): values for name, values in sink.dataset().variables.items()}
