@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import os
 import signal
@@ -41,6 +43,12 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
+def pytest_collection_finish() -> None:
+    """What is there by now stays to the end: nobody need look through it for garbage again."""
+    gc.collect()
+    gc.freeze()
+
+
 Build = Callable[..., Scene]
 Refused = Callable[..., str]
 Install = Callable[..., None]
@@ -63,6 +71,15 @@ def _figures_are_closed() -> Iterator[None]:
     yield
     if pyplot := sys.modules.get("matplotlib.pyplot"):
         pyplot.close("all")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _memory_is_given_back() -> Iterator[None]:
+    """The C library would keep what large bodies took, in every worker."""
+    yield
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        gc.collect()
+        trim(0)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ ORDER = [
     "equilibrium",
     "prediction",
     "runs",
+    "ranks",
     "sweeps",
     "fitting",
     "drawing",

@@ -92,7 +92,7 @@ def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
     for _ in increments.increments(scene, kept, Watch(), since):
         pass
     assert (kept.bond_values[-1] > 0.0).any()
-    for mine, others in zip(kept._arrays(), whole._arrays(), strict=True):
+    for mine, others in zip(kept.arrays(), whole.arrays(), strict=True):
         np.testing.assert_array_equal(mine, others)
 
 

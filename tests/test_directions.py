@@ -97,7 +97,7 @@ def test_the_kernels_agree_to_the_last_bit(case):
     with interpreting():
         found = list(states(scene, CompiledStepper(scene), (1, 2, 5)))
     for one, other in zip(found, states(scene, Stepper(scene), (1, 2, 5)), strict=True):
-        for values, expected in zip(one._arrays(), other._arrays(), strict=True):
+        for values, expected in zip(one.arrays(), other.arrays(), strict=True):
             np.testing.assert_array_equal(values, expected)
 
 
@@ -120,7 +120,7 @@ def test_a_clamped_run_goes_on_from_a_copy_of_its_state():
     *_, half, _ = states(scene, Stepper(scene), (3, 5))
     *_, whole = states(scene, Stepper(scene), (8,))
     gone_on = Stepper(scene).advance(half, 5)
-    for values, expected in zip(gone_on._arrays(), whole._arrays(), strict=True):
+    for values, expected in zip(gone_on.arrays(), whole.arrays(), strict=True):
         np.testing.assert_array_equal(values, expected)
 
 

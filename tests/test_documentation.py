@@ -34,6 +34,17 @@ def blocks(language):
     ]
 
 
+COARSER = {
+    '{"lattice.a": 0.5}': '{"lattice.a": 1.25}',
+    '{"lattice.a": 0.25}': '{"lattice.a": 1.5}',
+    '"folds": 3': '"folds": 2',
+}
+"""What is changed in `fitting.md`: its finer rivals take half a minute; the builder of the site has
+them."""
+FEW = ["--every", "20"]
+"""Steps of a movie: it draws all of them alike."""
+
+
 def is_sweep(code):
     return re.search("^experiment:", code, re.M) is not None
 
@@ -64,7 +75,11 @@ def test_notebooks_run(page, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     module = ModuleType("a_notebook")
     monkeypatch.setitem(sys.modules, module.__name__, module)  # so that its classes can be found
-    cells = re.findall(r"^```\{code-cell\}\n(.*?)^```", page.read_text(), re.M | re.S)
+    text = page.read_text()
+    for fine, coarse in COARSER.items() if page.stem == "fitting" else ():
+        assert fine in text
+        text = text.replace(fine, coarse)
+    cells = re.findall(r"^```\{code-cell\}\n(.*?)^```", text, re.M | re.S)
     for cell in cells:
         exec(compile(cell, page.name, "exec"), vars(module))
     report = vars(module).get("report")
@@ -95,7 +110,8 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
         if line.startswith("$ pbdkit live "):
             assert_served_until_interrupted(line.removeprefix("$ "))
             continue
-        result = CliRunner().invoke(program, shlex.split(line.removeprefix("$ pbdkit ")))
+        words = shlex.split(line.removeprefix("$ pbdkit "))
+        result = CliRunner().invoke(program, words + FEW * (words[0] == "animate"))
         if "barycenter" in line:
             assert "did you mean 'barycentre'?" in str(result.exception)
         else:

@@ -41,7 +41,7 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs.py --trials 8 --kinds breaking",
+        "kill_runs.py --trials 4 --kinds breaking",
         "two_writers.py --trials 3 --kinds small",
         "mutate_stores.py --trials 2 --kinds breaking",
         "equilibria.py fracture --trials 3",
@@ -225,7 +225,7 @@ def test_clocks_that_are_set_back_show_in_no_figure(
 def put(key: str, data: bytes) -> None:
     """Something else in the store, as if it had been written so."""
     with RunStore(store_of(OUT), mode="rw") as store:
-        store.commit({key: data})
+        store.commit([(key, data)])
 
 
 def test_a_newer_store_is_refused_with_its_version(

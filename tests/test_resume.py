@@ -218,7 +218,7 @@ def test_what_changed_since_is_refused(
     assert (refused.code, "e.json has changed since the run began" in refused.err) == (2, True)
     Path("e.json").write_text(json.dumps(stopped))
     with monkeypatch.context() as other:
-        other.setattr("pbdkit.runs.resumption.version", lambda name: "99.0")
+        other.setattr("pbdkit.runs.earlier_run.version", lambda name: "99.0")
         refused = call("resume", str(OUT))
         assert (refused.code, "and 99.0 is installed" in refused.err) == (2, True)
         assert call("resume", str(OUT), "--anyway").code == 0
@@ -229,8 +229,9 @@ CONTINUED = ["plain", "everything", "memory", "fracture", "small records", "zlib
 
 @pytest.mark.parametrize("change", CONTINUED)
 def test_a_finished_run_is_continued_to_the_longer_one(
-    change: str, tensile: dict[str, Any], tmp_path: Path
+    change: str, tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("pbdkit.runs.earlier_run.BLOCK_BYTES", 3000)  # several rows, not all
     given = tensile | RUNS[change]
     given |= {"steps": given.get("steps", 10) + 17}
     whole, shorter = tmp_path / "whole.nc", tmp_path / "shorter.nc"

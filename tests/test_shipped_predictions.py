@@ -26,15 +26,16 @@ BARE = [n for n in shipped_names() if not pbdkit.load(n).obstacles and n not in 
 TORN = [n for n in BARE if pbdkit.load(n).fracture.type != "none"]
 STEPS = [n for n in TORN if pbdkit.load(n).solver.makes_steps and n != "modelling/ageing"]
 """A bar that has aged is in two halves at once, of which nothing holds one against sliding."""
-STEPPED = "solver={type: stepping, relaxation: 0.2}"
+STEPPED = "solver={type: stepping, relaxation: 0.2, memory: 0.8}"
 SWINGING = "solver={type: stepping, memory: 0.9}"
+SWINGING_LONG = "solver={type: stepping, memory: 0.95}"
 SMALLER = {
     "material/bar": ["lattice.a=0.2"],
-    "modelling/strip": ["units.length=3.125 mm", SWINGING],
-    "material/cantilever": ["lattice.a=0.25"],
+    "modelling/strip": ["units.length=3.125 mm", SWINGING_LONG],
+    "material/cantilever": ["lattice.a=0.25", "solver={type: stepping, memory: 0.7}"],
     "material/hole": ["lattice.a=0.2"],
-    "modelling/cantilever-weight": ["lattice.a=0.5", SWINGING],
-    "modelling/hanging-bar": ["lattice.a=0.5", SWINGING],
+    "modelling/cantilever-weight": ["lattice.a=0.5", SWINGING_LONG],
+    "modelling/hanging-bar": ["lattice.a=0.5", SWINGING_LONG],
     "modelling/double-cantilever": [
         "body.columns=13",
         "cuts=[{from: [-1.0, 5.5], to: [3.25, 5.5]}]",
@@ -42,13 +43,14 @@ SMALLER = {
     ],
     "modelling/inclusion": ["lattice.a=1.0", SWINGING],
     "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
-    "modelling/composite-plate": ["lattice.a=4.0", SWINGING],
+    "modelling/composite-plate": ["lattice.a=4.0", SWINGING_LONG],
     "modelling/weakest-place": ["body.columns=8", SWINGING],
     "material/gradient-layer": ["lattice.a=0.1", STEPPED],
-    "paper/e-40": ["body={type: grid, columns: 20, rows: 20}"]
+    "start": ["body={type: grid, columns: 12, rows: 6}"],
+    "paper/e-40": ["body={type: grid, columns: 12, rows: 12}"]
     + [
         f"leaders.{n}.select={{nearest: [[{x}, {y}]]}}"
-        for n, (x, y) in enumerate([(9, 9), (9, 10), (10, 9), (10, 10)])
+        for n, (x, y) in enumerate([(5, 5), (5, 6), (6, 5), (6, 6)])
     ],
 }
 """Settings of shorter variants where the experiment itself would take minutes to settle, and of

@@ -5,7 +5,8 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, advanced, body_sites, scene_of
 
 from pbdkit.components.neighbours import Chebyshev, Coordination
-from pbdkit.prediction.forecast import forecast, quick_warnings
+from pbdkit.prediction.forecast import forecast
+from pbdkit.runs.course import Run
 from pbdkit.scene.neighbourhood import build_neighbourhood
 
 SQUARE = {"type": "square", "a": 1.0}
@@ -126,4 +127,4 @@ def test_an_equilibrium_that_smaller_steps_reach_is_not_warned_of():
     ]
     assert len(warned[0]) == 1
     assert warned[1] == []
-    assert not any("diverge" in w for w in quick_warnings(scene_of(**parts, solver=straight)))
+    assert not any("diverge" in w for w in Run(scene_of(**parts, solver=straight)).warnings)

@@ -405,5 +405,5 @@ def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
 
 
 def test_under_fire(tmp_path):
-    found = under_fire(tmp_path, members=80, kills=1, workers=2)
-    assert found == {"exit": 0, "killed": 1, "right": 80, "wrong": 0, "run again": 0}
+    found = under_fire(tmp_path, members=40, kills=1, workers=2)
+    assert found == {"exit": 0, "killed": 1, "right": 40, "wrong": 0, "run again": 0}
