@@ -66,6 +66,14 @@ def plugins(session: nox.Session) -> None:
 
 
 @nox.session
+def gpu(session: nox.Session) -> None:
+    """Kernels for GPUs are compiled as far as that goes without one. The compiler takes half a
+    gigabyte, which other environments are spared."""
+    session.install("-e", ".[all,gpu]", *nox.project.dependency_groups(PROJECT, "test"))
+    session.run("pytest", "-n", "auto", "tests/test_gpu.py")
+
+
+@nox.session
 def docs(session: nox.Session) -> None:
     """The documentation site, in build/docs; a warning is an error. `nox -s docs -- unrun` leaves
     out what notebooks and gallery show: the tests run the one, the other takes a quarter of an
