@@ -179,7 +179,7 @@ def test_runs_settle_and_diverge_at_the_predicted_rate(parts, seed):
 def test_bodies_are_stable_where_run_says_that_waves_are(parts):
     """What `run` says in milliseconds against what `check` knows."""
     scene = built(parts)
-    assume(prediction(scene).get("stable"))
+    assume(prediction(scene, wave_bound(scene)).get("stable"))
     assert Analysis(scene).stable
 
 
@@ -193,7 +193,8 @@ def test_run_promises_nothing_where_waves_do_not_bound_the_body():
     }
     for frame, promise in (("none", None), ("mean", None)):
         scene = scene_of(frame={"type": frame}, **parts)
-        assert wave_bound(scene).radius <= 1.0 + 1e-9
-        assert prediction(scene)["stable"] is promise
+        bound = wave_bound(scene)
+        assert bound.radius <= 1.0 + 1e-9
+        assert prediction(scene, bound)["stable"] is promise
     scene = scene_of(frame={"type": "mean"}, **parts | {"solver": {"type": "stepping"}})
-    assert prediction(scene)["stable"] is True
+    assert prediction(scene, wave_bound(scene))["stable"] is True

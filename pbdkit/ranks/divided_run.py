@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pbdkit.analysis.stencil import wave_bound
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.solvers import Stepping
 from pbdkit.prediction.forecast import prediction, quick_warnings
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.divided_driver import DividedStepwise, Division
@@ -22,7 +21,7 @@ class DividedRun(Run):
     states of the part. Raises what any run does, in all processes."""
 
     def __init__(self, ranks: Ranks, scene: Scene, watch: Watch) -> None:
-        if not isinstance(scene.experiment.solver, Stepping):
+        if not scene.experiment.solver.makes_steps:
             refusal = "an equilibrium is found by one process; run it without mpiexec"
             raise scene.experiment.located(ExperimentError(refusal, ("solver", "type")))
         whole = tuned(scene)
