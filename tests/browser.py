@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -54,3 +55,16 @@ def page(browser: Any) -> Iterator[Any]:
     yield found
     context.close()
     assert faults == []
+
+
+def until(holds: Callable[[], Any], seconds: float = 20.0) -> None:
+    """Waits for that."""
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it never came to that"
+        time.sleep(0.01)
+
+
+def until_page(page: Any, expression: str) -> None:
+    """As `wait_for_function`, which the page's policy does not let evaluate."""
+    until(lambda: page.evaluate(expression))

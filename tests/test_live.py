@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import until, until_page
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -354,13 +355,6 @@ def test_the_judgement_says_why(settings, word, told):
     assert (found.word, told in found.why) == (word, True), found
 
 
-def until(holds, seconds=20.0):
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline, "it never came to that"
-        time.sleep(0.01)
-
-
 class Onlooker:
     """A page without a browser, over a socket."""
 
@@ -648,11 +642,6 @@ def test_what_is_missing_is_said_with_the_remedy(monkeypatch):
     for call in (lambda: pbdkit.live("paper/a"), lambda: live.main(["paper/a", "--no-browser"])):
         with pytest.raises(pbdkit.ExperimentError, match=re.escape("pip install 'pbdkit[live]'")):
             call()
-
-
-def until_page(page, expression):
-    """As `wait_for_function`, which the page's policy does not let evaluate."""
-    until(lambda: page.evaluate(expression))
 
 
 PLACE = """row => { const { view } = pbdkitLive;

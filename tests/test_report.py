@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -89,7 +90,7 @@ def test_the_slider_and_the_keys_move_the_lattice(page, sheet):
     page.keyboard.press("ArrowLeft")
     assert read.inner_text() == "step 9"
     page.keyboard.press(" ")
-    page.wait_for_function("document.querySelector('.time output').textContent > 'step 12'")
+    until(lambda: int(read.inner_text().split()[1]) > 12)
     page.keyboard.press(" ")
     show_step(page, 400)
     assert canvas.screenshot() == last
