@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
 
 import h5netcdf
 import numpy as np
@@ -271,7 +273,7 @@ def pbdkit_on(size, *arguments, folder, **more):
 def test_mpiexec_gives_the_file_of_one_process(tmp_path):
     done = pbdkit_on(3, "run", "paper/f2", "--set", "steps=40", "-o", "three.nc", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("complete: ") == 1
+    assert done.stdout.count("complete: ") == done.stdout.count(" on 3 processes") == 1
     written(pbdkit.load("paper/f2", settings=["steps=40"]).model_dump(mode="json", by_alias=True),
             tmp_path / "one.nc")  # fmt: skip
     assert_same(tmp_path / "one.nc", tmp_path / "three.nc")
@@ -285,6 +287,27 @@ def test_what_is_wrong_is_said_once(tmp_path):
     assert done.returncode == 2
     assert done.stderr.count("pbdkit: ") == 1
     assert "rule.K" in done.stderr
+    growing = ["--set", "solver.relaxation=2.5", "--set", "steps=200"]
+    done = pbdkit_on(2, "run", "paper/a", *growing, folder=tmp_path)
+    assert done.returncode == 4
+    assert done.stderr.count("pbdkit: diverged") == 1
+
+
+@pytest.mark.parametrize("names", [("PMI_SIZE",), ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK")])
+def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, call):
+    """As where the launcher is of one MPI and mpi4py of another."""
+    for name in names:
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setattr("pbdkit.ranks.launched.refuse_without", lambda *missing: None)
+    monkeypatch.setitem(sys.modules, "mpi4py", SimpleNamespace(MPI=Alone))
+    done = call("run", "e.json")
+    assert done.code == 2
+    assert "2 processes were started" in done.err
+    assert not Path("tensile.nc").exists()
+
+
+class Alone:
+    COMM_WORLD = SimpleNamespace(size=1)
 
 
 @needs_mpi

@@ -24,7 +24,7 @@ class DividedRun(Run):
         if not scene.experiment.solver.makes_steps:
             refusal = "an equilibrium is found by one process; run it without mpiexec"
             raise scene.experiment.located(ExperimentError(refusal, ("solver", "type")))
-        whole = tuned(scene)
+        whole, self.processes = tuned(scene), ranks.size
         with ranks.agreeing():
             self.division = Division(ranks, whole)
         self.scene, self.outcome = self.division.scene, None

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from pbdkit.errors import ExperimentError
 from pbdkit.registry.extras import refuse_without
 from pbdkit.runs.processes import Processes
 
@@ -20,15 +21,21 @@ def launched() -> Iterator[Processes]:
     """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
     and this one alone where it was not.
 
-    Raises ExperimentError where mpi4py is missing.
+    Raises ExperimentError where mpi4py is missing, or belongs to another launcher.
     """
-    if RANK not in os.environ and all(os.environ.get(name, "1") == "1" for name in SIZES):
+    size = max(int(os.environ.get(name, 1)) for name in SIZES)
+    if RANK not in os.environ and size == 1:
         yield Processes()
         return
     refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
     from mpi4py import MPI
 
     if MPI.COMM_WORLD.size == 1:
+        if size > 1:
+            raise ExperimentError(
+                f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
+                "another launcher; start them by that one's mpiexec"
+            )
         yield Processes()
         return
     from pbdkit.ranks.divided_run import SharingRanks

@@ -46,6 +46,9 @@ class Run:
     the file, and PluginError.
     """
 
+    processes = 1
+    """That share it."""
+
     def __init__(
         self, scene: Scene, *, start: State | None = None, watch: Watch | None = None
     ) -> None:
@@ -111,6 +114,8 @@ class Report:
     warnings: tuple[str, ...] = ()
     first: int = 0
     """The step from which on it was run."""
+    processes: int = 1
+    """That shared it."""
 
     @property
     def ns_per_particle_step(self) -> float:
@@ -144,7 +149,7 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
 
     def report(outcome: Outcome, warnings: tuple[str, ...] = ()) -> Report:
         wall_s = time.perf_counter() - begun
-        return Report(outcome, run.particles, wall_s, run.choice, warnings, first)
+        return Report(outcome, run.particles, wall_s, run.choice, warnings, first, run.processes)
 
     try:
         if recorder is None:
