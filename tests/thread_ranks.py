@@ -52,9 +52,6 @@ class ThreadComm:
                 self.send(value, rank)
         return self.recv(0)
 
-    def Abort(self, code: int) -> None:  # noqa: N802
-        raise SystemExit(code)
-
 
 class Request:
     """What is waited for."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import pickle
-import sys
-import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -95,22 +94,16 @@ class Ranks(Processes):
 
     @contextmanager
     def speaking(self) -> Iterator[None]:
-        """The first process alone says what ends the block. What is no PbdkitError ends all
-        processes at once: others would wait for this one for ever."""
+        """The first process alone says what ends the block. After what is no PbdkitError this one
+        ends all processes when it ends: others would wait for it for ever."""
         try:
             yield
         except PbdkitError as error:
             error.told = not self.first
             raise
         except BaseException:
-            self.abort()
-
-    def abort(self) -> NoReturn:
-        """Ends all processes, after saying why."""
-        traceback.print_exc()
-        sys.stderr.flush()
-        self._comm.Abort(FAILED)
-        raise SystemExit(FAILED)
+            atexit.register(self._comm.Abort, FAILED)
+            raise
 
 
 def _carried(error: Exception) -> Exception:
