@@ -97,7 +97,8 @@ RULES = {
             "poisson_ratio": 0.3,
             "modulus_ratio": 2.0,
             "shear_ratio": 0.4,
-        }
+        },
+        "solver": {"type": "stepping", "relaxation": 0.5},
     },
     "strain-gradient": CELLS
     | {
