@@ -10,13 +10,19 @@ from typing import TypeVar
 from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
+from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import asks_for_grids
 from pbdkit.stepping.state import State
 
 T = TypeVar("T")
+NOT_SHARED = (
+    "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
+    "and its frame show particles nearby; run it in one process"
+)
 
 
 def linearised(
@@ -26,12 +32,16 @@ def linearised(
     method: str,
     watch: Watch,
     moves: Moves | None = None,
+    rows: Rows = ALL,
 ) -> System:
     """The system of a scene at a state with the roles of a moment's step, by one of the solver's
     methods; `moves`, where known, serve it.
 
-    Raises ExperimentError where there is no unique solution.
+    Of a scene of which each process has some rows there is the one on stencils alone. Raises
+    ExperimentError where there is no unique solution, or none on stencils.
     """
+    if rows.strip:
+        return _shared(scene, state, math.ceil(moment), watch, rows)
     if scene.barriers:
         return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
     step = math.ceil(moment)
@@ -45,6 +55,15 @@ def linearised(
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
+
+
+def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:
+    from pbdkit.equilibrium.grids.lattice_choice import lattice_system
+
+    system = lattice_system(scene, state, step, watch, rows=rows)
+    if system is None:
+        raise ExperimentError(NOT_SHARED, ("rule",))
+    return system
 
 
 class _Replaceable(System):
