@@ -21,7 +21,8 @@ from pbdkit.stepping.state import State
 T = TypeVar("T")
 NOT_SHARED = (
     "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
-    "and its frame show particles nearby; run it in one process"
+    "its frame show particles nearby, and each axis move the other or neither; run it in one "
+    "process"
 )
 
 

@@ -75,7 +75,7 @@ def _refuse(scene: Scene) -> None:
             (
                 bool(experiment.neighbours.nearness()) or grid is None,
                 ("neighbours",),
-                "an equilibrium with such neighbours",
+                "an equilibrium whose neighbours lie farther away than in the next cell",
             ),
             (
                 grid is None or not grid.is_the_scenes,

@@ -13,7 +13,7 @@ from pbdkit.equilibrium.rows import Rows
 from pbdkit.equilibrium.strip import Strip
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.halo import Halo
-from pbdkit.ranks.subdomain import Subdomain, reaches, subdomains
+from pbdkit.ranks.subdomain import MOST_STEPS, Subdomain, reaches, subdomains
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.passes import Skew
 
@@ -65,7 +65,7 @@ def deep_subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     for own in subdomains(scene, parts):
         low = max(0, own.begin - halo) // spread * spread
         high = min(scene.raster.shape[1], own.end + halo)
-        steps = max(1, (halo - edge) // max(1, each))
+        steps = max(1, min(MOST_STEPS, (halo - edge) // max(1, each)))
         found.append(Subdomain(own.begin, own.end, low, high, edge, steps))
     return found
 

@@ -151,7 +151,7 @@ class _Assembly:
                 place = self._followers[some]
                 responses = respond(self._scene, self._state, s, place, answers)
                 fits = fits and self._add(place, responses)
-        if rows.any(not fits):
+        if rows.any(not fits) or not rows.any(len(self._followers) > 0):
             return None
         code, stencils, scale = most_first(
             self._code.reshape(self._scene.raster.shape),
