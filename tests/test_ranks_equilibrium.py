@@ -12,10 +12,10 @@ from thread_ranks import on_ranks
 
 import pbdkit
 from pbdkit.equilibrium.grids import parted_grids
+from pbdkit.results.progress import Watch
 from pbdkit.runs.processes import Processes
 from pbdkit.runs.resumption import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.results.progress import Watch
 
 pytest.importorskip("numba")
 MULTIGRID = {"type": "equilibrium", "method": "multigrid"}

@@ -10,13 +10,13 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, UnconvergedError
-from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
+from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats, State, initial_state
+from pbdkit.stepping.state import Floats, State
 
 MOST_CORRECTIONS = 12
 CONTRACTION = 0.5
@@ -56,17 +56,15 @@ class Finder:
     def linear(self) -> bool:
         """Whether the rule is, and there is no obstacle: it says so, or followers put elsewhere, at
         random and as far as the load goes, move by what the linearisation at rest says."""
-        scene, steps = self.scene, self.scene.experiment.steps
+        scene = self.scene
         if scene.barriers:
             return False
         if scene.experiment.rule.linear:
             return True
         with one_thread():
-            rest = replace(initial_state(scene), u=np.zeros_like(initial_state(scene).u))
-            system = linearised(scene, rest, steps, self.method, self.watch)
-            put = random_displacements(scene, self.scale)
-            moves = [self.moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
-            return system.mismatch(put, *moves) <= LINEAR
+            return (
+                mismatch_at_rest(scene, self.moves, self.scale, self.method, self.watch) <= LINEAR
+            )
 
     def at(self, moment: float) -> Finder:
         """The same with the numbers of a moment."""
@@ -130,7 +128,7 @@ class Search(ABC):
         largest = self._finder.rows.largest(self._left)
         if not math.isfinite(largest):
             return "it left the finite numbers"
-        if self._left.size and largest <= 8 * self._rounding():
+        if largest <= 8 * self._rounding():
             return "rounding alone allows no better"
         return "no correction makes the moves smaller"
 

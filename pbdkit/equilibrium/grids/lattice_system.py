@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grids.compliance import compliance
 from pbdkit.equilibrium.grids.fields import field_of, free_field_of, planes_of
 from pbdkit.equilibrium.grids.grid import Grid
 from pbdkit.equilibrium.grids.grid_functions import kernels
@@ -47,8 +48,6 @@ NEAR = 0.01
 """The share of the first jump at which an iteration has found most of an error."""
 TURNS = 6
 """Of inverse iteration."""
-ENOUGH = 8
-"""Iterations that tell how far a place gives way."""
 
 
 class LatticeSystem(System):
@@ -67,7 +66,10 @@ class LatticeSystem(System):
         self._matrix, self._shape, self._watch = matrix, shape, watch
         self._has_leaders = has_leaders and matrix.at is None and matrix.held is None
         self._rows, self._symmetric = rows, symmetric
-        self._grids = _grids(matrix, rows)
+        grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
+        self._grids: Multigrid | PartedGrids = (
+            PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)
+        )
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids, rows=rows)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()
@@ -227,20 +229,7 @@ class LatticeSystem(System):
 
     @cached_property
     def _compliance(self) -> float:
-        """How far a place gives way to a unit load at most: as on the coarsest grid, and on each
-        finer one by so much more as on the first of them."""
-        coarse, last = self._grids.whole, len(self._grids) - 1
-        axis, place, found = coarse.softest
-        if last == 0:
-            return found
-        depth = len(coarse) - 2
-        grid, (i, j) = coarse.grid(depth), coarse.finer_place(depth + 1, place)
-        b = grid.field(np.float64)
-        if i >= b.shape[1] or j >= b.shape[2] or grid.code[i, j] < 0:
-            return found * (last + 1)
-        b[axis, i, j] = 1.0
-        x = ConjugateGradients(coarse, depth).solve(b, lambda d: len(d.steps) >= ENOUGH).x
-        return found + max(0.0, float(x[axis, i, j]) - found) * last
+        return compliance(self._grids)
 
     def _pull(self, moves: Floats) -> Floats:
         """What K c equals, on the grid."""
@@ -252,8 +241,3 @@ class LatticeSystem(System):
     def _planes(self, field: Floats) -> Floats:
         """On the scene's raster."""
         return planes_of(self._matrix, field, self._shape)
-
-
-def _grids(matrix: StencilMatrix, rows: Rows) -> Multigrid | PartedGrids:
-    grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
-    return PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)
