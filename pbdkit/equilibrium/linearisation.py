@@ -14,7 +14,7 @@ from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.rows import ALL, Rows
-from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
+from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System, one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -66,10 +66,11 @@ def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch
     as by System.mismatch, of the linearisation at rest."""
     start, steps = initial_state(scene), scene.experiment.steps
     rest = replace(start, u=np.zeros_like(start.u))
-    system = linearised(scene, rest, steps, method, watch)
-    put = random_displacements(scene, size)
-    made = [moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
-    return system.mismatch(put, *made)
+    with one_thread():
+        system = linearised(scene, rest, steps, method, watch)
+        put = random_displacements(scene, size)
+        made = [moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
+        return system.mismatch(put, *made)
 
 
 def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:

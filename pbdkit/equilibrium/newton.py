@@ -61,10 +61,8 @@ class Finder:
             return False
         if scene.experiment.rule.linear:
             return True
-        with one_thread():
-            return (
-                mismatch_at_rest(scene, self.moves, self.scale, self.method, self.watch) <= LINEAR
-            )
+        off = mismatch_at_rest(scene, self.moves, self.scale, self.method, self.watch)
+        return off <= LINEAR
 
     def at(self, moment: float) -> Finder:
         """The same with the numbers of a moment."""
@@ -166,9 +164,6 @@ class Search(ABC):
         rounding = self._finder.rows.most(self._finder.moves.rounding(self._state.u))
         return self._system.amplification * rounding
 
-    def _floor(self) -> float:
-        return self._rounding() * math.sqrt(max(1, self._finder.rows.size(self._left)))
-
 
 class _Linear(Search):
     """By one linearisation."""
@@ -193,7 +188,8 @@ class _Linear(Search):
             correction = self._system.solve(moves, self._wanted, self._owed)
             self._shift(correction)
             self._owed = None
-            after, floor = self._finder.rows.norm(self._left), self._floor()
+            after = self._finder.rows.norm(self._left)
+            floor = self._rounding() * math.sqrt(self._finder.rows.size(self._left))
             if n == 0 and before > 1e3 * floor:
                 off = self._system.mismatch(correction, moves, self._left)
                 if not off <= LINEAR + floor / before:

@@ -30,8 +30,7 @@ from pbdkit.equilibrium.grids.lattice_krylov import (
     Krylov,
     best_of,
 )
-from pbdkit.equilibrium.grids.multigrid import Multigrid
-from pbdkit.equilibrium.grids.parted_grids import PartedGrids
+from pbdkit.equilibrium.grids.parted_grids import grids_of
 from pbdkit.equilibrium.grids.stencil_matrix import StencilMatrix, inverses
 from pbdkit.equilibrium.grids.stencil_properties import transposed
 from pbdkit.equilibrium.rows import ALL, Rows
@@ -67,9 +66,7 @@ class LatticeSystem(System):
         self._has_leaders = has_leaders and matrix.at is None and matrix.held is None
         self._rows, self._symmetric = rows, symmetric
         grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
-        self._grids: Multigrid | PartedGrids = (
-            PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)
-        )
+        self._grids = grids_of(grid, rows)
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
         self._solver: Krylov = kind(self._grids, rows=rows)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()

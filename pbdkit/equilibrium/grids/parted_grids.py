@@ -92,3 +92,8 @@ class PartedGrids(Grids):
             level.up(b, x)
             x = level.x
         return x
+
+
+def grids_of(grid: Grid, rows: Rows) -> Multigrid | PartedGrids:
+    """Those of the finest."""
+    return PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)
