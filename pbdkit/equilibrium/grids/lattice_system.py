@@ -145,7 +145,8 @@ class LatticeSystem(System):
         return np.asarray(start + found.x)
 
     def slowest(self) -> SlowMode:
-        """Roughly the mode of the steps that fades most slowly, by the coarser grids."""
+        """Roughly the mode of the steps that fades most slowly, by the coarser grids; of a lattice
+        that this process has whole."""
         mode, softness = softest(self._grids.whole, type(self._solver))
         return SlowMode(
             self._planes(mode),
