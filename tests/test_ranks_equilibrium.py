@@ -1,17 +1,31 @@
 """Several processes find the equilibrium of one, bit for bit, on grids that they share."""
 
 import json
+import re
 import tracemalloc
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from property_cases import HOLD_LEFT, pull_right
+from scene_strategies import samples
 from test_multigrid import Skew
-from test_ranks import assert_same, on, stopping_after, written, written_or_refused
+from test_ranks import (
+    assert_same,
+    needs_mpi,
+    on,
+    pbdkit_on,
+    stopping_after,
+    written,
+)
 from thread_ranks import on_ranks
 
 import pbdkit
 from pbdkit.equilibrium.grids import parted_grids
+from pbdkit.equilibrium.grids.lattice_system import LatticeSystem
+from pbdkit.equilibrium.system import StuckError
+from pbdkit.ranks.divided_rows import deep_subdomains, strip_of
 from pbdkit.results.progress import Watch
 from pbdkit.runs.processes import Processes
 from pbdkit.runs.resumption import resumption
@@ -93,15 +107,15 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_several_processes_find_what_one_does(name, tmp_path):
-    given = strip(**CASES[name])
-    compare(given, tmp_path, 3)
+    given_ = strip(**CASES[name])
+    compare(given_, tmp_path, 3)
 
 
-def compare(given, folder, size):
+def compare(given_, folder, size):
     one, several = folder / "one.nc", folder / "several.nc"
-    alone = written(given, one)
+    alone = written(given_, one)
     assert alone.status == "complete"
-    found = on_ranks(size, lambda ranks: written(given, several, ranks))
+    found = on_ranks(size, lambda ranks: written(given_, several, ranks))
     assert found == [alone] * size
     assert_same(one, several)
 
@@ -127,8 +141,11 @@ SHAPES = {
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_parts_of_every_shape(name, tmp_path):
-    given, size = SHAPES[name]
-    compare(given, tmp_path, size)
+    given_, size = SHAPES[name]
+    compare(given_, tmp_path, size)
+
+
+SENT_BACK = re.compile("run it in one process$|too few for")
 
 
 def certified(path):
@@ -138,10 +155,10 @@ def certified(path):
 
 def test_what_the_certificate_says_is_true(tmp_path):
     """Also where one process takes factors of a matrix."""
-    given = strip(body=RING, leaders=ENDS)
+    given_ = strip(body=RING, leaders=ENDS)
     exact = {"type": "equilibrium", "method": "lu", "tolerance": 1e-11}
-    written(given | {"solver": exact}, tmp_path / "exact.nc")
-    sought, path = given | {"solver": {"type": "equilibrium"}}, tmp_path / "several.nc"
+    written(given_ | {"solver": exact}, tmp_path / "exact.nc")
+    sought, path = given_ | {"solver": {"type": "equilibrium"}}, tmp_path / "several.nc"
     outcomes = on_ranks(2, lambda ranks: written(sought, path, ranks))
     (right, _), (u, certificate) = certified(tmp_path / "exact.nc"), certified(path)
     assert {one.status for one in outcomes} == {"complete"}
@@ -177,22 +194,112 @@ REFUSED = {
 
 @pytest.mark.parametrize("text", REFUSED)
 def test_what_is_not_shared_is_refused_in_one_message(text, tmp_path):
-    given = strip(**REFUSED[text])
-    refused = on_ranks(2, lambda ranks: written_or_refused(given, tmp_path / "out.nc", ranks))
+    given_ = strip(**REFUSED[text])
+    refused = on_ranks(2, lambda ranks: ended(given_, tmp_path / "out.nc", ranks))
     assert refused[0] == refused[1]
     assert text in refused[0]
     assert refused[0].endswith("run it in one process")
     assert not (tmp_path / "out.nc").exists()
 
 
+def test_where_the_iteration_gets_nowhere_one_process_is_asked_for(tmp_path, monkeypatch):
+    def stuck(*given):
+        raise StuckError
+
+    monkeypatch.setattr(LatticeSystem, "solve", stuck)
+    refused = on_ranks(2, lambda ranks: ended(strip(), tmp_path / "out.nc", ranks))
+    assert refused[0] == refused[1]
+    assert refused[0].startswith("solver: the iteration that several processes share gets nowhere")
+
+
+one_of = st.sampled_from
+RULES = [
+    {"rule": ELASTIC, "frame": {"type": "natural"}},
+    {"rule": ELASTIC | {"poisson_ratio": -0.4}, "frame": {"type": "mirror"}},
+    {"rule": {"type": "barycentre"}, "frame": {"type": "none"}},
+    {"rule": {"type": "barycentre"}, "neighbours": FOUR, "frame": {"type": "first"}},
+    {"rule": {"type": "mean-displacement"}, "frame": {"type": "mean"}},
+]
+LATTICES = [
+    {"type": "square", "a": 0.7},
+    {"type": "rectangular", "a": 1.0, "b": 1.9},
+    {"type": "rectangular", "a": 2.1, "b": 0.6},
+]
+spots = st.tuples(st.floats(1.0, 90.0), st.floats(0.0, 6.0), st.floats(0.0, 60.0))
+inner_leaders = st.builds(
+    lambda spot, axes: (
+        {
+            "select": {"box": [spot[0], spot[1], spot[0] + spot[2], spot[1] + 1.5]},
+            "motion": UP,
+        }
+        | axes
+    ),
+    spots,
+    one_of([{}, {"axes": ["x"]}, {"axes": ["y"]}]),
+)
+bodies = st.builds(
+    lambda columns, rows: {"type": "grid", "columns": columns, "rows": rows},
+    st.integers(20, 260),
+    one_of([3, 8, 14]),
+)
+starts = one_of([{}, {"initial": {"type": "noise", "amplitude": 0.1}}])
+
+
+@samples(12)
+@given(
+    bodies,
+    one_of(LATTICES),
+    one_of(RULES),
+    st.lists(inner_leaders, max_size=1),
+    starts,
+    st.integers(2, 5),
+)
+def test_random_scenes(tmp_path_factory, body, lattice, rule, inner, start, size):
+    leaders = [HOLD_LEFT, *inner]
+    given_ = strip(body=body, lattice=lattice, leaders=leaders, **start | rule)
+    folder = tmp_path_factory.mktemp("ranks")
+    one, several = folder / "one.nc", folder / "several.nc"
+    found = on_ranks(size, lambda ranks: ended(given_, several, ranks))
+    assert all(each == found[0] for each in found)
+    if SENT_BACK.search(str(found[0])):
+        return
+    assert found[0] == ended(given_, one)
+    if not isinstance(found[0], str):
+        assert_same(one, several)
+
+
+def ended(given_, path, processes=None):
+    """An outcome, or in which words it was refused."""
+    try:
+        return written(given_, path, processes)
+    except pbdkit.PbdkitError as error:
+        return str(error)
+
+
+def test_strips_cut_every_grid():
+    """Without gaps; what each process knows there contains its own rows, and some around them."""
+    scene = build_scene(pbdkit.Experiment.model_validate(strip()))
+    for parts in (2, 3, 5, 9):
+        strips = [strip_of(scene, own, parts) for own in deep_subdomains(scene, parts)]
+        while True:
+            assert [s.begin for s in strips[1:]] == [s.end for s in strips[:-1]]
+            assert (strips[0].begin, strips[-1].end) == (0, strips[0].count)
+            for s in strips:
+                assert s.first <= max(0, s.begin - 2)
+                assert s.last >= min(s.count, s.end + 2)
+            if not strips[0].depth:
+                break
+            strips = [s.coarser(1) for s in strips]
+
+
 @pytest.mark.parametrize("sizes", [(3, 2), (1, 3), (2, 1)])
 def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path):
-    given = strip(**CASES["released on the way"])
+    given_ = strip(**CASES["released on the way"])
     one, several = tmp_path / "one.nc", tmp_path / "several.nc"
-    written(given, one)
+    written(given_, one)
 
     def begin(ranks):
-        return written(given, several, ranks, stopping_after(3)).status
+        return written(given_, several, ranks, stopping_after(3)).status
 
     def go_on(ranks):
         return resumption(several, Watch(), processes=ranks).record().outcome.status
@@ -221,3 +328,14 @@ def test_no_process_holds_the_whole(monkeypatch):
 
     alone = peak(lambda: steps(Processes()))
     assert peak(lambda: on_ranks(3, steps)) < 1.5 * alone
+
+
+@needs_mpi
+def test_mpiexec_gives_the_file_of_one_process(tmp_path):
+    how = ["--set", "solver.method=multigrid"]
+    done = pbdkit_on(3, "run", "modelling/strip", *how, "-o", "three.nc", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("complete: ") == 1
+    experiment = pbdkit.load("modelling/strip", settings=how[1:])
+    written(experiment.model_dump(mode="json", by_alias=True), tmp_path / "one.nc")
+    assert_same(tmp_path / "one.nc", tmp_path / "three.nc")

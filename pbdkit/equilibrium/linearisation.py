@@ -24,8 +24,8 @@ from pbdkit.stepping.state import State, initial_state
 T = TypeVar("T")
 NOT_SHARED = (
     "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
-    "its frame show particles nearby, and each axis move the other or neither; run it in one "
-    "process"
+    "it must be stable at rest, its frame show particles nearby, and each axis move the other or "
+    "neither; run it in one process"
 )
 
 
