@@ -339,3 +339,11 @@ def test_mpiexec_gives_the_file_of_one_process(tmp_path):
     experiment = pbdkit.load("modelling/strip", settings=how[1:])
     written(experiment.model_dump(mode="json", by_alias=True), tmp_path / "one.nc")
     assert_same(tmp_path / "one.nc", tmp_path / "three.nc")
+
+
+@needs_mpi
+def test_an_end_that_is_no_equilibrium_is_said_once(tmp_path):
+    how = ["--set", "solver.tolerance=1e-17"]
+    done = pbdkit_on(2, "run", "modelling/strip", *how, "-o", "out.nc", folder=tmp_path)
+    assert done.returncode == 4
+    assert done.stderr.count("pbdkit: unconverged: ") == 1

@@ -23,7 +23,11 @@ from pbdkit.cli.stopping import Stop, asked_to_stop
 if TYPE_CHECKING:
     from pbdkit.results.netcdf_sink import NetcdfSink
     from pbdkit.results.progress import Watch
+    from pbdkit.results.recorder import Outcome
     from pbdkit.runs.course import Report, Run
+
+GOOD = "complete", "settled"
+"""How a run ends well."""
 
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 
@@ -70,7 +74,9 @@ def run(
             one = processes.run(scene, watch)
             _warn(one.warnings, quiet)
             report = record(one, one.sink(file))
-        return _tell(one, report, file, path, stop, quiet, as_json and processes.first)
+        if processes.first:
+            _tell(one, report, file, path, quiet, as_json)
+        return _exit_status(report.outcome, stop)
 
 
 @click.command()
@@ -95,7 +101,9 @@ def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: 
             _warn(found.run.warnings, quiet)
             with _told_what_is_kept(output, found.sink):
                 report = found.record()
-        return _tell(found.run, report, found.sink, output, stop, quiet, as_json)
+        if processes.first:
+            _tell(found.run, report, found.sink, output, quiet, as_json)
+        return _exit_status(report.outcome, stop)
 
 
 @contextmanager
@@ -136,30 +144,28 @@ def _warn(texts: Iterable[str], quiet: bool) -> None:
 
 
 def _tell(
-    run: Run,
-    report: Report,
-    file: NetcdfSink,
-    path: Path,
-    stop: Stop,
-    quiet: bool,
-    as_json: bool,
-) -> int:
-    """What there is to say of a run that ended; the exit status."""
+    run: Run, report: Report, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
+) -> None:
+    """What there is to say of a run that ended."""
     _warn(report.warnings, quiet)
     outcome = report.outcome
     if as_json:
         click.echo(json.dumps(_figures(report, file.written)))
-    elif not quiet and outcome.status in ("complete", "settled"):
+    elif not quiet and outcome.status in GOOD:
         _say(report, file.written, settling=run.scene.experiment.stepping.settle is not None)
-    if outcome.status in ("complete", "settled"):
-        return 0
     what = f"pbdkit: {outcome.status}: {outcome.stop_reason}"
     if outcome.status == "interrupted":
         click.echo(f"{what}; {_how_to_go_on(path)}", err=True)
-        return stop.exit_status
-    left = "" if file.written == path else f"; {path} is left as it was"
-    click.echo(f"{what}; what was recorded until then is in {file.written}{left}", err=True)
-    return 4
+    elif outcome.status not in GOOD:
+        left = "" if file.written == path else f"; {path} is left as it was"
+        click.echo(f"{what}; what was recorded until then is in {file.written}{left}", err=True)
+
+
+def _exit_status(outcome: Outcome, stop: Stop) -> int:
+    """Of the program, in all processes."""
+    if outcome.status in GOOD:
+        return 0
+    return stop.exit_status if outcome.status == "interrupted" else 4
 
 
 def _say(report: Report, path: Path, *, settling: bool) -> None:
