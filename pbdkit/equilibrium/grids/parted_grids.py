@@ -21,7 +21,8 @@ from pbdkit.equilibrium.strip import Strip
 Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]
 SMALL = 100 * COARSEST
-"""Unknowns of a grid that is not worth sharing."""
+"""Unknowns of a grid that is not worth sharing: more than four times those of the coarsest, so that
+all processes have two grids at least where any is parted."""
 
 
 class PartedGrids(Grids):
@@ -38,6 +39,7 @@ class PartedGrids(Grids):
             self._strips.append(strip)
             self._levels.append(Level(level.grid.coarser(level.halved, strip.known)))
         self.whole = Multigrid(self._joined())
+        """The grids that all processes have."""
 
     def _unknowns(self) -> int:
         own, code = self._strips[-1].own, self._levels[-1].grid.code
