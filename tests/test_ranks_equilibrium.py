@@ -132,6 +132,16 @@ SHAPES = {
         7,
     ),
     "a grid that is not worth sharing": (strip(body={"type": "grid", "columns": 9, "rows": 8}), 4),
+    "frame points that are large at the start alone": (
+        strip(
+            body={"type": "grid", "columns": 56, "rows": 3},
+            rule=ELASTIC | {"poisson_ratio": -0.4},
+            frame={"type": "mirror"},
+            leaders=[HOLD_LEFT],
+            initial={"type": "noise", "amplitude": 0.1},
+        ),
+        2,
+    ),
     "a part where nobody follows": (
         strip(leaders=[{"select": {"box": [0, 0, 129, 12]}, "motion": UP}, pull_right(0.3, 0.1)]),
         3,

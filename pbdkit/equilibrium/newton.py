@@ -161,8 +161,8 @@ class Search(ABC):
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
-        rounding = self._finder.rows.most(self._finder.moves.rounding(self._state.u))
-        return self._system.amplification * rounding
+        finder, own = self._finder, self._state.u[..., self._finder.rows.own, :]
+        return self._system.amplification * finder.rows.most(finder.moves.rounding(own))
 
 
 class _Linear(Search):

@@ -50,11 +50,12 @@ class DividedStraight(Straight):
         scene, start = self.scene, self._start or initial_state(self.scene)
         try:
             finder = finder_of(scene, start, self.watch, rows=self._rows)
-            return (
-                yield from increments(scene, state, self.watch, self.moment, finder, self._stepper)
-            )
+            way = increments(scene, state, self.watch, self.moment, finder, self._stepper)
+            certificate = yield from way
         except StuckError:
             raise ExperimentError(STUCK, ("solver",)) from None
+        self._division.halo.renew(state)  # with what frame points show there
+        return certificate
 
     def _stepper(self, scene: Scene) -> Engine:
         return self._division.stepper(self._stepping)[0]

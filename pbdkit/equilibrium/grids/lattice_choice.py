@@ -35,8 +35,8 @@ def lattice_system(
     rows: Rows = ALL,
 ) -> LatticeSystem | None:
     """The system of a scene, by the moves of its followers where these are compiled and the state
-    is not at rest; None where it has no such form, or leaders do not hold the body. A scene of which
-    each process has some `rows` has it at rest, without such moves."""
+    is not at rest; None where it has no such form, or leaders do not hold the body. A scene of
+    which each process has some `rows` has it at rest, without such moves."""
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)
         alike = DIFFERENCED
