@@ -162,6 +162,7 @@ def _tell(
 
 
 def _exit_status(outcome: Outcome, stop: Stop) -> int:
+    """Of the program, in all processes."""
     if outcome.status in ENDED:
         return 0
     return stop.exit_status if outcome.status == "interrupted" else 4

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import StuckError, System, one_thread, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
@@ -84,26 +85,27 @@ class UnconvergedError(Exception):
 """Where a search met a body that is not stable."""
 
 
-def scale_of(scene: Scene, start: State) -> float:
+def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
     """The largest prescribed displacement: of the leaders, or of the start; where nothing is
     prescribed but rest the largest that loads make, and without any the lattice's spacing."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    prescribed = max([float(abs(start.u).max()), *ways])
-    return prescribed or _way_under_loads(scene, start) or spacing_of(scene)
+    prescribed = rows.most(max([rows.largest(start.u), *ways]))
+    return prescribed or _way_under_loads(scene, start, rows) or spacing_of(scene)
 
 
-def _way_under_loads(scene: Scene, rest: State) -> float:
+def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     """The largest displacement that loads make when they change, linearised at rest; 0 where
     nothing holds the body against them."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
     pushes = [moves.at(rest, moment) for moment in sorted(moments)]
-    if any(push.any() for push in pushes):
+    if rows.any(any(push.any() for push in pushes)):
         with suppress(ExperimentError, StuckError), one_thread():
-            system = linearised(scene, rest, steps, "auto", Watch())
+            system = linearised(scene, rest, steps, "auto", Watch(), rows=rows)
             for push in pushes:
-                ways.append(float(np.abs(solved(system, push, spacing_of(scene))).max()))
+                found = solved(system, push, spacing_of(scene), rows)
+                ways.append(rows.largest(found))
     return max(ways)
 
 

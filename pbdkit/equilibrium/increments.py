@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 
 import numpy as np
 
 from pbdkit.equilibrium.breaking.choice import settler_of
-from pbdkit.equilibrium.certificate import (
-    Certificate,
-    UnconvergedError,
-    broken_bonds,
-)
+from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, broken_bonds
 from pbdkit.equilibrium.contact_search import follow_contact
 from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.load_path import last_change, moments, spacings
@@ -22,7 +18,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
-from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.choice import chosen_engine
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.prescription import place, prescribe
@@ -41,7 +37,12 @@ Way = Generator[float, None, Certificate]
 
 
 def increments(
-    scene: Scene, state: State, watch: Watch, since: float = 0.0, finder: Finder | None = None
+    scene: Scene,
+    state: State,
+    watch: Watch,
+    since: float = 0.0,
+    finder: Finder | None = None,
+    engine: Callable[[Scene], Engine] = chosen_engine,
 ) -> Way:
     """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
     moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
@@ -70,7 +71,7 @@ def increments(
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since))
     if (last := last_change(scene)) > state.step:
-        yield from _step_to(last, make_engine(scene, choose(scene))[0], state, watch)
+        yield from _step_to(last, engine(scene), state, finder)
     return _settle_at(scene, state, finder, steps)
 
 
@@ -94,11 +95,11 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
-def _step_to(last: int, engine: Engine, state: State, watch: Watch) -> Iterator[float]:
+def _step_to(last: int, engine: Engine, state: State, finder: Finder) -> Iterator[float]:
     """Steps, in calls short enough for interruptions to be heard."""
+    watch, first = finder.watch, state.step
     watch.begin("stepping until roles and loads change no more")
-    first = state.step
-    a_call = max(1, VALUES_A_CALL // state.u.size)
+    a_call = max(1, int(VALUES_A_CALL / finder.rows.most(state.u.size)))
     while state.step < last:
         reached = engine.advance(state, min(a_call, last - state.step))
         state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts

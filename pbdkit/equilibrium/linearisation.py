@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import TypeVar
 
+import numpy as np
+
 from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.matrix_system import MatrixSystem
-from pbdkit.equilibrium.moves import Moves
-from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System
+from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.rows import ALL, Rows
+from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System, one_thread
+from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import asks_for_grids
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import State, initial_state
 
 T = TypeVar("T")
+NOT_SHARED = (
+    "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
+    "it must be stable at rest, its frame show particles nearby, and each axis move the other or "
+    "neither; run it in one process"
+)
 
 
 def linearised(
@@ -26,12 +36,16 @@ def linearised(
     method: str,
     watch: Watch,
     moves: Moves | None = None,
+    rows: Rows = ALL,
 ) -> System:
     """The system of a scene at a state with the roles of a moment's step, by one of the solver's
     methods; `moves`, where known, serve it.
 
-    Raises ExperimentError where there is no unique solution.
+    Of a scene of which each process has some rows there is the one on stencils alone. Raises
+    ExperimentError where there is no unique solution, or none on stencils.
     """
+    if rows.strip:
+        return _shared(scene, state, math.ceil(moment), watch, rows)
     if scene.barriers:
         return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
     step = math.ceil(moment)
@@ -45,6 +59,27 @@ def linearised(
         if system := lattice_system(scene, state, step, watch, moves):
             return _Replaceable(system, by_matrix, at_rest=not state.u.any())
     return by_matrix()
+
+
+def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch: Watch) -> float:
+    """How far from linear the moves are of followers put elsewhere, at random and as far as a size:
+    as by System.mismatch, of the linearisation at rest."""
+    start, steps = initial_state(scene), scene.experiment.steps
+    rest = replace(start, u=np.zeros_like(start.u))
+    with one_thread():
+        system = linearised(scene, rest, steps, method, watch)
+        put = random_displacements(scene, size)
+        made = [moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
+        return system.mismatch(put, *made)
+
+
+def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:
+    from pbdkit.equilibrium.grids.lattice_choice import lattice_system
+
+    system = lattice_system(scene, state, step, watch, rows=rows)
+    if system is None:
+        raise ExperimentError(NOT_SHARED, ("rule",))
+    return system
 
 
 class _Replaceable(System):

@@ -10,12 +10,13 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, UnconvergedError
-from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
+from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.state import Floats, State, initial_state
+from pbdkit.stepping.state import Floats, State
 
 MOST_CORRECTIONS = 12
 CONTRACTION = 0.5
@@ -34,7 +35,8 @@ UNSTABLE = "what is found is not stable"
 @dataclass(frozen=True)
 class Finder:
     """Looks for equilibria of a scene, to within a length, by one of the solver's methods, shares
-    being of the length `scale`; `compiles` is of the moves; `at_rest` the last system there."""
+    being of the length `scale`; `compiles` is of the moves; `rows` are those of the scene;
+    `at_rest` the last system there."""
 
     scene: Scene
     tolerance: float
@@ -42,6 +44,7 @@ class Finder:
     method: str
     watch: Watch
     compiles: bool = True
+    rows: Rows = ALL
     at_rest: list[System] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
@@ -53,17 +56,13 @@ class Finder:
     def linear(self) -> bool:
         """Whether the rule is, and there is no obstacle: it says so, or followers put elsewhere, at
         random and as far as the load goes, move by what the linearisation at rest says."""
-        scene, steps = self.scene, self.scene.experiment.steps
+        scene = self.scene
         if scene.barriers:
             return False
         if scene.experiment.rule.linear:
             return True
-        with one_thread():
-            rest = replace(initial_state(scene), u=np.zeros_like(initial_state(scene).u))
-            system = linearised(scene, rest, steps, self.method, self.watch)
-            put = random_displacements(scene, self.scale)
-            moves = [self.moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
-            return system.mismatch(put, *moves) <= LINEAR
+        off = mismatch_at_rest(scene, self.moves, self.scale, self.method, self.watch)
+        return off <= LINEAR
 
     def at(self, moment: float) -> Finder:
         """The same with the numbers of a moment."""
@@ -116,7 +115,7 @@ class Search(ABC):
             method=self._system.methods,
             iterations=self._linearisations,
             inner_iterations=self._inner + self._system.iterations,
-            residual=float(np.abs(self._left).max(initial=0.0)),
+            residual=self._finder.rows.largest(self._left),
             distance=distance,
             share=distance / self._finder.scale,
             bound=self._system.how,
@@ -124,9 +123,10 @@ class Search(ABC):
         )
 
     def _why(self) -> str:
-        if not np.isfinite(self._left).all():
+        largest = self._finder.rows.largest(self._left)
+        if not math.isfinite(largest):
             return "it left the finite numbers"
-        if self._left.size and np.abs(self._left).max() <= 8 * self._rounding():
+        if largest <= 8 * self._rounding():
             return "rounding alone allows no better"
         return "no correction makes the moves smaller"
 
@@ -136,14 +136,17 @@ class Search(ABC):
         if self._linearisations:
             self._inner += self._system.iterations
         self._linearisations += 1
-        return linearised(finder.scene, at, self._moment, finder.method, finder.watch, finder.moves)
+        how = finder.method, finder.watch, finder.moves, finder.rows
+        return linearised(finder.scene, at, self._moment, *how)
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
+        self._finder.rows.meet(self._state.u)
         self._left = self._moves()
 
     def _moves(self) -> Floats:
-        return self._finder.moves.at(self._state, self._moment)
+        with self._finder.rows.agreeing():
+            return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
         known, of, by = self._known
@@ -158,10 +161,8 @@ class Search(ABC):
         return SHARE * self._finder.tolerance
 
     def _rounding(self) -> float:
-        return self._system.amplification * self._finder.moves.rounding(self._state.u)
-
-    def _floor(self) -> float:
-        return self._rounding() * math.sqrt(max(1, self._left.size))
+        finder, own = self._finder, self._state.u[..., self._finder.rows.own, :]
+        return self._system.amplification * finder.rows.most(finder.moves.rounding(own))
 
 
 class _Linear(Search):
@@ -176,17 +177,19 @@ class _Linear(Search):
     def run(self) -> Certificate:
         """Corrects until the tolerance is reached."""
         self._linear = True
-        if self._left.any() or self._state.u.any() or self._state.previous.any():
+        start = self._left, self._state.u, self._state.previous
+        if self._finder.rows.any(any(planes.any() for planes in start)):
             self._correct()  # else nothing is prescribed but rest
         return self._certified()
 
     def _correct(self) -> None:
         for n in range(MOST_CORRECTIONS):
-            moves, before = self._left, _size(self._left)
+            moves, before = self._left, self._finder.rows.norm(self._left)
             correction = self._system.solve(moves, self._wanted, self._owed)
             self._shift(correction)
             self._owed = None
-            after, floor = _size(self._left), self._floor()
+            after = self._finder.rows.norm(self._left)
+            floor = self._rounding() * math.sqrt(self._finder.rows.size(self._left))
             if n == 0 and before > 1e3 * floor:
                 off = self._system.mismatch(correction, moves, self._left)
                 if not off <= LINEAR + floor / before:
@@ -243,8 +246,3 @@ class _Newton(Search):
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
             farther, far = far, self._distance()
-
-
-def _size(moves: Floats) -> float:
-    with np.errstate(over="ignore"):
-        return float(np.linalg.norm(moves))

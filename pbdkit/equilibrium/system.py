@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
@@ -117,11 +118,11 @@ class System(ABC):
         disturbance of the solution then dies away, with a relaxation that is small enough."""
 
 
-def solved(system: System, moves: Floats, size: float) -> Floats:
+def solved(system: System, moves: Floats, size: float, rows: Rows = ALL) -> Floats:
     """A⁻¹ moves, taken to come to that size, to a share of what it comes to."""
     found = system.solve(moves, ACCURACY * size)
     for _ in range(TURNS):
-        most = float(np.abs(found).max())
+        most = rows.largest(found)
         if most * FAR >= size:
             break
         size = most

@@ -1,1 +1,1 @@
-"""One lattice cut into parts, each stepped by a process of its own."""
+"""One lattice cut into parts, each with a process that steps it or finds its equilibrium."""

@@ -17,7 +17,7 @@ from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.divided_stepper import DividedStepper
 from pbdkit.ranks.halo import Halo, part_of_state
 from pbdkit.ranks.part import part_of
-from pbdkit.ranks.subdomain import subdomains
+from pbdkit.ranks.subdomain import Subdomain
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.runs.drivers import SECONDS_A_VALUE, Driver, Stepwise
 from pbdkit.scene.scene import Scene
@@ -31,11 +31,11 @@ class Division:
     """A scene cut up among processes: this one's part, and how a state of it is put together with
     those of the others. The first process keeps the `whole` scene where somebody measures on it."""
 
-    def __init__(self, ranks: Ranks, scene: Scene) -> None:
+    def __init__(self, ranks: Ranks, scene: Scene, parts: list[Subdomain]) -> None:
         self.ranks, self.count = ranks, scene.raster.count
         measured = any(not each.local for each in scene.experiment.diagnostics)
         self.whole = scene if ranks.first and measured else None
-        self.subdomains = subdomains(scene, ranks.size)
+        self.subdomains = parts
         self.part = part_of(scene, self.subdomains[ranks.rank])
         self.scene = self.part.scene
         self.halo = Halo(ranks, self.subdomains, self.part)
@@ -68,6 +68,25 @@ class Division:
     def gathered(self, state: State) -> State | None:
         """The whole state, in the first process."""
         return self.halo.gathered(state)
+
+    def standing(self, own: dict[str, Any]) -> dict[str, Any]:
+        """That of a driver of the part with the state of the whole, as it is joined."""
+        return own | {"state": self.halo.joined(own["state"])}
+
+    def taken_up(self, standing: Mapping[str, Any]) -> dict[str, Any]:
+        """For the part, where the first process has that of the whole."""
+        rest = self.ranks.told({key: part for key, part in standing.items() if key != "state"})
+        state = self.dealt(standing.get("state") if self.ranks.first else None)
+        return {**rest, "state": state}
+
+    def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
+        """Of the part: a thread a process, unless more are asked for."""
+        if self.scene.experiment.stepping.threads == "auto":
+            choice = replace(choice, threads=1)
+        with self.ranks.agreeing():
+            engine, choice = make_engine(self.scene, choice)
+        steps = self.part.subdomain.steps
+        return DividedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
 
 
 class DividedWatch(Watch):
@@ -129,10 +148,13 @@ class DividedStepwise(Stepwise):
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
-        _refuse(scene)
+        nearness = scene.experiment.neighbours.nearness()
+        refuse(
+            scene, [(bool(nearness), ("neighbours",), "neighbours are found anew in every step")]
+        )
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
-        self._engine, self.choice = self._made(ranks.told(choose(scene)))
+        self._engine, self.choice = division.stepper(ranks.told(choose(scene)))
         self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count / ranks.size)
         size = size_of(scene) + ranks.most(most_of(start))
         self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
@@ -140,38 +162,22 @@ class DividedStepwise(Stepwise):
         if asked := scene.experiment.stepping.settle:
             self.settling = DividedSettling(division, scene, asked)
 
-    def _made(self, choice: Choice) -> tuple[Engine, Choice]:
-        """A thread a process, unless more are asked for."""
-        division, ranks = self._division, self._division.ranks
-        if self.scene.experiment.stepping.threads == "auto":
-            choice = replace(choice, threads=1)
-        with ranks.agreeing():
-            engine, choice = make_engine(division.scene, choice)
-        steps = division.part.subdomain.steps
-        return DividedStepper(ranks, division.scene, engine, division.halo, steps), choice
-
     def _steps_in(self, seconds_a_step: float) -> int:
         """As the first process finds it."""
         return int(self._division.ranks.told(super()._steps_in(seconds_a_step)))
 
     def standing(self) -> dict[str, Any]:
         """With the state of the whole, as it is joined."""
-        return super().standing() | {"state": self._division.halo.joined(self.state)}
+        return self._division.standing(super().standing())
 
     def take_up(self, standing: Mapping[str, Any]) -> None:
         """From the state of the whole, which the first process has."""
-        ranks = self._division.ranks
-        rest = ranks.told({key: part for key, part in standing.items() if key != "state"})
-        state = self._division.dealt(standing.get("state") if ranks.first else None)
-        super().take_up(rest | {"state": state})
+        super().take_up(self._division.taken_up(standing))
 
 
-def _refuse(scene: Scene) -> None:
-    experiment = scene.experiment
-    unfit = ((experiment.neighbours.nearness(), "neighbours", "are found anew in every step"),)
+def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
+    """Raises ExperimentError for the first clash of what does not fit, of a field."""
     for clash, field, text in unfit:
         if clash:
-            raise ExperimentError(
-                f"{field} {text}, which several processes cannot share yet; run it in one process",
-                (field,),
-            )
+            refusal = f"{text}, which several processes cannot share yet; run it in one process"
+            raise scene.experiment.located(ExperimentError(refusal, field))

@@ -62,6 +62,17 @@ class Halo:
         for n, packed in received.items():
             self._write(state, self.received[n], self._mine[n], packed)
 
+    def meet(self, field: Array) -> None:
+        """Writes the halo of an array whose last axes are those of cells, in place."""
+        sent = {n: _packed([rows_of(field, self._axes, rows)]) for n, rows in self._sent.items()}
+        received = {
+            n: _packed([rows_of(field, self._axes, rows)]) for n, rows in self.received.items()
+        }
+        self._ranks.exchange(sent, received)
+        for n, packed in received.items():
+            part = rows_of(field, self._axes, self.received[n])
+            part[...] = packed.view(field.dtype).reshape(part.shape)
+
     def _some(self, state: State, rows: slice, members: list[Array]) -> list[Array]:
         """What goes over of some rows."""
         some = [rows_of(array, self._axes, rows) for array in state.arrays()]

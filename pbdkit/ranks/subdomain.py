@@ -68,16 +68,20 @@ def rows_of(array: Array, axes: int, rows: slice) -> Array:
     return array[(*(slice(None),) * (array.ndim - axes), rows)]
 
 
-def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
-    """Parts with about equally many particles, of whole rows. Raises ExperimentError where rows
-    are too few."""
-    skew, levels, experiment = Skew(scene).axes[0], 1, scene.experiment
-    below = scene.inner
+def reaches(scene: Scene) -> tuple[int, int]:
+    """How many rows a step reaches, and its neighbours."""
+    skew, levels, below = Skew(scene).axes[0], 1, scene.inner
     while below:
         levels, below = levels + 1, below.inner
     # Masses see their neighbours before these see where the masses have gone.
     levels += any(leading.share is not None for leading in scene.leading)
-    each, edge = levels * (skew.reach + skew.apart), skew.reach
+    return levels * (skew.reach + skew.apart), skew.reach
+
+
+def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
+    """Parts with about equally many particles, of whole rows. Raises ExperimentError where rows
+    are too few."""
+    (each, edge), experiment = reaches(scene), scene.experiment
     counts = (scene.raster.kind != EMPTY).sum(axis=(0, *range(2, scene.axes + 1)))
     share = np.cumsum(counts) / max(1, counts.sum())
     cuts = np.searchsorted(share, np.arange(1, parts) / parts) + 1

@@ -17,6 +17,7 @@ from pbdkit.stepping.state import State
 
 if TYPE_CHECKING:
     from pbdkit.equilibrium.certificate import Certificate
+    from pbdkit.equilibrium.increments import Way
     from pbdkit.equilibrium.settlement import Settling
 
 States = Generator[State, None, Outcome]
@@ -214,10 +215,14 @@ class Straight(Driver):
             return Outcome("unconverged", f"{self.rejection} left all bounds", steps)
         return outcome
 
-    def _on_the_way(self, state: State) -> Generator[State, None, Certificate]:
+    def _way(self, state: State) -> Way:
+        """The moments reached on the way of a state to equilibrium."""
         from pbdkit.equilibrium.increments import increments
 
-        way = increments(self.scene, state, self.watch, self.moment)
+        return increments(self.scene, state, self.watch, self.moment)
+
+    def _on_the_way(self, state: State) -> Generator[State, None, Certificate]:
+        way = self._way(state)
         while True:
             try:
                 self.moment = next(way)

@@ -45,10 +45,12 @@ class Filling:
         if self.share is None:
             return None
         out = np.zeros((len(self.share), *raster.shape))
-        rows = raster.body_rows
-        sites = tuple((raster.site_of(rows) - self.first).T)
-        for own, share in zip(out, self.share, strict=True):
-            own.ravel()[raster.place_of(rows)] = share[sites]
+        body = raster.table_kind == FOLLOWER
+        for some in raster.chunks():
+            rows = some[body[some]]
+            place, sites = raster.place_of(rows), tuple((raster.site_of(rows) - self.first).T)
+            for own, share in zip(out, self.share, strict=True):
+                own.ravel()[place] = share[sites]
         return WeighedCells(tiling, out, out)
 
 

@@ -95,6 +95,11 @@ def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
         return Stepper(scene), Choice("numpy", 1, reason)
 
 
+def chosen_engine(scene: Scene) -> Engine:
+    """The engine that serves a scene."""
+    return make_engine(scene, choose(scene))[0]
+
+
 def obstacle() -> str:
     """Why the compiled engine cannot be had; empty where it can."""
     return "" if find_spec("numba") else "numba is not installed: pip install 'pbdkit[fast]'"

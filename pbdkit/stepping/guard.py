@@ -105,4 +105,4 @@ def way_of(leading: Leading | Barrier, steps: int) -> float:
         return 0.0
     looks = {*np.linspace(1, last, SAMPLES).astype(int).tolist(), *group.motion.knots()}
     offsets = (leading.offset(n) for n in looks if n <= last)
-    return max(float(np.abs(offset).max()) for offset in offsets)
+    return max(float(np.abs(offset).max(initial=0.0)) for offset in offsets)

@@ -161,14 +161,13 @@ def symmetrise(code, own):
 
 @njit(cache=KEPT)
 def balance(code, own, factor):
-    """Factors of rows, from place to place, with which as much of K as can be is symmetric; 1 for
-    the stencil of most. Returns how many places have none."""
-    left = 0
+    """Factors of rows, from place to place, with which as much of K as can be is symmetric, from
+    those that are known, 0 where none is. Returns how many places have none, and how many had."""
+    before = 0
     for i in range(code.shape[0]):
         for j in range(code.shape[1]):
-            factor[i, j] = 1.0 if code[i, j] == 0 else 0.0
-            left += code[i, j] > 0
-    found = 1
+            before += code[i, j] > 0 and factor[i, j] == 0.0
+    found, left = 1, before
     while left and found:
         found = 0
         for i in range(1, code.shape[0] - 1):
@@ -187,7 +186,7 @@ def balance(code, own, factor):
                     factor[i, j] = both / square
                     found += 1
         left -= found
-    return left
+    return left, before
 
 
 def run():

@@ -1,4 +1,5 @@
-"""What iterations do with whole fields, (axis, row, place), compiled. Sums are made row by row."""
+"""What iterations do with whole fields, (axis, row, place), compiled. Sums are given by row, for
+whoever has some of the rows to add up with those of others."""
 
 from __future__ import annotations
 
@@ -10,21 +11,22 @@ FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
 
 
 @njit(**FAST)
-def descend(a, p, q, x, r, share, out):
-    """x += a p, r -= a q; out = share · r in its precision; returns r · r and the largest |a p|."""
-    whole, most = 0.0, 0.0
+def descend(a, p, q, x, r, share, out, sums):
+    """x += a p, r -= a q; out = share · r in its precision; sums, by row, = r · r and the largest
+    |a p|."""
+    sums[:] = 0.0
     for v in range(2):
         for i in range(x.shape[1]):
             xs, rs, ps, qs, os = x[v, i], r[v, i], p[v, i], q[v, i], out[v, i]
-            part = 0.0
+            part = most = 0.0
             for j in range(xs.size):
                 xs[j] += a * ps[j]
                 rs[j] -= a * qs[j]
                 os[j] = share * rs[j]
                 part += rs[j] * rs[j]
                 most = max(most, abs(ps[j]))
-            whole += part
-    return whole, abs(a) * most
+            sums[0, i] += part
+            sums[1, i] = max(sums[1, i], abs(a) * most)
 
 
 @njit(**FAST)
@@ -38,17 +40,16 @@ def turn(share, z, beta, p):
 
 
 @njit(**FAST)
-def dot(a, b):
-    """a · b."""
-    whole = 0.0
+def dot(a, b, sums):
+    """sums, by row, = a · b."""
+    sums[:] = 0.0
     for v in range(2):
         for i in range(a.shape[1]):
             one, other = a[v, i], b[v, i]
             part = 0.0
             for j in range(one.size):
                 part += one[j] * other[j]
-            whole += part
-    return whole
+            sums[i] += part
 
 
 @njit(**FAST)
@@ -107,10 +108,10 @@ def clear_noise(stencils, noise):
 def run():
     """Calls each of these once, so that all are compiled."""
     r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
-    descend(0.0, r, r, r.copy(), r.copy(), 1.0, z)
+    descend(0.0, r, r, r.copy(), r.copy(), 1.0, z, np.zeros((2, 8)))
     turn(1.0, z, 0.0, r)
-    dot(r, z)
-    dot(r, r)
+    dot(r, z, np.zeros(8))
+    dot(r, r, np.zeros(8))
     differences(r.reshape(2, -1), r.reshape(2, -1), np.zeros(1, int), np.zeros(1, int), 1.0, 0,
                 np.zeros((1, 9, 2, 2)))  # fmt: skip
     clear_noise(np.zeros((1, 9, 2, 2)), 0.0)

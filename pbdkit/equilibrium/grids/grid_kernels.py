@@ -67,9 +67,8 @@ def of_lone(grid, e, x, i):
 
 
 @njit(**FAST)
-def product(grid, x, out):
-    """out = K x; returns x · K x."""
-    whole = 0.0
+def product(grid, x, out, sums):
+    """out = K x; sums, by row, = x · K x."""
     for i in range(grid.first.size - 1):
         part = 0.0
         for e in range(grid.first[i], grid.first[i + 1]):
@@ -84,8 +83,7 @@ def product(grid, x, out):
             kx, ky = of_lone(grid, e, x, i)
             out[0, i, j], out[1, i, j] = kx, ky
             part += x[0, i, j] * kx + x[1, i, j] * ky
-        whole += part
-    return whole
+        sums[i] = part
 
 
 @njit(**FAST)
@@ -228,7 +226,7 @@ def run():
         grids.append(Grid(*lists, same, own.astype(real), middle, np.ones((2, 4), real)))
     rough, exact = grids
     r, z, half = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32), np.float32(0.5)
-    product(exact, r, r.copy())
+    product(exact, r, r.copy(), np.zeros(8))
     relax(rough, z, z.copy(), np.zeros((2, 8), np.float32), half, True, False)
     coarse, code = np.zeros((2, 6, 6), np.float32), np.zeros((6, 6), np.int32)
     restrict(rough, z, z, (1, 1), code, coarse)

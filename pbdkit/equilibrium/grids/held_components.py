@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.grids.grid_functions import kernels
 from pbdkit.equilibrium.grids.primitive_raster import PrimitiveRaster
 from pbdkit.equilibrium.grids.stencil_matrix import FREE, LED, OWN, StencilMatrix
+from pbdkit.equilibrium.rows import ALL, Rows
+from pbdkit.equilibrium.strip import outside
 from pbdkit.scene.guides import guided_at
 from pbdkit.scene.scene import Scene
 
@@ -20,13 +22,15 @@ Held = NDArray[np.bool_]
 """(axis, row, place)."""
 
 
-def held_components(scene: Scene, step: int) -> Held | None:
+def held_components(scene: Scene, step: int, rows: Rows = ALL) -> Held | None:
     """Those of a step; None where nobody is guided."""
     guided, grid = guided_at(scene.raster, scene.leading, step), PrimitiveRaster.of(scene)
-    if grid is None or not len(guided.place):
+    if grid is None or not rows.any(len(guided.place) > 0):
         return None
     held = np.zeros((2, *grid.shape), bool)
     held.reshape(2, -1)[:, grid.places(guided.place)] = guided.led
+    for unknown in outside(rows.known, grid.shape[0]):
+        held[:, unknown] = False
     return held
 
 

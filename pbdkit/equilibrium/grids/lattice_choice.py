@@ -16,6 +16,7 @@ from pbdkit.equilibrium.grids.stencil_properties import (
     leads_one_way,
 )
 from pbdkit.equilibrium.moves import Moves, random_displacements
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import IndefiniteError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -26,22 +27,31 @@ FAITHFUL = 1e-3
 
 
 def lattice_system(
-    scene: Scene, state: State, step: int, watch: Watch, moves: Moves | None = None
+    scene: Scene,
+    state: State,
+    step: int,
+    watch: Watch,
+    moves: Moves | None = None,
+    rows: Rows = ALL,
 ) -> LatticeSystem | None:
     """The system of a scene, by the moves of its followers where these are compiled and the state
-    is not at rest; None where it has no such form, or leaders do not hold the body."""
+    is not at rest; None where it has no such form, or leaders do not hold the body. A scene of
+    which each process has some `rows` has it at rest, without such moves."""
     if moves and moves.is_compiled and state.u.any():
         matrix = differenced_matrix(scene, state, step, moves)
         alike = DIFFERENCED
     else:
-        matrix, alike, moves = stencil_matrix(scene, state, step), EXACT, None
-    held = held_components(scene, step)
-    if matrix is None or leads_one_way(matrix) or not is_held(matrix, held):
+        matrix, alike, moves = stencil_matrix(scene, state, step, rows), EXACT, None
+    if matrix is None:
         return None
-    known = balanced(constrained(matrix, held), alike)
+    matrix = matrix.within(rows.known)
+    held = held_components(scene, step, rows)
+    if leads_one_way(matrix, rows) or not is_held(matrix, held, rows):
+        return None
+    known = balanced(constrained(matrix, held), alike, rows)
     try:
         # What frame points show of leaders is not among the stencils.
-        system = LatticeSystem(*known, state.u.shape, watch, not (moves or scene.frame))
+        system = LatticeSystem(*known, state.u.shape, watch, not (moves or scene.frame), rows)
     except FloatingError:
         return None
     if not system.may_be_stable:

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grids.grid import Grids
 from pbdkit.equilibrium.grids.grid_functions import kernels
-from pbdkit.equilibrium.grids.multigrid import Multigrid
+from pbdkit.equilibrium.rows import ALL, Rows
 
 Floats = NDArray[np.floating[Any]]
 MOST = 400
@@ -27,18 +28,15 @@ SLOWEST = 0.9
 """The slowest fall of the jumps that is extrapolated."""
 
 
-def best_of(matrix: Any, near: Sequence[Floats], b: Floats) -> Floats | float:
+def best_of(krylov: Krylov, near: Sequence[Floats], b: Floats) -> Floats | float:
     """The x among combinations of some fields that leaves nothing of K x = b along any of them, and
     least energy where K is symmetric (Galerkin); b is overwritten with what it leaves. 0 of none.
     """
     if not near:
         return 0.0
-    kernel = kernels()
-    pulls = [np.zeros_like(b) for _ in near]
-    for v, pull in zip(near, pulls, strict=True):
-        kernel.product(matrix, v, pull)
-    products = np.array([[kernel.dot(v, pull) for pull in pulls] for v in near])
-    along = np.array([kernel.dot(v, b) for v in near])
+    pulls = [krylov.product(v) for v in near]
+    products = np.array([[krylov.dot(v, pull) for pull in pulls] for v in near])
+    along = np.array([krylov.dot(v, b) for v in near])
     size = np.sqrt(np.abs(products.diagonal()))
     size[size == 0.0] = 1.0
     scaled = products / np.outer(size, size)
@@ -94,10 +92,27 @@ class Krylov(ABC):
 
     name: str
 
-    def __init__(self, grids: Multigrid, depth: int = 0) -> None:
-        self._grids, self._depth = grids, depth
+    def __init__(self, grids: Grids, depth: int = 0, rows: Rows = ALL) -> None:
+        self._grids, self._depth, self._rows = grids, depth, rows
         self._grid = grids.grid(depth)
         self.matrix = self._grid.given(np.float64)
+        self._sums = np.empty(len(self._grid.code))
+
+    def dot(self, a: Floats, b: Floats) -> float:
+        """a · b."""
+        kernels().dot(a, b, self._sums)
+        return self._rows.total(self._sums)
+
+    def product(self, x: Floats, out: Floats | None = None) -> Floats:
+        """K x."""
+        found = self._grid.field(np.float64) if out is None else out
+        kernels().product(self.matrix, x, found, self._sums)
+        return found
+
+    def energy(self, x: Floats, out: Floats) -> float:
+        """x · K x; out = K x."""
+        self.product(x, out)
+        return self._rows.total(self._sums)
 
     @abstractmethod
     def solve(self, b: Floats, done: Callable[[Any], bool], most: int = MOST) -> Found:
@@ -114,28 +129,29 @@ class ConjugateGradients(Krylov):
         kernel, grid = kernels(), self._grid
         found, r = Descent(grid.field(np.float64)), b
         p, q, rounded = grid.field(np.float64), grid.field(np.float64), grid.field(np.float32)
-        size = math.sqrt(kernel.dot(r, r))
+        size, sums = math.sqrt(self.dot(r, r)), np.empty((2, r.shape[1]))
         if not 0.0 < size < math.inf:
             found.left = 0.0 if size == 0.0 else math.inf
             return found
         np.multiply(r, 1.0 / size, out=rounded, casting="same_kind")
         while True:
             z = self._grids.cycle(rounded, self._depth)
-            before, found.left = found.left, size * kernel.dot(r, z)
+            before, found.left = found.left, size * self.dot(r, z)
             if len(found.steps) >= most or (found.steps and done(found)):
                 return found
             turned = found.left / before if found.steps else 0.0
             kernel.turn(size, z, turned, p)
-            bent = kernel.product(self.matrix, p, q)
+            bent = self.energy(p, q)
             if not 0.0 < bent < math.inf:
                 found.indefinite = bent <= 0.0
                 return found
             step = found.left / bent
-            square, jump = kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded)
+            kernel.descend(step, p, q, found.x, r, 1.0 / size, rounded, sums)
+            squares, jumps = self._rows.whole(sums)
             found.steps.append(step)
             found.turns.append(turned)
-            found.jumps.append(jump)
-            if square == 0.0:
+            found.jumps.append(float(jumps.max()))
+            if not squares.any():
                 found.left = 0.0
                 return found
 
@@ -160,25 +176,25 @@ class BiconjugateGradients(Krylov):
 
     def solve(self, b: Floats, done: Callable[[Found], bool], most: int = MOST) -> Stabilised:
         """Two cycles a turn."""
-        kernel, r, found = kernels(), b, Stabilised(self._grid.field(np.float64))
+        r, found = b, Stabilised(self._grid.field(np.float64))
         shadow, p, q, t = r.copy(), r.copy(), np.zeros_like(r), np.zeros_like(r)
-        rho = kernel.dot(shadow, r)
+        rho = self.dot(shadow, r)
         while rho and math.isfinite(rho) and len(found.jumps) < most:
             p_smooth = self._smoothed(p)
-            kernel.product(self.matrix, p_smooth, q)
-            step = rho / kernel.dot(shadow, q)
+            self.product(p_smooth, q)
+            step = rho / self.dot(shadow, q)
             r -= step * q
             r_smooth = self._smoothed(r)
-            kernel.product(self.matrix, r_smooth, t)
-            square = kernel.dot(t, t)
-            weight = kernel.dot(t, r) / square if square else 0.0
+            self.product(r_smooth, t)
+            square = self.dot(t, t)
+            weight = self.dot(t, r) / square if square else 0.0
             way = step * p_smooth + weight * r_smooth
             found.x += way
             r -= weight * t
-            found.jumps.append(float(np.abs(way).max()))
+            found.jumps.append(self._rows.largest(way))
             if done(found) or not weight:
                 break
-            before, rho = rho, kernel.dot(shadow, r)
+            before, rho = rho, self.dot(shadow, r)
             p -= weight * q
             p *= rho / before * step / weight
             p += r
@@ -186,6 +202,6 @@ class BiconjugateGradients(Krylov):
 
     def _smoothed(self, r: Floats) -> Floats:
         """B r; r is scaled, for it may be tiny in single precision."""
-        size = math.sqrt(kernels().dot(r, r)) or 1.0
+        size = math.sqrt(self.dot(r, r)) or 1.0
         rounded = np.multiply(r, 1.0 / size).astype(np.float32)
         return size * self._grids.cycle(rounded, self._depth).astype(np.float64)

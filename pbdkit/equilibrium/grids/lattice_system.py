@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.equilibrium.grids.compliance import compliance
 from pbdkit.equilibrium.grids.fields import field_of, free_field_of, planes_of
+from pbdkit.equilibrium.grids.grid import Grid
 from pbdkit.equilibrium.grids.grid_functions import kernels
 from pbdkit.equilibrium.grids.inverse_iteration import SlowMode, softest
 from pbdkit.equilibrium.grids.lattice_krylov import (
@@ -28,9 +30,10 @@ from pbdkit.equilibrium.grids.lattice_krylov import (
     Krylov,
     best_of,
 )
-from pbdkit.equilibrium.grids.multigrid import Multigrid
+from pbdkit.equilibrium.grids.parted_grids import grids_of
 from pbdkit.equilibrium.grids.stencil_matrix import StencilMatrix, inverses
 from pbdkit.equilibrium.grids.stencil_properties import transposed
+from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System
 from pbdkit.results.progress import Watch
 from pbdkit.stepping.state import State
@@ -44,8 +47,6 @@ NEAR = 0.01
 """The share of the first jump at which an iteration has found most of an error."""
 TURNS = 6
 """Of inverse iteration."""
-ENOUGH = 8
-"""Iterations that tell how far a place gives way."""
 
 
 class LatticeSystem(System):
@@ -59,16 +60,19 @@ class LatticeSystem(System):
         shape: tuple[int, ...],
         watch: Watch,
         has_leaders: bool = False,
+        rows: Rows = ALL,
     ) -> None:
         self._matrix, self._shape, self._watch = matrix, shape, watch
         self._has_leaders = has_leaders and matrix.at is None and matrix.held is None
-        self._grids = Multigrid(matrix)
-        self._symmetric = symmetric
+        self._rows, self._symmetric = rows, symmetric
+        grid = Grid(matrix.code, matrix.kind, matrix.stencils, matrix.held)
+        self._grids = grids_of(grid, rows)
         kind = ConjugateGradients if self._symmetric else BiconjugateGradients
-        self._solver: Krylov = kind(self._grids)
+        self._solver: Krylov = kind(self._grids, rows=rows)
         self.may_be_stable = not self._symmetric or self._grids.is_definite()
         """Not where coarse ways already lead downhill."""
         self._smallest = 1.0
+        self._spread: float | None = None
         self._iterations = 0
 
     @property
@@ -104,8 +108,10 @@ class LatticeSystem(System):
         """-S⁻¹ K led."""
         if not self._has_leaders:
             return None
-        pull, out = self._grids.grid().field(np.float64), self._grids.grid().field(np.float64)
-        kernels().product(self._solver.matrix, field_of(self._matrix, led), pull)
+        pull, out = (
+            self._solver.product(field_of(self._matrix, led)),
+            self._grids.grid().field(np.float64),
+        )
         own = inverses(-self._matrix.scale.reshape(-1, 2, 2)).reshape(-1, 4)
         inverse = np.ascontiguousarray(own)  # kernels are compiled for such alone
         kernels().scaled(self._solver.matrix, tuple(inverse[0].tolist()), inverse, pull, out)
@@ -128,10 +134,10 @@ class LatticeSystem(System):
     def _to_share(self, b: Floats, share: float, near: Sequence[Floats]) -> Floats:
         """x with K x = b to a share of its largest number."""
         self._watch.begin("solving")
-        start = best_of(self._solver.matrix, near, b)
+        start = best_of(self._solver, near, b)
 
         def is_near(d: Found) -> bool:
-            return d.ahead <= share * float(np.abs(start + d.x).max())
+            return d.ahead <= share * self._rows.largest(start + d.x)
 
         found = self._found(b, is_near)
         if found.jumps and not is_near(found):
@@ -139,8 +145,9 @@ class LatticeSystem(System):
         return np.asarray(start + found.x)
 
     def slowest(self) -> SlowMode:
-        """Roughly the mode of the steps that fades most slowly, by the coarser grids."""
-        mode, softness = softest(self._grids, type(self._solver))
+        """Roughly the mode of the steps that fades most slowly, by the coarser grids; of a lattice
+        that this process has whole."""
+        mode, softness = softest(self._grids.whole, type(self._solver))
         return SlowMode(
             self._planes(mode),
             softness * float(np.abs(self._matrix.scale[0, 0])),
@@ -148,15 +155,16 @@ class LatticeSystem(System):
 
     def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
         """Of forces."""
-        kernel, pull = kernels(), self._grids.grid().field(np.float64)
-        kernel.product(self._solver.matrix, field_of(self._matrix, c), pull)
+        solver, pull = self._solver, self._solver.product(field_of(self._matrix, c))
         left = self._pull(after) - self._pull(before) + pull
-        return math.sqrt(kernel.dot(left, left) / kernel.dot(pull, pull))
+        return math.sqrt(solver.dot(left, left) / solver.dot(pull, pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
         """The error that some turns find, and the bound on what they leave; rounding counts as
         random."""
         found, way = self._tracked(self._pull(moves))
+        if self._spread is None:
+            self._spread = self._spread_of_rounding()
         return way + found + rounding * self._spread
 
     def _tracked(self, r: Floats) -> tuple[float, float]:
@@ -170,7 +178,7 @@ class LatticeSystem(System):
             left = SAFETY * found.ahead if found.jumps else 0.0
             if not math.isfinite(left):
                 raise StuckError
-        return left, math.sqrt(float((found.x * found.x).sum(axis=0).max()))
+        return left, math.sqrt(self._rows.largest((found.x * found.x).sum(axis=0)))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """All is held."""
@@ -178,7 +186,7 @@ class LatticeSystem(System):
     def is_stable(self) -> bool:
         """Conjugate gradients see a negative eigenvalue, from the load and from a random one. Where
         the matrix is not symmetric, those nearest to 0 are looked at."""
-        v: Floats = np.random.default_rng(0).uniform(-1.0, 1.0, self._shape)
+        v = self._rows.random(self._shape)
         if self._symmetric:
             try:
                 self._found(self._pull(v), lambda d: d.jumps[-1] <= NEAR * d.jumps[0])
@@ -190,9 +198,9 @@ class LatticeSystem(System):
             found = self._found(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
             before, v = (
                 v,
-                self._planes(found.x / (np.abs(found.x).max() or 1.0)),
+                self._planes(found.x / (self._rows.largest(found.x) or 1.0)),
             )
-        return bool((v * before).sum() > 0.0)
+        return self._solver.dot(*(field_of(self._matrix, each) for each in (v, before))) > 0.0
 
     def _found(self, r: Floats, done: Callable[[Any], bool]) -> Found:
         found: Found = self._solver.solve(r, done)
@@ -210,33 +218,16 @@ class LatticeSystem(System):
             raise IndefiniteError
         return math.sqrt(SAFETY / self._smallest * self._compliance * left)
 
-    @cached_property
-    def _spread(self) -> float:
+    def _spread_of_rounding(self) -> float:
         """How far rounding of moves by up to 1 takes a place."""
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], self._shape)
-        r = self._pull(signs)
+        r = self._pull(np.sign(self._rows.random(self._shape)))
         if self._symmetric:
-            return self._farthest(kernels().dot(r, self._grids.cycle(r.astype(np.float32))))
+            return self._farthest(self._solver.dot(r, self._grids.cycle(r.astype(np.float32))))
         return SAFETY * sum(self._tracked(r))
 
     @cached_property
     def _compliance(self) -> float:
-        """How far a place gives way to a unit load at most: as on the coarsest grid, and on each
-        finer one by so much more as on the first of them."""
-        axis, place, found = self._grids.softest
-        last = len(self._grids) - 1
-        if last == 0:
-            return found
-        solver, b = (
-            ConjugateGradients(self._grids, last - 1),
-            self._grids.grid(last - 1).field(np.float64),
-        )
-        i, j = self._grids.finer_place(last, place)
-        if i >= b.shape[1] or j >= b.shape[2] or self._grids.grid(last - 1).code[i, j] < 0:
-            return found * (last + 1)
-        b[axis, i, j] = 1.0
-        x = solver.solve(b, lambda d: len(d.steps) >= ENOUGH).x
-        return found + max(0.0, float(x[axis, i, j]) - found) * last
+        return compliance(self._grids)
 
     def _pull(self, moves: Floats) -> Floats:
         """What K c equals, on the grid."""

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from pbdkit.analysis.couplings import frame_matrices
 from pbdkit.analysis.linear_response import Response, by_sublattice, respond
+from pbdkit.equilibrium.grids.commonest import most_first
 from pbdkit.equilibrium.grids.grid_functions import kernels
 from pbdkit.equilibrium.grids.primitive_raster import PrimitiveRaster, primitive_step
 from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.rows import ALL, Rows
+from pbdkit.equilibrium.strip import outside
 from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.guides import kinds_of_places
@@ -35,8 +38,8 @@ NUDGE = 1e-7
 for displacements of up to a hundred."""
 NOISE = 1e-5
 """The share of the largest entry below which there is no bond."""
-SINGULAR, SAME = 1e-14, 1e-12
-"""Relative sizes below which a determinant counts as zero, and two stencils as one."""
+SINGULAR = 1e-14
+"""Relative size below which a determinant counts as zero."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,24 @@ class StencilMatrix:
     place: Indices | None
     held: NDArray[np.bool_] | None = None
 
+    def within(self, rows: slice) -> StencilMatrix:
+        """With nobody outside some rows."""
+        if rows == slice(None):
+            return self
+        code, kind = self.code.copy(), self.kind.copy()
+        for unknown in outside(rows, len(code)):
+            code[unknown], kind[unknown] = -1, OUTSIDE
+        return replace(self, code=code, kind=kind)
 
-def stencil_matrix(scene: Scene, state: State, step: int) -> StencilMatrix | None:
+
+def stencil_matrix(scene: Scene, state: State, step: int, rows: Rows = ALL) -> StencilMatrix | None:
     """The matrix at a state with the roles of a step; None where it has no such form: in space, on
     lattices of several sites a primitive cell, for longer bonds, rules that apply twice and frames
     whose points show particles far away."""
     grid = PrimitiveRaster.of(scene)
     if grid is None or scene.inner or scene.experiment.neighbours.nearness():
         return None
-    return _Assembly(scene, state, step, grid).matrix()
+    return _Assembly(scene, state, step, grid).matrix(rows)
 
 
 def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> StencilMatrix | None:
@@ -125,22 +137,30 @@ class _Assembly:
         self._kind = kinds_of_places(scene.raster, scene.leading, step)
         self._followers = np.flatnonzero(self._kind == FOLLOWER)
         self._code = np.full(self._kind.size, -1, np.int32)
-        self._stencils, self._scale = list[Floats](), list[Floats]()
+        self._stencils = list[Floats]([np.empty((0, WINDOW, 2, 2))])
+        self._scale = list[Floats]([np.empty((0, 2, 2))])
         self._count = 0
 
-    def matrix(self) -> StencilMatrix | None:
+    def matrix(self, rows: Rows) -> StencilMatrix | None:
         """None where a frame point shows a particle that lies outside the window."""
         known = isinstance(self._scene.experiment.rule, Calibrated)
         answers = ("move", "force") if known else ("move",)
-        for s, some in by_sublattice(self._scene, self._followers):
-            place = self._followers[some]
-            if not self._add(place, respond(self._scene, self._state, s, place, answers)):
-                return None
-        code, stencils, scale = _most_first(
-            self._code, np.concatenate(self._stencils), np.concatenate(self._scale)
+        fits, every = True, by_sublattice(self._scene, self._followers)
+        with rows.agreeing():
+            for s, some in every:
+                place = self._followers[some]
+                responses = respond(self._scene, self._state, s, place, answers)
+                fits = fits and self._add(place, responses)
+        if rows.any(not fits) or not rows.any(len(self._followers) > 0):
+            return None
+        code, stencils, scale = most_first(
+            self._code.reshape(self._scene.raster.shape),
+            np.concatenate(self._stencils),
+            np.concatenate(self._scale),
+            rows,
         )
         stencils, scale = (v.reshape(*v.shape[:-2], 4) for v in (stencils, scale))
-        return _on(self._grid, code, self._kind == LEADER, stencils, scale)
+        return _on(self._grid, code.ravel(), self._kind == LEADER, stencils, scale)
 
     def _add(self, place: Indices, responses: list[Response]) -> bool:
         """Takes the stencils of one sublattice in; False where they do not fit."""
@@ -218,20 +238,3 @@ def inverses(matrices: Floats) -> Floats:
     adjugate = np.moveaxis(np.array([[d, -b], [-c, a]]), (0, 1), (-2, -1))
     factor = np.where(some, 1.0 / np.where(some, determinant, 1.0), 0.0)
     return np.asarray(factor[..., None, None] * adjugate)
-
-
-def _most_first(
-    code: Integers, stencils: Floats, scale: Floats
-) -> tuple[NDArray[np.int32], Floats, Floats]:
-    """The same with the stencil of most as number 0, and those alike with it."""
-    counts = np.bincount(code[code >= 0], minlength=len(stencils))
-    most = int(counts.argmax())
-    apart = np.abs(stencils - stencils[most]).max(axis=(1, 2, 3))
-    apart += np.abs(scale - scale[most]).max(axis=(1, 2))
-    alike = apart <= SAME * np.abs(stencils[most]).max()
-    kept = (counts > 0) & ~alike
-    order = np.concatenate([[most], np.flatnonzero(kept)])
-    number = np.zeros(len(stencils) + 1, np.int32)
-    number[order] = np.arange(len(order))
-    number[-1] = -1
-    return number[code], stencils[order], scale[order]

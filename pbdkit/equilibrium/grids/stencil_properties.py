@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ from pbdkit.equilibrium.grids.stencil_matrix import (
     WINDOW,
     StencilMatrix,
 )
+from pbdkit.equilibrium.rows import ALL, Rows
 
+Floats = NDArray[np.floating[Any]]
 EXACT, DIFFERENCED = 1e-9, 1e-5
 """Relative difference up to which a matrix counts as symmetric: one by derivatives, one by
 differences."""
@@ -24,26 +27,28 @@ DIGITS = 13
 """Of factors of rows; rounding decides the others."""
 
 
-def is_symmetric(matrix: StencilMatrix, alike: float = EXACT) -> bool:
+def is_symmetric(matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL) -> bool:
     """Up to a share of its largest entry."""
-    largest = max(float(matrix.stencils.max()), -float(matrix.stencils.min()))
-    return bool(kernels().asymmetry(matrix.code, matrix.stencils) <= alike * largest)
+    largest = rows.most(max(float(matrix.stencils.max()), -float(matrix.stencils.min())))
+    return rows.most(kernels().asymmetry(matrix.code, matrix.stencils)) <= alike * largest
 
 
-def balanced(matrix: StencilMatrix, alike: float = EXACT) -> tuple[StencilMatrix, bool]:
+def balanced(
+    matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL
+) -> tuple[StencilMatrix, bool]:
     """The matrix with its rows multiplied so that it is symmetric, and whether that can be: those
     of particles with fewer neighbours, of which each has more weight. What is left of a difference
     is shared by both sides."""
-    if is_symmetric(matrix):
+    if is_symmetric(matrix, rows=rows):
         return matrix, True
-    factor = np.empty(matrix.code.shape)
-    if kernels().balance(matrix.code, matrix.stencils, factor):
+    factor = _factors(matrix, rows)
+    if factor is None:
         return matrix, False
     lone = np.nonzero(matrix.code > 0)
-    row, times = matrix.code[lone], factor[lone]
+    row, times = matrix.code[lone], factor[lone].round(DIGITS)
     number = np.arange(len(row))
     if len(row) >= len(matrix.stencils):
-        pairs = np.stack([row, times.round(DIGITS)], axis=1)
+        pairs = np.stack([row, times], axis=1)
         kinds, number = np.unique(pairs, axis=0, return_inverse=True)
         row, times = kinds[:, 0].astype(int), kinds[:, 1]
     code = matrix.code.copy()
@@ -53,11 +58,23 @@ def balanced(matrix: StencilMatrix, alike: float = EXACT) -> tuple[StencilMatrix
         for table in (matrix.stencils, matrix.scale)
     )
     found = replace(matrix, code=code, stencils=stencils, scale=scale)
-    if not is_symmetric(found, alike):
+    if not is_symmetric(found, alike, rows):
         return matrix, False
     if alike > EXACT:
         kernels().symmetrise(code, stencils)
     return found, True
+
+
+def _factors(matrix: StencilMatrix, rows: Rows) -> Floats | None:
+    """By which rows are multiplied, 1 for the stencil of most; None where some have none."""
+    factor = (matrix.code == 0).astype(float)
+    while True:
+        left, before = kernels().balance(matrix.code, matrix.stencils, factor)
+        if not rows.any(left < before):
+            return None if rows.any(left > 0) else factor
+        told = factor.copy()
+        rows.meet(told)
+        np.copyto(factor, told, where=told > 0.0)
 
 
 def transposed(matrix: StencilMatrix) -> StencilMatrix:
@@ -75,20 +92,21 @@ def transposed(matrix: StencilMatrix) -> StencilMatrix:
     return replace(matrix, code=codes, stencils=np.ascontiguousarray(found), scale=scale)
 
 
-def leads_one_way(matrix: StencilMatrix) -> bool:
+def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
     """Whether one axis moves the other and not the reverse: they are better solved in turn."""
-    return bool(matrix.stencils[..., 1].any() != matrix.stencils[..., 2].any())
+    ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
+    return len({rows.any(bool(way.any())) for way in ways}) > 1
 
 
-def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None) -> bool:
+def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:
     """Whether every connected part of the body touches a leader, along each axis, or has `held`
     components, and no neighbours are apart, as across a crack: without a bond, and without a
     neighbour that both have one with."""
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
-    known = bonds.any(axis=0)
-    if any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist()):
+    known = np.logical_or.reduce(rows.every(bonds.any(axis=0)))
+    if rows.any(any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist())):
         return False
     pattern = (known | known[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
@@ -96,9 +114,25 @@ def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None) -> boo
         led = binary_dilation(matrix.kind == LED, structure=pattern)
         if held is not None:
             led |= held[axis]
-        if np.count_nonzero(np.unique(parts[led])) < count:
+        if not _reached(parts, count, led, rows):
             return False
     return True
+
+
+def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
+    """Whether all parts have led places, each going on where other processes have rows."""
+    while True:
+        reached = np.zeros(count + 1, bool)
+        reached[parts[led]] = True
+        reached[0] = False
+        if not rows.any(not reached[1:].all()):
+            return True
+        here = reached[parts]
+        there = here.copy()
+        rows.meet(there)
+        if not rows.any(bool((there > here).any())):
+            return not rows.any(bool((here < (parts > 0))[rows.own].any()))
+        led = here | there
 
 
 def _apart(matrix: StencilMatrix, bonds: NDArray[np.bool_], s: int) -> bool:
