@@ -29,10 +29,10 @@ SHEET = {
     "rule": {"type": "barycentre"},
     "initial": {"type": "noise", "amplitude": 0.1},
     "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
-    "steps": 200,
+    "steps": 1000,
 }
 KEEP = {"variables": ["position"], "times": "last"}
-WORKERS, PATIENCE_S = 4, 0.1
+WORKERS, PATIENCE_S = 4, 0.01
 
 
 def children(pid: int) -> list[int]:
