@@ -17,6 +17,7 @@ from sheets import Running, moving, scene_of
 from pbdkit.ranks.divided_driver import Division
 from pbdkit.ranks.divided_run import SharingRanks
 from pbdkit.ranks.divided_stepper import DividedStepper
+from pbdkit.ranks.subdomain import subdomains
 from pbdkit.runs.course import peak_memory
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
@@ -48,7 +49,7 @@ class Sharing:
 
     def __init__(self, ranks: SharingRanks) -> None:
         scene = scene_of(moving(SIZE))
-        self.division = Division(ranks, scene)
+        self.division = Division(ranks, scene, subdomains(scene, ranks.size))
         part, self.halo = self.division.scene, self.division.halo
         engine, steps = CompiledStepper(part, 1), self.division.part.subdomain.steps
         self.steps = steps

@@ -12,9 +12,8 @@ from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.passes import CACHE, Skew, cell_bytes, exceeds_cache, single_steps
 from pbdkit.stepping.prescription import Led
 
-DEEP, BAND, ROW = 16, 8, 96 * 2**10
-"""Steps of a pass, rows of a band, bytes of a row of a tile (measured: longer rows gain more than
-fewer bytes)."""
+DEEP, BAND, ROW = 16, 8, 24 * 2**10
+"""Steps of a pass, rows of a band, bytes of a row of a tile: all measured."""
 SHORTEST = 256
 """Columns of a tile at least."""
 AHEAD, ENTRIES = 64, 2**20
