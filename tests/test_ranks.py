@@ -311,6 +311,15 @@ class Alone:
 
 
 @needs_mpi
+def test_a_sample_of_the_long_trial_on_random_scenes():
+    script = Path(__file__).parent / "reliability" / "rank_runs.py"
+    command = [MPIEXEC, "-n", "2", sys.executable, script, "--trials", "4"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "'compared': " in done.stdout
+
+
+@needs_mpi
 def test_where_one_process_is_killed_all_end_and_the_run_goes_on(tmp_path):
     settings = ["--set", "steps=1000000", "--set", "record.every=1000000", "--quiet"]
     arguments = ["run", "paper/a", *settings, "-o", "out.nc"]
