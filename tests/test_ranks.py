@@ -163,6 +163,10 @@ OTHERS = {
     "loads": ELASTIC | {"loads": [{"select": {"edge": "top"}, "force": [0.01, 0.02]}]},
     "an obstacle": ELASTIC
     | {"obstacles": [{"shape": DISC, "motion": {**UP, "velocity": [0, -0.1]}}]},
+    "bonds to the frame are spared": {
+        "fracture": {"type": "threshold", "thresholds": [1.1], "frame_bonds": False},
+        "initial": {"type": "affine", "gradient": [[0.2, 0.0], [0.0, 0.2]]},
+    },
     "cuts": {"cuts": [{"from": [5.5, -1.0], "to": [5.5, 3.5], "at": 5}]},
     "a course": {
         "rule": {"type": "mixed-coordinate", "K": {"steps": [0, 20], "values": [0.0, -0.004]}}

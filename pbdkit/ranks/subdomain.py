@@ -96,6 +96,8 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     steps = min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
     # After the last of these steps all of its own rows are right, and whom frame points follow.
     halo = max(steps * each, edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)) + edge
+    if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
+        halo += edge  # bonds to what stands are spared: it must be beyond those of own rows
     return [
         Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
         for b, e in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)
