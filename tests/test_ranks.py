@@ -166,6 +166,8 @@ OTHERS = {
     "bonds to the frame are spared": {
         "fracture": {"type": "threshold", "thresholds": [1.1], "frame_bonds": False},
         "initial": {"type": "affine", "gradient": [[0.2, 0.0], [0.0, 0.2]]},
+        "frame": {"type": "none"},
+        "diagnostics": [],
     },
     "cuts": {"cuts": [{"from": [5.5, -1.0], "to": [5.5, 3.5], "at": 5}]},
     "a course": {
