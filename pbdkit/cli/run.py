@@ -72,6 +72,7 @@ def run(
         _warn(disk_warnings(path, scene), quiet)
         with _watched(path, quiet or as_json, file) as (stop, watch):
             one = processes.run(scene, watch)
+            del scene  # of which each of several processes goes on with its part alone
             _warn(one.warnings, quiet)
             report = record(one, one.sink(file))
         if processes.first:
