@@ -40,7 +40,8 @@ COMPILED = {"type": "stepping", "engine": "compiled"}
 def written(given_, path, processes=None, watch=None):
     """How a run into a file ended."""
     together = processes or Processes()
-    run = together.run(build_scene(pbdkit.Experiment.model_validate(given_)), watch or Watch())
+    scene = together.scene(pbdkit.Experiment.model_validate(given_))
+    run = together.run(scene, watch or Watch())
     return record(run, run.sink(NetcdfSink(path, replace=True))).outcome
 
 

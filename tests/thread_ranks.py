@@ -10,7 +10,7 @@ from typing import Any
 
 from pbdkit.ranks.divided_run import SharingRanks
 
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 
 
 class ThreadComm:
@@ -44,7 +44,8 @@ class ThreadComm:
         return [self.recv(rank) for rank in range(self.size)]
 
     def Allgather(self, mine: Any, found: Any) -> None:  # noqa: N802
-        found[...] = [value[0] for value in self.allgather(mine)]
+        for rank, value in enumerate(self.allgather(mine)):
+            found[rank] = value.reshape(found.shape[1:])
 
     def bcast(self, value: Any) -> Any:
         if self.rank == 0:

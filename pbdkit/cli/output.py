@@ -92,7 +92,7 @@ def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
     """What is to be said where the output may not fit on its disk."""
     from pbdkit.scene.sizes import MIB, sizes_of
 
-    output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count).output
+    output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
     with suppress(OSError):  # no such folder: said when the file is opened
         if output > (free := shutil.disk_usage(path.parent).free):
             yield (

@@ -53,7 +53,6 @@ def run(
     from pbdkit.ranks.launched import launched
     from pbdkit.results.netcdf_sink import NetcdfSink
     from pbdkit.runs.course import record
-    from pbdkit.scene.scene import build_scene
 
     with launched() as processes:
         with processes.agreeing():
@@ -62,7 +61,8 @@ def run(
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if processes.first:
                 refuse_output(path, force=force, experiment=Path(experiment))
-            scene = build_scene(loaded)
+        scene = processes.scene(loaded)
+        with processes.agreeing():
             if processes.first:
                 refuse_unfinished(path, force=force)
         given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment

@@ -22,6 +22,8 @@ COLUMNS = 256
 class Frameless(FramePolicy):
     """Common to bodies without frame points."""
 
+    local: ClassVar[bool] = True
+
     def depth(self, reach: int) -> int:
         """No layer."""
         return 0
@@ -41,6 +43,7 @@ class NoFrame(Frameless):
 class LayeredFrame(FramePolicy):
     """Common to all frames; `layers` defaults to what the neighbour metric reaches."""
 
+    local: ClassVar[bool] = True
     layers: Annotated[int, Field(ge=1, le=64)] | None = Field(
         None, description="Layers of points; by default what the neighbours reach.", examples=[3]
     )

@@ -26,6 +26,8 @@ class Initial(Component):
 
     at_rest: ClassVar[bool] = False
     """Whether everything starts where it rests; `displacement` is then not asked."""
+    is_drawn: ClassVar[bool] = False
+    """Whether it takes numbers from the generator."""
 
     @abstractmethod
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
@@ -51,6 +53,8 @@ class Noise(Initial):
 
     type: Literal["noise"] = "noise"
     amplitude: Annotated[float, Field(ge=0.0, le=1e100), LENGTH]
+
+    is_drawn: ClassVar[bool] = True
 
     def displacement(self, X: Floats, leads: Flags, generator: np.random.Generator) -> Floats:
         """Uniform in [-amplitude, amplitude)."""

@@ -63,6 +63,10 @@ class FramePolicy(Component):
     """Whether the body is made of the lattice's cells, each weighted by the share of it that lies
     inside the outline; for rules that declare `uses_cells`. The corners of cut cells are then
     particles of the body, on whichever side of the outline they lie."""
+    local: ClassVar[bool] = False
+    """Whether each point is told of by itself, and follows particles that are nearest to it, or no
+    farther off than twice the layers in site index. Several processes then build the frame in
+    parts; else each of them builds the whole."""
     edges_are_free: ClassVar[bool] = False
     """Whether edges are free of stress under a calibrated rule; where not, a warning says so."""
 

@@ -179,9 +179,10 @@ def _on_the_way(scene: Scene) -> list[str]:
 
 
 def _doubts(scene: Scene) -> list[str]:
-    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     warnings = list(scene.warnings)
-    if not (kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER).any():
+    followers = kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER
+    if not scene.raster.others.any(followers.any()):
         warnings.append("leaders: everybody leads in step 1, nobody follows")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:
@@ -217,7 +218,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
 
 def refuse_too_much_output(scene: Scene) -> None:
     """Raises ExperimentError where the records of a run cannot all be in memory at once."""
-    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.count)
+    sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     if sizes.output > machine_memory():
         raise scene.experiment.located(
             ExperimentError(

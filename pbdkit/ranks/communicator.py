@@ -6,14 +6,18 @@ import atexit
 import pickle
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from platform import node
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.errors import PbdkitError
 from pbdkit.runs.processes import Processes
 from pbdkit.storage.pieced_array import Bytes
 
+NUMBERS_AT_ONCE = 2**20
+"""So many of all processes together are compared at a time."""
 FAILED = 1
 """The exit status of a run that is given up because one process failed."""
 
@@ -38,6 +42,22 @@ class Ranks(Processes):
     def most(self, value: float) -> float:
         """The largest number of all; not a number where one is none."""
         return float(np.max(self.every(value)))
+
+    def least(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """The smallest of all, place by place of arrays of one shape."""
+        flat = np.ascontiguousarray(numbers).ravel()
+        found, some = np.empty_like(flat), max(1, NUMBERS_AT_ONCE // self.size)
+        for at in range(0, len(flat), some):
+            mine = flat[at : at + some]
+            every = np.empty((self.size, len(mine)), mine.dtype)
+            self._comm.Allgather(mine, every)
+            every.min(axis=0, out=found[at : at + some])
+        return found.reshape(numbers.shape)
+
+    def on_machine(self) -> int:
+        """How many processes share the machine of this one."""
+        name = node()
+        return self.every(name).count(name)
 
     def any(self, value: bool) -> bool:
         """Whether it is so in any process."""

@@ -20,7 +20,7 @@ from pbdkit.ranks.part import part_of
 from pbdkit.ranks.subdomain import Subdomain
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.runs.drivers import SECONDS_A_VALUE, Driver, Stepwise
-from pbdkit.scene.scene import Scene
+from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
 from pbdkit.stepping.guard import EVERY, Guard, most_of, size_of
 from pbdkit.stepping.numpy_engine import Engine
@@ -29,37 +29,47 @@ from pbdkit.stepping.state import State, initial_state
 
 class Division:
     """A scene cut up among processes: this one's part, and how a state of it is put together with
-    those of the others. The first process keeps the `whole` scene where somebody measures on it."""
+    those of the others. The first process keeps the `whole` scene where somebody looks at that."""
 
     def __init__(self, ranks: Ranks, scene: Scene, parts: list[Subdomain]) -> None:
-        self.ranks, self.count = ranks, scene.raster.count
-        measured = any(not each.local for each in scene.experiment.diagnostics)
-        self.whole = scene if ranks.first and measured else None
-        self.subdomains = parts
+        self.ranks, self.count, self.subdomains = ranks, scene.raster.total, parts
         self.part = part_of(scene, self.subdomains[ranks.rank])
-        self.scene = self.part.scene
+        self.scene, experiment = self.part.scene, scene.experiment
         self.halo = Halo(ranks, self.subdomains, self.part)
+        self.whole: Scene | None = None
+        measured = any(not each.local for each in experiment.diagnostics)
+        with ranks.agreeing():
+            if measured or experiment.stepping.settle:
+                self.whole = self.whole_of(scene)
+
+    def whole_of(self, scene: Scene) -> Scene | None:
+        """The scene that others have parts of, in the first process."""
+        if self.whole or not self.ranks.first:
+            return self.whole
+        return build_scene(scene.experiment) if scene.raster.extent else scene
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
         """The part of the state at time 0, and whether it can be made again from the part alone:
-        random numbers are drawn for the whole."""
-        experiment = scene.experiment
-        if experiment.initial.at_rest and not any(
-            isinstance(part, Draws) for part in (experiment.rule, experiment.fracture)
-        ):
-            return initial_state(self.scene), True
-        return part_of_state(initial_state(scene), self.part), False
+        random numbers are drawn for the whole, by the first process."""
+        experiment, whole = scene.experiment, None
+        draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
+        if not (experiment.initial.is_drawn or draws):
+            state = initial_state(self.scene)
+            self.halo.renew(state)
+            return state, experiment.initial.at_rest
+        with self.ranks.agreeing():
+            if found := self.whole_of(scene):
+                whole = initial_state(found)
+        return self.dealt(whole), False
 
     def dealt(self, whole: State | None) -> State:
         """The part of a state that the first process has."""
-        members = self.ranks.every(self.part.members)
+        members = self.ranks.every(self.halo.members)
         if whole is None or not self.ranks.first:
             return self._state(None)
-        cut = (
-            part_of_state(whole, replace(self.part, subdomain=own, members=some))
-            for own, some in zip(self.subdomains, members, strict=True)
-        )
-        return self._state(cut)
+        axes = self.scene.axes
+        parts = zip(self.subdomains, members, strict=True)
+        return self._state(part_of_state(whole, axes, own, some) for own, some in parts)
 
     def _state(self, each: Iterable[State] | None) -> State:
         found: State = self.ranks.dealt(each)
@@ -115,10 +125,10 @@ class DividedGuard(Guard):
 class DividedSettling(Settling):
     """The first process looks whether the whole has settled."""
 
-    def __init__(self, division: Division, scene: Scene, settle: Settle) -> None:
+    def __init__(self, division: Division, settle: Settle) -> None:
         self._division, self._settling = division, None
-        if division.ranks.first:
-            self._settling = Settling(scene, settle, initial_state(scene), Watch())
+        if whole := division.whole:
+            self._settling = Settling(whole, settle, initial_state(whole), Watch())
         self._agree(None)
 
     def _agree(self, found: Certificate | None) -> Certificate | None:
@@ -155,12 +165,12 @@ class DividedStepwise(Stepwise):
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.told(choose(scene)))
-        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.count / ranks.size)
+        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
         size = size_of(scene) + ranks.most(most_of(start))
         self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
         self.settling, self.kept = None, -1
         if asked := scene.experiment.stepping.settle:
-            self.settling = DividedSettling(division, scene, asked)
+            self.settling = DividedSettling(division, asked)
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """As the first process finds it."""

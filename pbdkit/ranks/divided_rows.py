@@ -13,7 +13,7 @@ from pbdkit.equilibrium.rows import Rows
 from pbdkit.equilibrium.strip import Strip
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.halo import Halo
-from pbdkit.ranks.subdomain import MOST_STEPS, Subdomain, reaches, subdomains
+from pbdkit.ranks.subdomain import MOST_STEPS, Subdomain, farthest_apart, reaches, subdomains
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.passes import Skew
 
@@ -60,19 +60,24 @@ def deep_subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     that are parted have a row. Raises ExperimentError where rows are too few."""
     spread = 2 ** _depth(parts)
     each, edge = reaches(scene)
-    halo = _margin(scene) + A_CYCLE * spread
+    halo, rows = _margin(scene) + A_CYCLE * spread, len(scene.raster.row_counts)
     found = []
     for own in subdomains(scene, parts):
         low = max(0, own.begin - halo) // spread * spread
-        high = min(scene.raster.shape[1], own.end + halo)
+        high = min(rows, own.end + halo)
         steps = max(1, min(MOST_STEPS, (halo - edge) // max(1, each)))
         found.append(Subdomain(own.begin, own.end, low, high, edge, steps))
     return found
 
 
+def deep_halo(each: int, edge: int, least: int, parts: int) -> int:
+    """More rows than `deep_subdomains` take as halos, as `widest_halo` is."""
+    return 3 * edge + each + (A_CYCLE + 1) * int(2 ** _depth(parts))
+
+
 def strip_of(scene: Scene, own: Subdomain, parts: int) -> Strip:
     """What a part knows of the grid of a scene."""
-    count, margin = scene.raster.shape[1], _margin(scene)
+    count, margin = scene.raster.whole_shape[1], _margin(scene)
     first = own.low + margin if own.low else 0
     last = own.high - margin if own.high < count else count
     return Strip(count, own.low, own.begin, own.end, first, last, _depth(parts))
@@ -86,5 +91,4 @@ def _depth(parts: int) -> int:
 def _margin(scene: Scene) -> int:
     """The outermost rows of a part that are empty, that stand still, and whose particles see those,
     or frame points that follow them."""
-    skew = Skew(scene).axes[0]
-    return 3 * skew.reach + skew.apart
+    return 3 * Skew(scene).axes[0].reach + farthest_apart(scene)

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pbdkit.analysis.stencil import wave_bound
+from pbdkit.analysis.stencil import Bound, wave_bound
+from pbdkit.errors import ExperimentError
+from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.prediction.forecast import prediction, quick_warnings
+from pbdkit.ranks.building import CUTS, built
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.divided_driver import DividedStepwise, Division
 from pbdkit.ranks.divided_equilibrium import DividedStraight
 from pbdkit.ranks.divided_recording import DividedRecorder, PartSink
-from pbdkit.ranks.divided_rows import deep_subdomains
-from pbdkit.ranks.subdomain import Subdomain, subdomains
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import KeepingSink, Sink
 from pbdkit.runs.course import Run
 from pbdkit.runs.drivers import Driver
-from pbdkit.runs.tuning import tuned
-from pbdkit.scene.scene import Scene
+from pbdkit.runs.tuning import chosen_weights, with_solver
+from pbdkit.scene.scene import Scene, build_scene
 
-CUTS: dict[type[Solver], Callable[[Scene, int], list[Subdomain]]] = {
-    Stepping: subdomains,
-    Equilibrium: deep_subdomains,
-}
-"""What cuts a scene into parts for a solver."""
 DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
     Stepping: DividedStepwise,
     Equilibrium: DividedStraight,
@@ -38,17 +34,22 @@ class DividedRun(Run):
     states of the part. Raises what any run does, in all processes."""
 
     def __init__(self, ranks: Ranks, scene: Scene, watch: Watch) -> None:
-        whole, kind = tuned(scene), type(scene.experiment.solver)
-        cut, driver = CUTS[kind], DRIVERS[kind]
+        scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
         with ranks.agreeing():
-            self.division = Division(ranks, whole, cut(whole, ranks.size))
+            parts = CUTS[kind].subdomains(scene, ranks.size)
+        self.division = Division(ranks, scene, parts)
         self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
-        self.driver = driver(self.division, whole, watch)
-        self.warnings, self.prediction = (), {}
-        if ranks.first:
-            bound = wave_bound(whole)
-            self.warnings = quick_warnings(whole, bound)
-            self.prediction = prediction(whole, bound)
+        self.driver = DRIVERS[kind](self.division, scene, watch)
+        bound = wave_bound(scene)
+        self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
+
+    def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
+        """Whether masses are too light the first process finds, of the whole."""
+        if not any(leading.share is not None for leading in scene.leading):
+            return quick_warnings(scene, bound)
+        with self.division.ranks.agreeing():
+            whole = self.division.whole_of(scene)
+            return quick_warnings(whole, bound) if whole else ()
 
     @property
     def particles(self) -> int:
@@ -65,8 +66,27 @@ class DividedRun(Run):
         return PartSink(self.division, inner)
 
 
+def _tuned(ranks: Ranks, scene: Scene) -> Scene:
+    """With numbers in place of `auto`, which the first process finds, of the whole."""
+    if not scene.experiment.stepping.is_open:
+        return scene
+    weights = None
+    with ranks.agreeing():
+        if ranks.first:
+            whole = build_scene(scene.experiment) if scene.raster.extent else scene
+            try:
+                weights = chosen_weights(whole)
+            except ExperimentError as error:
+                raise scene.experiment.located(error) from None
+    return with_solver(scene, scene.experiment.stepping.with_weights(*ranks.told(weights)))
+
+
 class SharingRanks(Ranks):
     """Processes that share every run."""
+
+    def scene(self, experiment: Experiment) -> Scene:
+        """Each what it needs for its part."""
+        return built(self, experiment)
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """Each its part."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces.frame import Indices
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.joining import joined
 from pbdkit.ranks.part import Part
@@ -27,6 +28,12 @@ class Halo:
         self._parts = parts
         sizes = ranks.every([int(ours.sum()) for ours in part.ours])
         self._counts = list(zip(*sizes, strict=True))
+        before = [sum(counts[: ranks.rank]) for counts in self._counts]
+        self.members = tuple(
+            np.arange(len(ours)) + first - early
+            for ours, early, first in zip(part.ours, part.early, before, strict=True)
+        )
+        """The particles of each leader group that the part has, by their number in the group."""
         own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
         others = [n for n in range(len(parts)) if n != rank]
         sides = [n for n in others if _touch(own, parts[n]) or _touch(parts[n], own)]
@@ -155,9 +162,10 @@ def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...
     )
 
 
-def part_of_state(whole: State, part: Part) -> State:
-    """A part of a whole state, in memory of its own."""
-    axes, subdomain = part.scene.axes, part.subdomain
-    starts = zip(whole.starts, part.members, strict=True)
+def part_of_state(
+    whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
+) -> State:
+    """A part of a whole state, in memory of its own, with some members of the leader groups."""
+    starts = zip(whole.starts, members, strict=True)
     found = tuple(None if start is None else start[:, some].copy() for start, some in starts)
     return _each(whole, lambda array: subdomain.cut(array, axes), found)

@@ -16,8 +16,9 @@ from pbdkit.scene.frame_points import Frame
 from pbdkit.scene.homes import SceneConstants
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.loads import Loads
+from pbdkit.scene.others import ALONE
 from pbdkit.scene.places import Mask
-from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, Raster
+from pbdkit.scene.raster import EMPTY, FOLLOWER, FRAME, Extent, Raster
 from pbdkit.scene.scene import Scene
 
 Array = NDArray[Any]
@@ -26,34 +27,37 @@ Array = NDArray[Any]
 @dataclass(frozen=True)
 class Part:
     """A subdomain's part of a scene: the scene of the part, and what is known of the whole.
-    `members` are the particles of each leader group that the part has, by their number in the
-    group, and `ours` which of these are of its own rows."""
+    `ours` are which particles of each leader group that the part has are of its own rows, and
+    `early` how many of these groups' particles come before."""
 
     subdomain: Subdomain
     scene: Scene
-    members: tuple[Indices, ...]
     ours: tuple[Mask, ...]
+    early: tuple[int, ...]
     rows: slice
     """Of the table of its scene, those of its own particles."""
 
 
 def part_of(scene: Scene, subdomain: Subdomain) -> Part:
-    """That part of a scene."""
+    """That part of a scene that has these rows and more around them, or all."""
     window = _Window(scene.raster, subdomain)
-    found = window.scene(scene)
-    some = [window.leads(each) for each in scene.leading]
-    members = tuple(np.flatnonzero(these) for these in some)
-    ours = tuple(
-        window.has_own(each.place[these]) for each, these in zip(scene.leading, some, strict=True)
+    places = [each.place[window.leads(each)] for each in scene.leading]
+    ours, early = map(window.has_own, places), map(window.comes_before, places)
+    return Part(
+        subdomain,
+        window.scene(scene),
+        tuple(ours),
+        tuple(int(these.sum()) for these in early),
+        window.own_rows,
     )
-    return Part(subdomain, found, members, ours, window.own_rows)
 
 
 class _Window:
-    """The rows of a part on the raster of the whole."""
+    """The rows of a part on a raster that has more, of the whole or of its surroundings."""
 
     def __init__(self, raster: Raster, subdomain: Subdomain) -> None:
-        self._whole, self._sub = raster, subdomain
+        before = raster.extent.before if raster.extent else 0
+        self._whole, self._sub = raster, (subdomain := subdomain.after(before))
         self._axes = len(raster.shape) - 1
         period = raster.lattice.cell().period[0]
         lines = raster.sites.shape[0]
@@ -80,6 +84,8 @@ class _Window:
             low=(raster.low[0] + low, *raster.low[1:]),
             sites=sites,
             before=raster.before + int(counts[line(seen[0])]),
+            extent=Extent(raster.row_counts, before + subdomain.low),
+            others=ALONE,
         )
         ends = (subdomain.begin, subdomain.end)
         begin, end = (counts[line(row)] - counts[line(seen[0])] for row in ends)
@@ -88,7 +94,7 @@ class _Window:
     def scene(self, scene: Scene) -> Scene:
         """The part of a scene on it."""
         frame, inner = scene.frame, scene.inner
-        found = replace(
+        return replace(
             scene,
             raster=self.raster,
             constants=self._constants(scene.constants),
@@ -98,10 +104,6 @@ class _Window:
             leading=tuple(map(self._leading, scene.leading)),
             loads=self._loads(scene.loads) if scene.loads else None,
         )
-        # What the whole body tells is the same for all parts.
-        whole = {name: getattr(scene, name) for name in ("middle", "setting", "leaders_overlap")}
-        vars(found).update(whole)
-        return found
 
     def leads(self, leading: Leading) -> Mask:
         """Which particles of a group the part has; masses only where their neighbours are known."""
@@ -116,6 +118,10 @@ class _Window:
     def has_own(self, place: Indices) -> Mask:
         """Which lie in its own rows."""
         return self._between(place, self._sub.begin, self._sub.end)
+
+    def comes_before(self, place: Indices) -> Mask:
+        """Which lie in rows before these."""
+        return self._between(place, 0, self._sub.begin)
 
     def _between(self, place: Indices, low: int, high: int) -> Mask:
         row = np.unravel_index(place, self._whole.shape)[1]

@@ -8,14 +8,14 @@ shrinks from there by what a step reaches, so that several can be made before th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.scene.raster import EMPTY
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.passes import Skew
 
@@ -46,6 +46,11 @@ class Subdomain:
         """Its own rows, in arrays of the part."""
         return slice(self.begin - self.low, self.end - self.low)
 
+    def after(self, rows: int) -> Subdomain:
+        """The same, counted from a row that is so many after the first."""
+        begin, end, low, high = (n - rows for n in (self.begin, self.end, self.low, self.high))
+        return replace(self, begin=begin, end=end, low=low, high=high)
+
     def cut(self, array: Array, axes: int) -> Array:
         """The part of an array whose last `axes` are those of cells, in memory of its own."""
         return rows_of(array, axes, slice(self.low, self.high)).copy()
@@ -75,30 +80,52 @@ def reaches(scene: Scene) -> tuple[int, int]:
         levels, below = levels + 1, below.inner
     # Masses see their neighbours before these see where the masses have gone.
     levels += any(leading.share is not None for leading in scene.leading)
-    return levels * (skew.reach + skew.apart), skew.reach
+    return levels * (skew.reach + farthest_apart(scene)), skew.reach
+
+
+def farthest_apart(scene: Scene) -> int:
+    """How many rows at most a frame point lies apart from those whom it follows."""
+    return int(max(scene.raster.others.every(Skew(scene).axes[0].apart)))
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     """Parts with about equally many particles, of whole rows. Raises ExperimentError where rows
     are too few."""
     (each, edge), experiment = reaches(scene), scene.experiment
-    counts = (scene.raster.kind != EMPTY).sum(axis=(0, *range(2, scene.axes + 1)))
-    share = np.cumsum(counts) / max(1, counts.sum())
-    cuts = np.searchsorted(share, np.arange(1, parts) / parts) + 1
-    bounds = np.concatenate([[0], cuts, [len(counts)]])
-    least = int(np.diff(bounds).min())
-    if least < 1:
-        raise ExperimentError(
-            f"has {np.count_nonzero(counts)} rows of cells, too few for {parts} processes; start "
-            "fewer",
-            ("body",),
-        )
-    steps = min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
+    counts = scene.raster.row_counts
+    bounds = bounds_of(counts, parts)
+    steps = _steps(each, int(np.diff(bounds).min()))
     # After the last of these steps all of its own rows are right, and whom frame points follow.
     halo = max(steps * each, edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
         halo += edge  # bonds to what stands are spared: it must be beyond those of own rows
     return [
         Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
-        for b, e in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)
+        for b, e in pairwise(bounds)
     ]
+
+
+def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
+    """More rows than `subdomains` take as halos, where a step reaches `each` rows at most, and
+    neighbours `edge`, of parts of `least` rows."""
+    return _steps(each, least) * each + 3 * edge + LOOKED_AT + int(MADE_TWICE * least)
+
+
+def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
+    """The rows at which parts begin, and the end of the last; `counts` are the particles of each
+    row. Raises ExperimentError where rows are too few."""
+    share = np.cumsum(counts) / max(1, counts.sum())
+    cuts = np.searchsorted(share, np.arange(1, parts) / parts) + 1
+    bounds = [0, *cuts.tolist(), len(counts)]
+    if np.diff(bounds).min() < 1:
+        raise ExperimentError(
+            f"has {np.count_nonzero(counts)} rows of cells, too few for {parts} processes; start "
+            "fewer",
+            ("body",),
+        )
+    return bounds
+
+
+def _steps(each: int, least: int) -> int:
+    """Between two exchanges, where a step reaches so many rows, of parts of so many rows."""
+    return min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS

@@ -5,9 +5,10 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+from pbdkit.experiment.model import Experiment
 from pbdkit.results.progress import Watch
 from pbdkit.runs.course import Run
-from pbdkit.scene.scene import Scene
+from pbdkit.scene.scene import Scene, build_scene
 
 
 class Processes:
@@ -24,6 +25,10 @@ class Processes:
     def agreeing(self) -> AbstractContextManager[None]:
         """What is raised in the block, in any process, is raised in all of them at its end."""
         return nullcontext()
+
+    def scene(self, experiment: Experiment) -> Scene:
+        """What this one needs of an experiment's scene: here all."""
+        return build_scene(experiment)
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """The run of a scene that they make together."""

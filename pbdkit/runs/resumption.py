@@ -20,7 +20,6 @@ from pbdkit.runs.continuation import take_up
 from pbdkit.runs.course import Report, Run, record
 from pbdkit.runs.earlier_run import asked, history, longer
 from pbdkit.runs.processes import Processes
-from pbdkit.scene.scene import build_scene
 from pbdkit.storage.run_files import is_unfinished
 from pbdkit.storage.unfinished import UnfinishedRun
 
@@ -103,7 +102,7 @@ def _unfinished(
         if source is None:
             return None
         experiment = Experiment.build(source)
-        run = together.run(build_scene(experiment), watch)
+        run = together.run(together.scene(experiment), watch)
         recorder = run.recorder(run.sink(sink))
         with _damage_named(output):
             take_up(run.driver, recorder, standing, together)
@@ -129,7 +128,7 @@ def _continued(
                 dataset = open_until_read.enter_context(reading(output))
                 source, standing = longer(dataset, output, steps, anyway)
         experiment = Experiment.build(together.told(source))
-        run = together.run(build_scene(experiment), watch)
+        run = together.run(together.scene(experiment), watch)
         sink = NetcdfSink(output, True, experiment.record.compression)
         recorder, recorded = run.recorder(run.sink(sink)), None
         try:

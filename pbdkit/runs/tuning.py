@@ -47,7 +47,7 @@ def tuned(scene: Scene) -> Scene:
     if not asked.is_open:
         return scene
     try:
-        return _with(scene, asked.with_weights(*chosen_weights(scene)))
+        return with_solver(scene, asked.with_weights(*chosen_weights(scene)))
     except ExperimentError as error:
         raise scene.experiment.located(error) from None
 
@@ -58,7 +58,7 @@ def chosen_weights(scene: Scene) -> Weights:
     asked = scene.experiment.stepping
     both = ("relaxation", asked.asked_relaxation), ("memory", asked.asked_memory)
     given = [None if number == "auto" else getattr(asked, name) for name, number in both]
-    plain = _with(scene.bare, Stepping())
+    plain = with_solver(scene.bare, Stepping())
     rest = initial_state(scene)
     rest.u[...] = 0.0
     try:
@@ -90,10 +90,10 @@ def _refusal(text: str) -> ExperimentError:
     return ExperimentError(text, ("solver",))
 
 
-def _with(scene: Scene, solver: Stepping) -> Scene:
+def with_solver(scene: Scene, solver: Stepping) -> Scene:
     """The scene stepped otherwise."""
     experiment = scene.experiment.model_copy(update={"solver": solver})
-    inner = scene.inner and _with(scene.inner, solver)
+    inner = scene.inner and with_solver(scene.inner, solver)
     return replace(scene, experiment=experiment, inner=inner)
 
 

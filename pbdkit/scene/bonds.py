@@ -118,5 +118,7 @@ def missing_cuts(raster: Raster, neighbourhood: Neighbourhood, cuts: Sequence[Cu
     return [
         f"cuts.{n}: it crosses no bond of the body; look where it goes from and to"
         for n, cut in enumerate(cuts)
-        if not any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
+        if not raster.others.any(
+            any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
+        )
     ]

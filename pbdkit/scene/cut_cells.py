@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, reduce
 
 import numpy as np
 
-from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body, Sites
 from pbdkit.interfaces import Lattice, Vector
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
 from pbdkit.scene.places import Floats
-from pbdkit.scene.sites import Filling, rounding_of, sites_from, sublattices_from, trimmed, window
+from pbdkit.scene.sites import Filling, Lines, rounding_of, sites_from, sublattices_from, window
 
 Window = tuple[slice, ...]
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
+SITES_AT_ONCE = 2**20
+"""So many are looked at together, whole lines of them, for the same reason."""
 CELLS_AT_ONCE = 512
 """Cut cells that are looked at together: what that takes does not grow with the body."""
 NEAREST = 0.6
@@ -30,42 +31,53 @@ SMALLEST = 0.02
 as little else does, and say little about it."""
 
 
-def fill_with_cells(body: Body, lattice: Lattice, tiling: Tiling) -> Filling:
-    """The cells with a share inside the outline, and as body all their corners.
-
-    A body of given sites has the whole cells between them. Raises ExperimentError where there is
-    no cell.
-    """
-    cutter = _Cutter(body, lattice, tiling)
-    share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *cutter.shape))
-    corner = np.zeros(cutter.shape, bool)
-    for polygon in tiling.polygons:
-        there, found = cutter.shares(polygon)
-        share[polygon.kind][there] += found
-        for at in polygon.corners:
-            corner[_shifted(there, at.site)] |= found > 0.0
-    if not (filling := trimmed(cutter.low, corner, share)):
-        raise ExperimentError(
-            "holds no cell of the lattice; make it larger, or take a frame that does not weigh "
-            "cells",
-            ("body",),
+def fill_with_cells(
+    body: Body, lattice: Lattice, tiling: Tiling, lines: Lines | None = None
+) -> Filling:
+    """The cells with a share inside the outline, and as body all their corners, of those on some
+    lines. A body of given sites has the whole cells between them."""
+    low, high = window(body, lattice)
+    margin = margin_of(tiling)
+    low, high = tuple(n - margin for n in low), tuple(n + margin + 1 for n in high)
+    if lines:
+        first = max(low[0], lines[0])
+        low, high = (first, *low[1:]), (max(first, min(high[0], lines[1])), *high[1:])
+    shape = tuple(b - a for a, b in zip(low, high, strict=True))
+    share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *shape))
+    corner, some = np.zeros(shape, bool), max(1, SITES_AT_ONCE // math.prod(shape[1:]))
+    for begin in range(low[0], high[0], some):
+        # Cells reach so far from their first corner, and none begins as near to the window's end.
+        end = min(begin + some, high[0])
+        cutter = _Cutter(
+            body, lattice, (begin - 2 * margin, *low[1:]), (end + 2 * margin, *high[1:])
         )
-    return filling
+        inner, here = slice(2 * margin, -2 * margin), slice(begin - low[0], end - low[0])
+        for polygon in tiling.polygons:
+            there, found = cutter.shares(polygon)
+            whole, marked = np.zeros(cutter.shape), np.zeros(cutter.shape, bool)
+            whole[there] = found
+            for at in polygon.corners:
+                marked[_shifted(there, at.site)] |= found > 0.0
+            share[polygon.kind][here] += whole[inner]
+            corner[here] |= marked[inner]
+    return Filling(corner, low, share)
+
+
+def margin_of(tiling: Tiling) -> int:
+    """So many sites around an outline belong to cells that it cuts, at most."""
+    corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
+    return max(2, *(abs(n) for corner in corners for n in corner.site))
 
 
 class _Cutter:
-    """The signed distance at all sites of a window around the body, and within cells."""
+    """The signed distance at all sites of a window, and within cells."""
 
-    def __init__(self, body: Body, lattice: Lattice, tiling: Tiling) -> None:
-        low, high = window(body, lattice)
-        corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
-        margin = max(2, *(abs(n) for corner in corners for n in corner.site))
-        self.low = tuple(n - margin for n in low)
-        self.shape = tuple(b - a + 1 + 2 * margin for a, b in zip(low, high, strict=True))
+    def __init__(self, body: Body, lattice: Lattice, low: Index, high: Index) -> None:
+        self.shape = tuple(b - a for a, b in zip(low, high, strict=True))
         self._body, self._of_sites = body, any(box.in_sites for box in body.boxes())
-        sites = sites_from(lattice, self.low, self.shape)
-        self._sublattice = sublattices_from(lattice.cell(), self.low, self.shape)
-        self._at, self._tolerance = sites.at, rounding_of(lattice.cell(), *sites.at)
+        sites = sites_from(lattice, low, self.shape)
+        self._cell, self._at = lattice.cell(), sites.at
+        self._sublattice = sublattices_from(self._cell, low, self.shape)
         self._distance = self._signed(sites)
 
     def shares(self, polygon: Polygon) -> tuple[Window, Floats]:
@@ -97,7 +109,7 @@ class _Cutter:
 
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
-        return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
+        return np.where(np.abs(distance) <= rounding_of(self._cell, *at.at), 0.0, distance)
 
 
 def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Floats:
@@ -109,12 +121,15 @@ def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floa
         triangles = [(k, (k + 1) % n, n) for k in range(n)]
     corners = np.array(triangles).T
     weights, small = _small_triangles()
-    px, py = (np.einsum("pc,ctn->ptn", weights, c[corners]) for c in (x, y))
+    a, b, c = weights.T[:, :, None, None]
+    px, py = (a * at[corners[0]] + b * at[corners[1]] + c * at[corners[2]] for at in (x, y))
     distance = signed(px, py)
     share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
     cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
     a, b, c = (distance[corner][..., cut] for corner in small.T)
-    share[cut] = _negative_share(a, b, c).mean(axis=(0, 1))
+    parts = _negative_share(a, b, c).reshape(len(small) * len(triangles), -1)
+    # Added one after the other: what a cell comes to does not depend on who is looked at with it.
+    share[cut] = reduce(np.add, parts) / len(parts)
     return share
 
 

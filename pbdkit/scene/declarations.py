@@ -57,9 +57,11 @@ def check_diagnostics(
     taken = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
-            diagnostic.check(raster.count, len(experiment.leaders))
+            diagnostic.check(raster.total, len(experiment.leaders))
             diagnostic.coordinates()
-            if "cells" in diagnostic.needs and not patches(raster, neighbourhood.tiling):
+            if "cells" in diagnostic.needs and not raster.others.any(
+                patches(raster, neighbourhood.tiling)
+            ):
                 raise ExperimentError(
                     f"'{diagnostic.type}' needs cells, and nowhere do the corners of one all "
                     "belong to the body; make it wider, or leave the diagnostic out"
@@ -80,7 +82,7 @@ def check_diagnostics(
 
 
 def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
-    has_frame = (raster.table_kind == FRAME).any()
+    has_frame = raster.others.any((raster.table_kind == FRAME).any())
     return [
         f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which at "
         "the corners of held edges is no force of the body; there it converges slowly (a clamped "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import islice
+from itertools import compress, islice
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.neighbourhood import Neighbourhood, flatness
-from pbdkit.scene.places import Mask
-from pbdkit.scene.raster import Raster
+from pbdkit.scene.raster import FOLLOWER, Raster
 from pbdkit.scene.selecting import Selecting
 from pbdkit.scene.sites import has_narrow_slot
 
@@ -29,7 +28,7 @@ ANGLE, ROUNDING, DECIMALS = math.pi / 12, 1e-3, 2
 
 
 def doubts_of(
-    experiment: Experiment, neighbourhood: Neighbourhood, body: Mask, layers: int
+    experiment: Experiment, neighbourhood: Neighbourhood, raster: Raster, layers: int
 ) -> list[str]:
     """A line each, on the lattice, who is whose neighbour, and the frame of a body."""
     doubts, frame, rule = [], experiment.frame, experiment.rule
@@ -44,7 +43,7 @@ def doubts_of(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
             "more shells, or chebyshev neighbours, connect them"
         )
-    if layers and has_narrow_slot(body, layers):
+    if layers and raster.others.any(has_narrow_slot(raster.sites == FOLLOWER, layers)):
         doubts.append(
             f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
             "belong to both faces; widen it, or take fewer layers"
@@ -71,7 +70,7 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
         near = max(float(np.hypot(*vector)) for vector in cell.vectors)
         if name not in named:
             yield f"regions.{name}: nothing names it, so that it changes nothing"
-        elif not (signed_distance(region, cell, x, y) <= near).any():
+        elif not raster.others.any((signed_distance(region, cell, x, y) <= near).any()):
             yield f"regions.{name}: lies outside of the body, so that it changes nothing"
     for place, course in experiment.courses.items():
         if course.bends and course.bends[-1] > experiment.steps:
@@ -90,17 +89,17 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
     """A line each, for the first few, on points of `nearest` that no particle is near."""
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
-    points = ((name, at) for name, select in selections.items() for at in select.nearest or ())
+    points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
     body = Selecting(raster)
     limit = FAR * max(math.hypot(*vector) for vector in raster.lattice.cell().vectors)
-    far = (one for one in points if body.distance(one[1]).min() > limit)
-    for name, (x, y) in islice(far, SHOWN):
+    far = body.least_distances(at for _, at in points) > limit
+    for name, (x, y) in islice(compress(points, far), SHOWN):
         rows = body.nearest([(x, y)])
-        at_x, at_y = raster.reference(rows)[0]
+        own = (raster.before + rows[0] + 1, *raster.reference(rows)[0]) if len(rows) else None
+        number, at_x, at_y = raster.others.first(own)
         yield (
             f"{name}.select.nearest: ({x:g}, {y:g}) lies {math.hypot(x - at_x, y - at_y):.4g} away "
-            f"from the body; the particle nearest to it is {rows[0] + 1}, at ({at_x:.6g}, "
-            f"{at_y:.6g})"
+            f"from the body; the particle nearest to it is {number}, at ({at_x:.6g}, {at_y:.6g})"
         )
 
 

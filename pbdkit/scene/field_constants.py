@@ -107,7 +107,7 @@ def _by_particle(
     place, found = raster.place_of(rows), {}
     for name, own in _asked(rule, values, lambda part: part.parameters(setting)).items():
         base = getattr(constants.rule, name)
-        if (own != base).any():
+        if raster.others.any((own != base).any()):
             planes = np.full(raster.shape, base)
             planes.reshape(-1)[place] = own
             found[name] = planes
@@ -159,7 +159,9 @@ def _by_bond(
     return {
         name: planes
         for name, planes in found.items()
-        if any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
+        if raster.others.any(
+            any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
+        )
     }
 
 

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Floats
+from pbdkit.scene.raster import Raster
 
 STRAIGHT = 1e-9
 """Particles that lie off a line by less than this share of its length are on it."""
+
+
+def shares_of(raster: Raster, rows: Indices) -> Floats:
+    """(particle,): the parts of a force on all that are selected, of those that a raster has."""
+    own = raster.others.is_own(raster.site_of(rows)[:, 0])
+    every = raster.others.every((raster.before + rows[own], raster.reference(rows[own])))
+    numbers, at = (np.concatenate(part) for part in zip(*every, strict=True))
+    return np.asarray(shares(at)[np.searchsorted(numbers, raster.before + rows)])
 
 
 def shares(at: Floats) -> Floats:

@@ -57,13 +57,14 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
 
 def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     """The frame points of a raster as a policy sees them; None where there are none."""
-    rows = np.flatnonzero(raster.table_kind == FRAME)
-    if not len(rows):
-        return None
+    rows, others = np.flatnonzero(raster.table_kind == FRAME), raster.others
     body = bounds(raster.sites == FOLLOWER)
     assert body
-    low = tuple(map(add, raster.low, body[0]))
-    high = tuple(n + end - 1 for n, end in zip(raster.low, body[1], strict=True))
+    low, high = (tuple(map(add, raster.low, end)) for end in body)
+    low, high = others.hull([(low, tuple(n - 1 for n in high))])
+    rows = rows[others.sees_frame(raster.site_of(rows)[:, 0])]
+    if not len(rows):
+        return None
     site = raster.site_of(rows).astype(np.int32)
     return RasterFrame(raster.lattice.cell(), site, low, high, rule, raster, rows)
 

@@ -15,8 +15,8 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
 from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
-from pbdkit.scene.force_shares import shares
-from pbdkit.scene.places import Floats
+from pbdkit.scene.force_shares import shares_of
+from pbdkit.scene.places import Floats, distinct
 from pbdkit.scene.raster import LEADER, Raster
 from pbdkit.scene.selecting import Selecting, spacing
 
@@ -54,12 +54,19 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
         _refuse_unmeasured(group, at, rows, ("leaders", n, "motion"))
         _refuse_infinite(group, at, steps, ("leaders", n, "motion"))
         axes = tuple("xy".index(axis) for axis in group.axes or ()) or range(at.shape[1])
-        share = shares(at) if isinstance(group.motion, Newton) else None
+        share = shares_of(raster, rows) if isinstance(group.motion, Newton) else None
         found.append(Leading(group, rows, raster.place_of(rows), at, tuple(sorted(axes)), share))
     for k, n in _meeting(found, steps):
         if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
             _refuse_contradiction(raster, found, k, n, steps)
     return tuple(found)
+
+
+def overlap(raster: Raster, leading: Iterable[Leading]) -> bool:
+    """Whether any particle belongs to two leader groups."""
+    rows = [each.rows for each in leading]
+    own = bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
+    return raster.others.any(own)
 
 
 def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
@@ -69,7 +76,7 @@ def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
     kind = np.array([kinds[group.motion, group.from_] for group in groups])
     begin = np.array([min(group.from_, steps + 1) for group in groups])
     end = np.array([group.last(steps) for group in groups])
-    low, high = (np.array([some[edge] for some in rows]) for edge in (0, -1))
+    low, high = (np.array([some[edge] if len(some) else -1 for some in rows]) for edge in (0, -1))
     sets = [set(some.tolist()) for some in rows] if len(rows) > 1 else []
     for n in range(1, len(found)):
         near = (begin[:n] <= end[n]) & (begin[n] <= end[:n]) & (kind[:n] != kind[n])

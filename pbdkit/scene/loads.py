@@ -16,7 +16,7 @@ from pbdkit.interfaces.course import Course
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.polygons import Tiling, signed_area
 from pbdkit.scene.cells import WeighedCells, patches
-from pbdkit.scene.force_shares import shares
+from pbdkit.scene.force_shares import shares_of
 from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import Raster
 from pbdkit.scene.selecting import Selecting
@@ -94,9 +94,10 @@ def build_loads(
     body, found = Selecting(raster, experiment.regions), list[Loading]()
     for n, load in enumerate(experiment.loads):
         rows = body.select(load.select, ("loads", n, "select"))
-        at = raster.reference(rows)
         place = raster.place_of(rows)
-        share = shares(at) if load.force else _areas(raster, tiling, cells).ravel()[place]
+        share = (
+            shares_of(raster, rows) if load.force else _areas(raster, tiling, cells).ravel()[place]
+        )
         found.append(Loading(load, rows, place, share))
         with np.errstate(all="ignore"):
             moments = [load.from_, *(bend for course in load.courses for bend in course.bends)]

@@ -13,9 +13,13 @@ compiled anew). Some of them end the process, or never end, where they get none.
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 
 
-def machine_memory() -> int:
-    """Bytes for a scene; what cannot be asked is taken as 16 GiB."""
-    return min(_bounds(), default=16 * 2**30)
+def machine_memory(processes: int = 1) -> int:
+    """Bytes for a scene, where so many processes share the machine; what cannot be asked is taken
+    as 16 GiB."""
+    found = [min(_of_all(), default=16 * 2**30) // processes]
+    if (limit := address_limit()) is not None:
+        found.append(max(0, limit - LIBRARIES))
+    return min(found)
 
 
 def refuse_little_memory() -> None:
@@ -42,10 +46,8 @@ def address_limit() -> int | None:
     return None if limit == RLIM_INFINITY else limit
 
 
-def _bounds() -> Iterator[int]:
+def _of_all() -> Iterator[int]:
     with suppress(AttributeError, OSError, ValueError):
         yield os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     with suppress(OSError, ValueError):  # "max": no bound
         yield int(CONTAINER.read_text())
-    if (limit := address_limit()) is not None:
-        yield max(0, limit - LIBRARIES)

@@ -14,6 +14,7 @@ from pbdkit.experiment.obstacles import Obstacle
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.outlines import Floats, Outline, outline_of
+from pbdkit.scene.places import Mask
 from pbdkit.scene.raster import Raster
 
 SLACK = 1e-9
@@ -113,8 +114,9 @@ def collisions(
                 outline = barrier.at(step)
                 assert outline
                 gap = outline.facing(*(at - barrier.origin).T)[0]
-                if gap.min() < -slack:
-                    number = _number(led.rows, gap)
+                deepest = float(raster.others.least(np.array([gap.min(initial=np.inf)]))[0])
+                if deepest < -slack:
+                    number = raster.others.first(_number(raster, led.rows, gap == deepest))
                     found.append(
                         f"leaders.{k}: drives particle {number} into obstacles.{n} by step {step}; "
                         "obstacles stop followers, not leaders"
@@ -132,5 +134,6 @@ def _moments(led: Leading, barrier: Barrier, steps: int) -> Iterator[int]:
     yield from sorted({step for step in (begin, end, *knots) if begin <= step <= end})
 
 
-def _number(rows: Indices, gap: Floats) -> int:
-    return int(rows[np.argmin(gap)]) + 1
+def _number(raster: Raster, rows: Indices, those: Mask) -> int | None:
+    """That of the first of those, if there is any."""
+    return raster.before + int(rows[np.argmax(those)]) + 1 if those.any() else None

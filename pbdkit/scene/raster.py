@@ -15,11 +15,28 @@ from pbdkit.interfaces import Cell, Lattice
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.vector import vector
+from pbdkit.scene.others import ALONE, Others
 from pbdkit.scene.places import Block, Places, Where, bounds
 
 EMPTY, LEADER, FOLLOWER, FRAME = -1, 0, 1, 2
+NOWHERE = np.iinfo(np.int64).max
+"""Beyond all site indices."""
 CHUNK_ROWS = 65536
 """Rows of the table that are made at a time, so that temporaries stay small."""
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How many particles each row of repeat cells of a lattice has, padding included, and how many
+    rows are `before` those of a raster."""
+
+    rows: NDArray[np.int64]
+    before: int
+
+    @cached_property
+    def particles(self) -> int:
+        """In all."""
+        return int(self.rows.sum())
 
 
 @dataclass(frozen=True)
@@ -29,7 +46,8 @@ class Raster:
     `shape` is (sublattices, cells, cells), `first` the repeat cell at place (0, 0), `kind` the kind
     at each place with EMPTY where no particle is (leaders count as followers here). `sites` is the
     same by site index (i, j) from `low` on; its particles, i then j, are the rows of the table in
-    the order of their numbers, which count from 1 and those `before` the first row.
+    the order of their numbers, which count from 1 and those `before` the first row. Where it has
+    some rows of a lattice alone, `extent` tells of the whole, and `others` have the rest.
     """
 
     lattice: Lattice
@@ -39,11 +57,32 @@ class Raster:
     low: Index
     sites: NDArray[np.int8]
     before: int = 0
+    extent: Extent | None = None
+    others: Others = ALONE
 
     @cached_property
     def count(self) -> int:
         """The number of particles, frame included."""
         return int(np.count_nonzero(self.sites != EMPTY))
+
+    @property
+    def total(self) -> int:
+        """The same of the whole lattice."""
+        return self.extent.particles if self.extent else self.count
+
+    @property
+    def whole_shape(self) -> tuple[int, ...]:
+        """The shape of the raster of the whole lattice."""
+        rows = len(self.extent.rows) if self.extent else self.shape[1]
+        return (self.shape[0], rows, *self.shape[2:])
+
+    @property
+    def row_counts(self) -> NDArray[np.int64]:
+        """(row,): the particles in each row of repeat cells of the whole lattice."""
+        if self.extent:
+            return self.extent.rows
+        others = (0, *range(2, self.kind.ndim))
+        return np.asarray(np.count_nonzero(self.kind != EMPTY, axis=others))
 
     @cached_property
     def _full(self) -> bool:
@@ -66,11 +105,12 @@ class Raster:
         """The rows of leaders and followers."""
         return np.flatnonzero(self.table_kind == FOLLOWER)
 
-    @property
-    def body_ends(self) -> Indices:
-        """The first and the last of them, without a table of all."""
+    def body_ends(self) -> NDArray[np.float64]:
+        """X, (end, axis), of the first and the last of them, without a table of all."""
         body = self.table_kind == FOLLOWER
-        return np.array([body.argmax(), len(body) - 1 - body[::-1].argmax()])
+        ends = self.reference(np.array([body.argmax(), len(body) - 1 - body[::-1].argmax()]))
+        every = self.others.every(ends)
+        return np.stack([every[0][0], every[-1][1]])
 
     def chunks(self) -> Iterator[Indices]:
         """All rows, some at a time."""
@@ -158,10 +198,17 @@ class Raster:
     def ends_of_lines(self, axis: int, *, last: bool) -> Indices:
         """The rows of the body's first or last particles on every line of sites along an axis."""
         body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
-        some = np.nonzero(body.any(axis=0))
-        end = (body[::-1] if last else body).argmax(axis=0)[some]
-        site = np.insert(np.stack(some, axis=1), axis, len(body) - 1 - end if last else end, axis=1)
-        return self.rows_of_sites(site + self.low)
+        end = (body[::-1] if last else body).argmax(axis=0)
+        end = self.low[axis] + (len(body) - 1 - end if last else end)
+        if axis == 0:  # others have other places on these lines
+            far = np.where(body.any(axis=0), -end if last else end, NOWHERE)
+            far = self.others.least(far)
+            some, end = far < NOWHERE, -far if last else far
+        else:
+            some = body.any(axis=0)
+        lines = np.argwhere(some) + np.delete(self.low, axis)
+        rows = self.rows_of_sites(np.insert(lines, axis, end[some], axis=1))
+        return rows[rows >= 0]
 
     def ends_of_rows(self, sublattice: int) -> list[Indices]:
         """The repeat cells, index by index, of the body's first and last particle of a sublattice

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
@@ -14,22 +12,20 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
-from pbdkit.scene.cut_cells import fill_with_cells
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
 from pbdkit.scene.doubts import angles_in_radians, doubts_of, far_from_the_body, without_effect
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
+from pbdkit.scene.ground import Ground
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
-from pbdkit.scene.leader_groups import Leading, build_leading
+from pbdkit.scene.leader_groups import Leading, build_leading, overlap
 from pbdkit.scene.loads import Loads, build_loads
-from pbdkit.scene.neighbourhood import Neighbourhood, build_neighbourhood, checked_cell
+from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
-from pbdkit.scene.places import distinct
+from pbdkit.scene.others import ALONE, Others
 from pbdkit.scene.raster import Raster
 from pbdkit.scene.setting import body_box, setting_of
-from pbdkit.scene.sites import Filling, build_raster, fill, window
-from pbdkit.scene.sizes import refuse_too_large
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,9 @@ class Scene:
 
     `constants` are what the elementwise functions are called with. `frame`, `cells`, `inner` (the
     scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
-    the leader groups, `warnings` are for the user, `barriers` the obstacles.
+    the leader groups, and `leaders_overlap` whether any particle belongs to two of them; `setting`
+    is what a rule may derive its constants from, `middle` that of the body's box, from the
+    lattice's site (0, 0); `warnings` are for the user, `barriers` the obstacles.
     """
 
     experiment: Experiment
@@ -49,7 +47,10 @@ class Scene:
     cells: WeighedCells | None
     inner: Scene | None
     leading: tuple[Leading, ...]
+    leaders_overlap: bool
     loads: Loads | None
+    setting: Setting
+    middle: Components
     warnings: tuple[str, ...]
     barriers: tuple[Barrier, ...] = ()
 
@@ -96,23 +97,6 @@ class Scene:
         return len(self.raster.lattice.cell().vectors)
 
     @cached_property
-    def middle(self) -> Components:
-        """The middle of the body's box, from the lattice's site (0, 0)."""
-        lower, upper = body_box(self.raster)
-        return (lower + upper) / 2
-
-    @cached_property
-    def setting(self) -> Setting:
-        """What a rule may derive its constants from."""
-        return setting_of(self.raster, self.neighbourhood)
-
-    @cached_property
-    def leaders_overlap(self) -> bool:
-        """Whether any particle belongs to two leader groups."""
-        rows = [leading.rows for leading in self.leading]
-        return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
-
-    @cached_property
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
@@ -123,35 +107,26 @@ class Scene:
         return patches(self.raster, self.neighbourhood.tiling)
 
 
-def build_scene(experiment: Experiment) -> Scene:
-    """The scene; ExperimentError, with file and line where they are known, if there is none."""
+def build_scene(experiment: Experiment, others: Others = ALONE) -> Scene:
+    """The scene, or of the rows that others have not; ExperimentError, with file and line where
+    they are known, if there is none."""
     try:
-        return _build(experiment)
+        return _build(experiment, Ground(experiment, others))
     except ExperimentError as error:
         raise experiment.located(error) from None
 
 
-def _build(experiment: Experiment) -> Scene:
-    neighbours, frame, fracture = experiment.neighbours, experiment.frame, experiment.fracture
-    with blaming(experiment.lattice, "when asked for its cell", "lattice"):
-        cell = checked_cell(experiment.lattice)
-    with blaming(neighbours, "when asked for the neighbours", "neighbours"):
-        neighbourhood = build_neighbourhood(cell, neighbours)
-    with blaming(fracture, "when asked about the rest lengths", "fracture"):
-        warnings = list(fracture.check(neighbourhood.shells()))
-    with blaming(frame, "when asked for its depth", "frame"):
-        layers = frame.depth(neighbourhood.reach)
-    low, high = window(experiment.body, experiment.lattice)
-    extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-    refuse_too_large(experiment, neighbourhood, extent, layers)
-    filling = _filling(experiment, neighbourhood)
-    warnings += doubts_of(experiment, neighbourhood, filling.body, layers)
-    raster = build_raster(experiment.lattice, filling, layers, neighbourhood.reach_in_cells)
+def _build(experiment: Experiment, ground: Ground) -> Scene:
+    neighbours, frame = experiment.neighbours, experiment.frame
+    neighbourhood, layers = ground.neighbourhood, ground.layers
+    raster, cells = ground.raster()
+    warnings = [*ground.warnings, *doubts_of(experiment, neighbourhood, raster, layers)]
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
     warnings += angles_in_radians(experiment)
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
-    setting = setting_of(raster, neighbourhood)
+    lower, upper = body_box(raster)
+    setting = setting_of(raster, neighbourhood, lower, upper)
     constants = ask_for_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
     if neighbours.nearness() and any(constants.weights.values()):
@@ -163,14 +138,14 @@ def _build(experiment: Experiment) -> Scene:
     leading = build_leading(raster, experiment)
     with blaming(frame, "when asked whom its points follow", "frame"):
         following = build_frame(raster, frame, experiment.rule)
-    check_directions(experiment, has_frame=following is not None)
-    cells = filling.on(raster, neighbourhood.tiling)
+    check_directions(experiment, has_frame=raster.others.any(following is not None))
     cells = weighed(experiment, raster, setting, cells)
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
     barriers = build_obstacles(raster, experiment)
     warnings += collisions(raster, leading, barriers, experiment.steps)
-    parts = (neighbourhood, raster, constants, following, cells, None, leading, loads)
-    return with_inner(Scene(experiment, *parts, tuple(warnings), barriers))
+    parts = (neighbourhood, raster, constants, following, cells, None, leading)
+    facts = (overlap(raster, leading), loads, setting, (lower + upper) / 2)
+    return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers))
 
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:
@@ -180,27 +155,6 @@ def renumbered(scene: Scene, experiment: Experiment) -> Scene:
     constants = with_fields(constants, *parts)
     cells = weighed(experiment, scene.raster, scene.setting, scene.cells)
     return with_inner(replace(scene, experiment=experiment, constants=constants, cells=cells))
-
-
-def _filling(experiment: Experiment, neighbourhood: Neighbourhood) -> Filling:
-    frame, rule = experiment.frame, experiment.rule
-    if not frame.weighs_cells:
-        return fill(experiment.body, experiment.lattice)
-    if not rule.uses_cells:
-        raise ExperimentError(
-            f"'{frame.type}' weighs the cells between neighbours, and the rule '{rule.type}' does "
-            "not work cell by cell; take a calibrated rule ('elastic' with poisson_ratio -1 is the "
-            "barycentre), or another frame",
-            ("frame",),
-        )
-    if not neighbourhood.tiling.beside:
-        raise ExperimentError(
-            "the neighbours of a site are not the corners of the cells around it: take 8 on the "
-            "square or the rectangular lattice ({type: chebyshev, shells: 1}), 6 on the hexagonal "
-            "one ({type: coordination, shells: 1})",
-            ("neighbours",),
-        )
-    return fill_with_cells(experiment.body, experiment.lattice, neighbourhood.tiling)
 
 
 def with_inner(scene: Scene) -> Scene:

@@ -17,7 +17,7 @@ from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.places import Floats, distinct
-from pbdkit.scene.raster import FOLLOWER, Raster
+from pbdkit.scene.raster import FOLLOWER, NOWHERE, Raster
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Selecting:
             rows = self._region(selection.region, (*where, "region"))
         else:
             rows = self.nearest(selection.nearest or ())
-        if not len(rows):
+        if not self.raster.others.any(len(rows)):
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
             text = f"selects no particle; the body reaches from {low} to {high}"
             raise ExperimentError(text, where)
@@ -77,12 +77,20 @@ class Selecting:
 
     def nearest(self, points: Iterable[Pair]) -> Indices:
         """The row of the particle nearest to each point, the lowest number on ties."""
-        found = []
-        for point in points:
-            distance = self.distance(point)
-            ties = distance <= distance.min() * (1 + 1e-9) + 1e-12 * spacing(self.raster)
-            found.append(self._body[np.argmax(ties)])
-        return np.array(found, np.intp)
+        every, raster = list(points), self.raster
+        least = self.least_distances(every)
+        numbers = np.full(len(every), NOWHERE)
+        for n, point in enumerate(every):
+            ties = self.distance(point) <= least[n] * (1 + 1e-9) + 1e-12 * spacing(raster)
+            if ties.any():
+                numbers[n] = raster.before + self._body[np.argmax(ties)]
+        rows = raster.others.least(numbers) - raster.before
+        return rows[(rows >= 0) & (rows < raster.count)].astype(np.intp)
+
+    def least_distances(self, points: Iterable[Pair]) -> Floats:
+        """(point,): how far each point is from the body."""
+        own = [self.distance(point).min(initial=np.inf) for point in points]
+        return np.asarray(self.raster.others.least(np.array(own)))
 
 
 def spacing(raster: Raster) -> float:
@@ -91,13 +99,17 @@ def spacing(raster: Raster) -> float:
 
 
 def _numbers(raster: Raster, numbers: tuple[int, ...], where: tuple[str | int, ...]) -> Indices:
+    found = []
     for n, number in enumerate(numbers):
-        if number > raster.count:
+        if number > raster.total:
             raise ExperimentError(
-                f"there is no particle {number}; they are numbered 1 to {raster.count}", (*where, n)
+                f"there is no particle {number}; they are numbered 1 to {raster.total}", (*where, n)
             )
-        if raster.table_kind[number - 1] != FOLLOWER:
+        if not 0 <= (row := number - 1 - raster.before) < raster.count:
+            continue
+        if raster.table_kind[row] != FOLLOWER:
             raise ExperimentError(
                 f"particle {number} is a frame point: only body particles can lead", (*where, n)
             )
-    return np.array(numbers, np.intp) - 1
+        found.append(row)
+    return np.array(found, np.intp)

@@ -30,6 +30,9 @@ from pbdkit.scene.raster import (
     sublattices,
 )
 
+Lines = tuple[int, int]
+"""Lines of sites, of indices i from the first to below the second."""
+
 
 @dataclass(frozen=True)
 class Filling:
@@ -39,6 +42,24 @@ class Filling:
     body: Mask
     first: Index
     share: Floats | None = None
+
+    @property
+    def box(self) -> tuple[Index, Index] | None:
+        """(low, high) of the smallest window of site indices that holds the body; None where there
+        is none."""
+        if not (found := bounds(self.body)):
+            return None
+        low, high = (tuple(map(add, self.first, end)) for end in found)
+        return low, high
+
+    def within(self, low: Index, high: Index) -> Filling:
+        """The same on a window within its own, from the site `low` on, to below `high`."""
+        ends = (
+            [n - first for n, first in zip(end, self.first, strict=True)] for end in (low, high)
+        )
+        inside = tuple(map(slice, *ends))
+        share = None if self.share is None else self.share[(slice(None), *inside)]
+        return Filling(self.body[inside], low, share)
 
     def on(self, raster: Raster, tiling: Tiling) -> WeighedCells | None:
         """The shares by place of a raster."""
@@ -54,27 +75,22 @@ class Filling:
         return WeighedCells(tiling, out, out)
 
 
-def trimmed(low: Index, body: Mask, share: Floats | None = None) -> Filling | None:
-    """The same on a window as small as the body allows, from one that begins at the site `low`;
-    None where there is no body."""
-    if not (found := bounds(body)):
-        return None
-    inside = tuple(map(slice, *found))
-    shares = None if share is None else share[(slice(None), *inside)]
-    return Filling(body[inside], tuple(map(add, low, found[0])), shares)
-
-
-def build_raster(lattice: Lattice, filling: Filling, layers: int, reach: Index) -> Raster:
-    """The raster of a body and its frame, and of all that a slot can `reach`, in repeat cells.
+def framed(lattice: Lattice, filling: Filling, layers: int) -> tuple[Index, NDArray[np.int8]]:
+    """(low, kind): the kind of each site of the body and its frame, from the site `low` on.
 
     The frame takes every site within `layers` of index distance of the body that is none of it.
     """
-    cell = lattice.cell()
     inside = np.pad(filling.body, layers)
     low = tuple(n - layers for n in filling.first)
-    window = dilated(inside, layers) & has_sites(cell, low, inside.shape)
-    sites = np.where(window, np.int8(FRAME), np.int8(EMPTY))
+    there = dilated(inside, layers) & has_sites(lattice.cell(), low, inside.shape)
+    sites = np.where(there, np.int8(FRAME), np.int8(EMPTY))
     sites[inside] = FOLLOWER
+    return low, sites
+
+
+def build_raster(lattice: Lattice, low: Index, sites: NDArray[np.int8], reach: Index) -> Raster:
+    """The raster of sites of some kinds, and of all that a slot can `reach`, in repeat cells."""
+    cell = lattice.cell()
     first = np.floor_divide(low, cell.period) - reach
     last = (np.add(low, sites.shape) - 1) // cell.period + reach
     shape = (len(cell.sites), *(last + 1 - first).tolist())
@@ -113,9 +129,14 @@ def dilated(mask: Mask, layers: int) -> Mask:
     return mask
 
 
-def window(body: Body, lattice: Lattice) -> tuple[Index, Index]:
-    """The smallest and the largest site index (i, j) that may belong to the body."""
-    return hull(_indices(box, lattice) for box in body.boxes())
+def window(body: Body, lattice: Lattice, lines: Lines | None = None) -> tuple[Index, Index]:
+    """The smallest and the largest site index (i, j) that may belong to the body, on some lines."""
+    low, high = hull(_indices(box, lattice) for box in body.boxes())
+    if lines:
+        first = max(low[0], lines[0])
+        last = max(first, min(high[0] + 1, lines[1])) - 1
+        low, high = (first, *low[1:]), (last, *high[1:])
+    return low, high
 
 
 def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
@@ -125,9 +146,9 @@ def sites_from(lattice: Lattice, low: Index, shape: Index) -> Sites:
     return Sites(index, at.each(add, lattice.origin))
 
 
-def fill(body: Body, lattice: Lattice) -> Filling:
-    """The sites inside or on the outline; ExperimentError where there is none."""
-    low, high = window(body, lattice)
+def fill(body: Body, lattice: Lattice, lines: Lines | None = None) -> Filling:
+    """The sites inside or on the outline, of those on some lines."""
+    low, high = window(body, lattice, lines)
     cell = lattice.cell()
     if max(map(abs, (*low, *high))) > 2**31 - 100:
         raise ExperimentError(
@@ -136,20 +157,19 @@ def fill(body: Body, lattice: Lattice) -> Filling:
         )
     shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
     inside = has_sites(cell, low, shape)
-    lines = max(1, CHUNK_ROWS // inside[0].size)
-    for begin in range(0, len(inside), lines):
-        part = inside[begin : begin + lines]
+    some = max(1, CHUNK_ROWS // math.prod(shape[1:]))
+    for begin in range(0, len(inside), some):
+        part = inside[begin : begin + some]
         sites = sites_from(lattice, (low[0] + begin, *low[1:]), part.shape)
         part &= body.distance(sites) <= rounding_of(cell, *sites.at)
-    if not (filling := trimmed(low, inside)):
-        raise ExperimentError("holds no site of the lattice; make it larger, or move it", ("body",))
-    return filling
+    return Filling(inside, low)
 
 
-def rounding_of(cell: Cell, *at: Floats) -> float:
-    """The distance up to which points count as on the outline."""
-    rounding = 4 * np.finfo(float).eps * max(np.abs(x).max(initial=0.0) for x in at)
-    return float(max(1e-9 * math.hypot(*cell.vectors[0]), rounding))
+def rounding_of(cell: Cell, *at: Floats) -> Floats:
+    """The distance up to which each point counts as on the outline."""
+    farthest = np.maximum.reduce([np.abs(x) for x in at])
+    least, rounding = 1e-9 * math.hypot(*cell.vectors[0]), 4 * np.finfo(float).eps
+    return np.asarray(np.maximum(least, rounding * farthest))
 
 
 def has_narrow_slot(body: Mask, layers: int) -> bool:

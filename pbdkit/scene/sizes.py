@@ -15,6 +15,7 @@ from pbdkit.interfaces.units import LENGTH
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
+from pbdkit.scene.others import ALONE, Others
 from pbdkit.scene.solver_sizes import equilibrium_size
 
 MIB = 2**20
@@ -34,6 +35,10 @@ GRADIENT, FORCES, TABLES = 250, 160, 40
 
 ANEW, ANEW_EACH = 150, 118
 """The same where neighbours are found anew, and a neighbour."""
+
+
+class TooLargeError(ExperimentError):
+    """For the memory."""
 
 
 @dataclass(frozen=True)
@@ -117,19 +122,27 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
 
 
 def refuse_too_large(
-    experiment: Experiment, neighbourhood: Neighbourhood, window: Index, layers: int
+    experiment: Experiment,
+    neighbourhood: Neighbourhood,
+    window: Index,
+    layers: int,
+    others: Others = ALONE,
 ) -> None:
-    """Raises ExperimentError where the scene cannot fit into the memory of this machine, if the
-    body fills its window of site indices; with Python's integers, as windows can be vast."""
+    """Raises ExperimentError where the scene, or the parts of it that processes of this machine
+    have, cannot fit into its memory, if the body fills its window of site indices; with Python's
+    integers, as windows can be vast."""
     cell = neighbourhood.cell
     share = len(cell.sites) / math.prod(cell.period)
     particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
-    sizes = sizes_of(experiment, neighbourhood, particles)
-    available = machine_memory()
-    if sizes.memory > available:
-        raise ExperimentError(
-            f"{sizes.particles:.3g} particles need about {sizes.memory / 2**30:.3g} GiB, and "
-            f"{available / 2**30:.3g} may be used on this machine; make it smaller",
+    needed = sizes_of(experiment, neighbourhood, math.ceil(particles / others.size)).memory
+    available = machine_memory(others.on_machine)
+    if needed > available:
+        each, fewer = "", "make it smaller"
+        if others.size > 1:
+            each, fewer = " in each process", "make it smaller, or start more on other machines"
+        raise TooLargeError(
+            f"{particles:.3g} particles need about {needed / 2**30:.3g} GiB{each}, and "
+            f"{available / 2**30:.3g} may be used on this machine; {fewer}",
             ("body",),
         )
 

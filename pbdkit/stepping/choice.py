@@ -59,7 +59,7 @@ def choose(scene: Scene) -> Choice:
         return Choice("numpy", 1, f"slower than it could be: {hindrance}")
     threads = solver.threads
     if threads == "auto":
-        threads = processors() if scene.raster.count >= TWO_THREADS_PAY else 1
+        threads = processors() if scene.raster.total >= TWO_THREADS_PAY else 1
     reason = "asked for" if solver.engine == "compiled" else f"numpy would take {_about(seconds)}"
     return Choice("compiled", threads, reason + _about_passes(scene))
 
@@ -73,7 +73,7 @@ def seconds_of(scene: Scene, choice: Choice) -> float:
     """About what the steps take at most, with neither compiling nor recording."""
     if choice.engine == "numpy":
         return _numpy_seconds(scene)
-    return KERNEL_S * scene.raster.count * _most_steps(scene) / choice.threads
+    return KERNEL_S * scene.raster.total * _most_steps(scene) / choice.threads
 
 
 def make_engine(scene: Scene, choice: Choice) -> tuple[Engine, Choice]:
@@ -135,7 +135,7 @@ def _about_passes(scene: Scene) -> str:
 def _numpy_seconds(scene: Scene) -> float:
     """What the numpy engine takes at most."""
     slots = sum(map(len, scene.neighbourhood.slots)) * (2 if scene.has_fracture else 1)
-    a_step = slots * (CALL_S + VALUE_S * scene.raster.count / len(scene.neighbourhood.slots))
+    a_step = slots * (CALL_S + VALUE_S * scene.raster.total / len(scene.neighbourhood.slots))
     return a_step * _most_steps(scene)
 
 
@@ -145,7 +145,7 @@ def _most_steps(scene: Scene) -> float:
     steps, settle = float(scene.experiment.steps), scene.experiment.stepping.settle
     if settle is None:
         return steps
-    settled = (4 * max(scene.raster.shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
+    settled = (4 * max(scene.raster.whole_shape[1:]) / math.pi) ** 2 * -math.log(settle.tolerance)
     return min(steps, last_event(scene) + settled)
 
 

@@ -85,9 +85,10 @@ class Guard:
 
 def size_of(scene: Scene) -> float:
     """That of the body and its leaders' ways together."""
-    ends = scene.raster.reference(scene.raster.body_ends)
+    ends = scene.raster.body_ends()
     spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
-    ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
+    own = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
+    ways: list[float] = np.max(scene.raster.others.every(own), axis=0).tolist()
     width = float(np.abs(ends[1] - ends[0]).max())
     return width + float(spacing) + sum(ways)
 

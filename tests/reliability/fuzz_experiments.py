@@ -60,7 +60,7 @@ def case(seed: int, number: int) -> tuple[bytes, list[str]]:
 
 def tried(content: bytes, settings: list[str], *, quick: bool = False) -> Outcome:
     """How it ends, and what that took."""
-    sizes.machine_memory = lambda: MEMORY
+    sizes.machine_memory = lambda processes=1: MEMORY
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "e.yaml")
         path.write_bytes(content)

@@ -77,7 +77,7 @@ def _values(draw: random.Random) -> Any:
 
 def tried(content: bytes) -> Outcome:
     """How it ends, and what that took."""
-    sizes.machine_memory = outlook.machine_memory = lambda: MEMORY
+    sizes.machine_memory = outlook.machine_memory = lambda processes=1: MEMORY
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "s.yaml")
         path.write_bytes(content)

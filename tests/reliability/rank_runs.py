@@ -29,7 +29,6 @@ from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.progress import Watch
 from pbdkit.runs.course import record
 from pbdkit.runs.processes import Processes
-from pbdkit.scene.scene import build_scene
 
 Parts = dict[str, Any]
 ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])
@@ -61,7 +60,7 @@ def drawn(count: int, number: int) -> list[Parts]:
 def ran(parts: Parts, output: Path, processes: Processes) -> str:
     """Runs it into a file; what was refused, and in whose words."""
     try:
-        scene = build_scene(Experiment.model_validate(parts))
+        scene = processes.scene(Experiment.model_validate(parts))
         run = processes.run(scene, Watch())
         record(run, run.sink(NetcdfSink(output, replace=True)))
     except PbdkitError as error:
