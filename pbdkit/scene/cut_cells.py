@@ -19,7 +19,7 @@ from pbdkit.scene.sites import Filling, Lines, rounding_of, sites_from, sublatti
 Window = tuple[slice, ...]
 FINE = 8
 """Parts along each edge of a triangle in a cut cell, in each of which the outline is straight."""
-SITES_AT_ONCE = 2**20
+SITES_AT_ONCE = 2**18
 """So many are looked at together, whole lines of them, for the same reason."""
 CELLS_AT_ONCE = 512
 """Cut cells that are looked at together: what that takes does not grow with the body."""
