@@ -170,6 +170,12 @@ OTHERS = {
         "frame": {"type": "none"},
         "diagnostics": [],
     },
+    "frame points with bonds that reach far": {
+        "neighbours": {"type": "euclidean", "radius": 4.0},
+        "frame": {"type": "mean", "layers": 1},
+        "cuts": [{"from": [5.5, -1.0], "to": [5.5, 3.5], "at": 5}],
+        "steps": 8,
+    },
     "cuts": {"cuts": [{"from": [5.5, -1.0], "to": [5.5, 3.5], "at": 5}]},
     "a course": {
         "rule": {"type": "mixed-coordinate", "K": {"steps": [0, 20], "values": [0.0, -0.004]}}

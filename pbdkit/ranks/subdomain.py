@@ -96,7 +96,9 @@ def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
     bounds = bounds_of(counts, parts)
     steps = _steps(each, int(np.diff(bounds).min()))
     # After the last of these steps all of its own rows are right, and whom frame points follow.
-    halo = max(steps * each, edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)) + edge
+    looked_at = edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)
+    # Bonds from own frame points lead to particles that do not stand still.
+    halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
     if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
         halo += edge  # bonds to what stands are spared: it must be beyond those of own rows
     return [

@@ -74,7 +74,7 @@ def tried(parts: Parts, folder: Path, ranks: SharingRanks) -> tuple[str, list[st
     several = ran(parts, folder / "several.nc", ranks)
     if alone or several:
         shared = "several processes" in several or "too few for" in several
-        differs = [] if alone == several or (shared and not alone) else [alone, several]
+        differs = [] if shared or alone == several else [alone, several]
         return ("not shared" if shared else "refused"), differs
     return "compared", differences(folder / "one.nc", folder / "several.nc") if ranks.first else []
 
