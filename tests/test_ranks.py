@@ -3,9 +3,12 @@
 import os
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
+from functools import partial
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -247,6 +250,24 @@ def test_resumed_on_another_number_of_processes(sizes, tmp_path):
     written(given_ | {"steps": 60}, one)
     assert set(on(sizes[0], longer)) == {60}
     assert_same(one, several)
+
+
+def test_what_is_damaged_of_a_state_is_said_in_all_processes(tmp_path):
+    """Also where the first process comes upon it while others wait for their parts."""
+    path = tmp_path / "out.nc"
+    begin = partial(written, sheet(), path, watch=stopping_after(3))
+    assert on_ranks(3, lambda ranks: begin(processes=ranks).status)[0] == "interrupted"
+    with closing(sqlite3.connect(f"{path}.run")) as store:
+        changed = store.execute("UPDATE pieces SET data = x'00' WHERE key LIKE 'array/%.u/0'")
+        assert changed.rowcount == 1
+        store.commit()
+
+    def go_on(ranks):
+        with pytest.raises(pbdkit.StorageError, match="is damaged"):
+            resumption(path, Watch(), processes=ranks)
+        return True
+
+    assert on_ranks(3, go_on) == [True] * 3
 
 
 def on(size, work):

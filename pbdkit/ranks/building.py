@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import PbdkitError
+from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.interfaces import AppliesTwice, Cell
@@ -95,20 +95,32 @@ def built(ranks: Ranks, experiment: Experiment) -> Scene:
     """The scene of a process's own rows and what is near; of the whole where parts cannot be built
     alone: where frame points follow particles far away, and to say what is wrong as one process
     does. Raises what `build_scene` does, in all processes."""
-    error: Exception | None = None
     if experiment.frame.local:
+        error: Exception | None = None
         try:
             others = OtherRanks(ranks)
             with others.together():
                 return _built(ranks, experiment, others)
-        except PbdkitError as raised:
-            error = raised
+        except Exception as raised:
+            error = None if isinstance(raised, ElsewhereError) else raised
+        bug = error is not None and not isinstance(error, PbdkitError)
+        if ranks.any(bug or _is_too_large(experiment)):
+            if isinstance(error, ExperimentError):
+                error = experiment.located(error)
+            ranks.raise_first(error)
+    with ranks.agreeing():
+        return build_scene(experiment)
+
+
+def _is_too_large(experiment: Experiment) -> bool:
+    """Whether the whole is too large for one process."""
     try:
-        with ranks.agreeing():
-            return build_scene(experiment)
+        Ground(experiment)
     except TooLargeError:
-        ranks.raise_first(None if isinstance(error, ElsewhereError) else error)
-        raise
+        return True
+    except PbdkitError:
+        pass
+    return False
 
 
 def _built(ranks: Ranks, experiment: Experiment, others: OtherRanks) -> Scene:

@@ -74,15 +74,24 @@ class Ranks(Processes):
         self._comm.Recv(into, rank)
 
     def dealt(self, each: Iterable[Any] | None) -> Any:
-        """To each process what the first has for it, made one after the other."""
-        if each is None:
-            return self._comm.recv(source=0)
+        """To each process what the first has for it, made one after the other. What is raised in
+        making it is raised in all."""
         own: Any = None
-        for rank, value in enumerate(each):
-            if rank == 0:
-                own = value
+        with self.agreeing():
+            if each is None:
+                own = self._comm.recv(source=0)
             else:
-                self._comm.send(value, rank)
+                rank = 0
+                try:
+                    for rank, value in enumerate(each):
+                        if rank:
+                            self._comm.send(value, rank)
+                        else:
+                            own = value
+                except Exception:
+                    for waiting in range(rank + 1, self.size):
+                        self._comm.send(None, waiting)
+                    raise
         return own
 
     def exchange(self, sent: dict[int, Bytes], received: dict[int, Bytes]) -> None:

@@ -167,5 +167,5 @@ def part_of_state(
 ) -> State:
     """A part of a whole state, in memory of its own, with some members of the leader groups."""
     starts = zip(whole.starts, members, strict=True)
-    found = tuple(None if start is None else start[:, some].copy() for start, some in starts)
+    found = tuple(None if start is None else np.asarray(start)[:, some] for start, some in starts)
     return _each(whole, lambda array: subdomain.cut(array, axes), found)

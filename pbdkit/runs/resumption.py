@@ -98,7 +98,7 @@ def _unfinished(
             if left and source is None:
                 sink.conclude(left)
             elif left:
-                standing = left.standing()
+                standing = left.standing(on_disk=together.size > 1)
         if source is None:
             return None
         experiment = Experiment.build(source)

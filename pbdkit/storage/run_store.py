@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -15,7 +16,7 @@ import xxhash
 
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import FULL, is_full, is_local
-from pbdkit.storage.pieced_array import PiecedArray
+from pbdkit.storage.pieced_array import Array, PiecedArray
 
 FORMAT = "2"
 """Of the store; a newer one is refused."""
@@ -165,18 +166,49 @@ def keys_of(name: str, array: np.ndarray[Any, Any] | PiecedArray) -> list[str]:
     return [f"{name}/{n}" for n in range(-(-array.nbytes // PART_BYTES))]
 
 
-def array_of(
-    store: RunStore, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> np.ndarray[Any, Any]:
-    """An array of such parts. Raises StorageError where they are not as many as it needs."""
-    whole = np.empty(shape, dtype)
-    data: memoryview = whole.reshape(-1).view(np.uint8).data
-    for n, at in enumerate(range(0, len(data), PART_BYTES)):
-        piece = store.piece(f"{name}/{n}")
-        if len(piece) != min(PART_BYTES, len(data) - at):
-            raise StorageError(f"{store.path}: is damaged: '{name}' has another size")
-        data[at : at + PART_BYTES] = piece
-    return whole
+class StoredArray:
+    """An array of such parts. They are read when somebody asks for them: for all, or for some rows,
+    ``array[:, :, 3:7]``, one axis cut and those before it whole. Raises StorageError then where
+    they are not as many as it needs."""
+
+    def __init__(
+        self, store: RunStore, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
+    ) -> None:
+        self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
+        self.nbytes = math.prod(shape) * dtype.itemsize
+        self._store, self._name = store, name
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        """The whole."""
+        whole = np.empty(self.shape, self.dtype)
+        self._read(0, whole)
+        return whole if dtype is None else whole.astype(dtype, copy=False)
+
+    def __getitem__(self, index: tuple[slice, ...]) -> Array:
+        """Some rows."""
+        axis = len(index) - 1
+        first, last, _ = index[axis].indices(self.shape[axis])
+        lead, inner = self.shape[:axis], self.shape[axis + 1 :]
+        row = math.prod(inner) * self.dtype.itemsize
+        found = np.empty((math.prod(lead), last - first, *inner), self.dtype)
+        for n, part in enumerate(found):
+            self._read((n * self.shape[axis] + first) * row, part)
+        return found.reshape(*lead, last - first, *inner)
+
+    def _read(self, start: int, into: Array) -> None:
+        """What stands from a byte on."""
+        data: memoryview = into.reshape(-1).view(np.uint8).data
+        done = 0
+        while done < len(data):
+            n, skip = divmod(start + done, PART_BYTES)
+            piece = self._store.piece(f"{self._name}/{n}")
+            if len(piece) != min(PART_BYTES, self.nbytes - n * PART_BYTES):
+                raise StorageError(
+                    f"{self._store.path}: is damaged: '{self._name}' has another size"
+                )
+            some = piece[skip : skip + len(data) - done]
+            data[done : done + len(some)] = some
+            done += len(some)
 
 
 def files_of(path: Path) -> list[Path]:

@@ -26,7 +26,7 @@ from pbdkit.storage.run_store import (
     FORMAT,
     Piece,
     RunStore,
-    array_of,
+    StoredArray,
     json_piece,
     keys_of,
     parts_of,
@@ -145,16 +145,18 @@ class UnfinishedRun:
         """Where it stood, without the arrays."""
         return self._dict("facts")
 
-    def standing(self) -> Standing:
-        """Where it stood at the last commit; its arrays are those of the run and those that wait,
-        ``waiting.NAME``."""
+    def standing(self, *, on_disk: bool = False) -> Standing:
+        """Where it stood at the last commit; its arrays are those of the run, which stay `on_disk`
+        on request, and those that wait, ``waiting.NAME``."""
         facts, arrays = self.facts, Arrays()
         try:
             for name, (dtype, shape) in facts["arrays"].items():
                 kind = np.dtype(dtype)
                 if kind.kind not in "fiub" or np.prod(shape, dtype=float) > LARGEST_ARRAY:
                     raise ValueError(dtype)
-                arrays[name] = array_of(self._store, ARRAYS + name, kind, tuple(shape))
+                stored = StoredArray(self._store, ARRAYS + name, kind, tuple(shape))
+                waits = not on_disk or name.startswith("waiting.")
+                arrays[name] = np.asarray(stored) if waits else stored
         except (KeyError, TypeError, ValueError, MemoryError) as error:
             raise StorageError(f"{self._store.path}: is damaged: {error}") from None
         self._arrays = {*self._store.keys(ARRAYS)}
