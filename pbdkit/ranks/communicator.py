@@ -94,10 +94,10 @@ class Ranks(Processes):
                     raise
         return own
 
-    def exchange(self, sent: dict[int, Bytes], received: dict[int, Bytes]) -> None:
-        """Sends bytes to some ranks, and fills what is to be received from them."""
-        waiting = [self._comm.Irecv(into, rank) for rank, into in received.items()]
-        waiting += [self._comm.Isend(of, rank) for rank, of in sent.items()]
+    def exchange(self, sent: dict[int, list[Bytes]], received: dict[int, list[Bytes]]) -> None:
+        """Sends blocks to some ranks, and fills those that are to be received from them."""
+        waiting = [self._comm.Irecv(b, rank) for rank, each in received.items() for b in each]
+        waiting += [self._comm.Isend(b, rank) for rank, each in sent.items() for b in each]
         for request in waiting:
             request.Wait()
 

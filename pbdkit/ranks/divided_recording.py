@@ -35,6 +35,7 @@ class DividedRecorder(Recorder):
         self._whole: State | None = None
         diagnostics = division.scene.experiment.diagnostics
         self._gathered = {when_measured(d) for d in diagnostics if not d.local}
+        self._local = {when_measured(d) for d in diagnostics if d.local}
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
         """A history is that of the whole, which the first process has."""
@@ -47,8 +48,11 @@ class DividedRecorder(Recorder):
         if state.step <= self.seen.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)
-        if When.STEP in self._gathered or (recorded and When.RECORD in self._gathered):
+        measured = {When.STEP, When.RECORD} if recorded else {When.STEP}
+        if measured & self._gathered:
             self._whole = self._division.gathered(state)
+        if measured & self._local:
+            self._division.halo.look_back(state)
         with self._ranks.agreeing(), np.errstate(all="ignore"):
             values = self._taken(state, last)
         self._put(state, values)
@@ -56,6 +60,8 @@ class DividedRecorder(Recorder):
     def finish(self, state: State, outcome: Any, prediction: dict[str, Any]) -> None:
         """As one process does."""
         self._whole = self._division.gathered(state) if When.END in self._gathered else None
+        if When.END in self._local:
+            self._division.halo.look_back(state)
         super().finish(state, outcome, prediction)
 
     def _diagnosed(self, when: When, moment: StateMoment) -> Values:

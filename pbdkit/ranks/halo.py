@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -45,6 +45,8 @@ class Halo:
         moving = {n: self._rows(parts[n].inner(rows)) for n in (*sides, rank)}
         self._theirs = {n: self._members(self._sent[n], moving[n]) for n in sides}
         self._mine = {n: self._members(self.received[n], moving[rank]) for n in sides}
+        solver = part.scene.experiment.stepping
+        self._looks_back = solver.memory != 0.0 or "memory" in solver.courses
         self._pushed = [n for n, each in enumerate(part.scene.leading) if each.share is not None]
 
     def _rows(self, rows: tuple[int, int]) -> slice:
@@ -59,46 +61,46 @@ class Halo:
         return [np.flatnonzero(np.logical_and.reduce(one)) for one in ins]
 
     def renew(self, state: State) -> None:
-        """Writes the halo of a state, in place; and the velocities of masses that lie there."""
-        sent = {
-            n: _packed(self._some(state, rows, self._theirs[n])) for n, rows in self._sent.items()
+        """Writes the halo of a state, in place; and the velocities of masses that lie there. The
+        displacements of the step before are left out where no step reads them."""
+        arrays = [
+            array for array in state.arrays() if self._looks_back or array is not state.previous
+        ]
+        starts = [(n, start) for n in self._pushed if (start := state.starts[n]) is not None]
+        theirs = {r: [s[:, self._theirs[r][n]] for n, s in starts] for r in self._sent}
+        mine = {
+            r: [np.empty((len(s), len(those[n])), s.dtype) for n, s in starts]
+            for r, those in self._mine.items()
         }
-        some = {n: self._some(state, rows, self._mine[n]) for n, rows in self.received.items()}
-        received = {n: _packed(parts) for n, parts in some.items()}
-        self._ranks.exchange(sent, received)
-        for n, packed in received.items():
-            self._write(state, self.received[n], self._mine[n], packed)
+        self._exchange(arrays, theirs, mine)
+        for rank, found in mine.items():
+            for (n, start), values in zip(starts, found, strict=True):
+                start[:, self._mine[rank][n]] = values
 
     def meet(self, field: Array) -> None:
         """Writes the halo of an array whose last axes are those of cells, in place."""
-        sent = {n: _packed([rows_of(field, self._axes, rows)]) for n, rows in self._sent.items()}
-        received = {
-            n: _packed([rows_of(field, self._axes, rows)]) for n, rows in self.received.items()
-        }
+        self._exchange([field], {}, {})
+
+    def look_back(self, state: State) -> None:
+        """Writes the halo of the displacements of the step before, in place."""
+        if not self._looks_back:
+            self.meet(state.previous)
+
+    def _exchange(
+        self, arrays: list[Array], theirs: dict[int, list[Array]], mine: dict[int, list[Array]]
+    ) -> None:
+        """Sends own rows of arrays, and others from there into these; and further ones."""
+        sent, received = (
+            {r: [*self._blocks(arrays, rows), *map(as_bytes, more.get(r, []))] for r, rows in each}
+            for each, more in ((self._sent.items(), theirs), (self.received.items(), mine))
+        )
         self._ranks.exchange(sent, received)
-        for n, packed in received.items():
-            part = rows_of(field, self._axes, self.received[n])
-            part[...] = packed.view(field.dtype).reshape(part.shape)
 
-    def _some(self, state: State, rows: slice, members: list[Array]) -> list[Array]:
-        """What goes over of some rows."""
-        some = [rows_of(array, self._axes, rows) for array in state.arrays()]
-        starts = ((state.starts[n], members[n]) for n in self._pushed)
-        return some + [start[:, those] for start, those in starts if start is not None]
-
-    def _write(self, state: State, rows: slice, members: list[Array], packed: Bytes) -> None:
-        at = 0
-        for array in state.arrays():
-            part = rows_of(array, self._axes, rows)
-            part[...] = packed[at : at + part.nbytes].view(array.dtype).reshape(part.shape)
-            at += part.nbytes
-        for n in self._pushed:
-            if (start := state.starts[n]) is not None:
-                size = start[:, members[n]].nbytes
-                start[:, members[n]] = (
-                    packed[at : at + size].view(start.dtype).reshape(len(start), -1)
-                )
-                at += size
+    def _blocks(self, arrays: list[Array], rows: slice) -> Iterator[Bytes]:
+        """Some rows as they lie in memory, plane by plane."""
+        for array in arrays:
+            for plane in np.ndindex(array.shape[: array.ndim - self._axes]):
+                yield as_bytes(array[plane][rows])
 
     def joined(self, state: State) -> State:
         """The state of the whole, of arrays that are joined when somebody asks for them; in other
@@ -137,11 +139,6 @@ def _shared(part: Subdomain, other: Subdomain) -> tuple[int, int]:
 def _touch(part: Subdomain, other: Subdomain) -> bool:
     low, high = _shared(part, other)
     return low < high
-
-
-def _packed(arrays: Sequence[Array]) -> Bytes:
-    """Arrays as bytes, one after the other."""
-    return np.concatenate([np.empty(0, np.uint8), *map(as_bytes, arrays)])
 
 
 def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...]) -> State:
