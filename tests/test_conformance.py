@@ -101,6 +101,7 @@ FAULTS = [
     (others.Favours, "takes-sublattices-in-any-order", "where the sites are listed backwards"),
     (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
     (others.Alternates, "takes-every-point-alone", "follows somebody else where fewer points"),
+    (others.SaysItIsLocal, "follows-who-is-near", "leave out `local`"),
     (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),
     (others.SaysItAnchors, "follows-translations", "and follows every translation"),
     (others.WritesSites, "changes-no-input", "`follow` writes into `site`"),

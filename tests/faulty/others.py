@@ -156,6 +156,19 @@ class Alternates(Following):
         return pbdkit.FrameMap(points, body[chosen], np.ones(len(points)))
 
 
+class SaysItIsLocal(Following):
+    """Follows the body's first particle, wherever that is."""
+
+    type: Literal["says-it-is-local"] = "says-it-is-local"
+
+    local: ClassVar[bool] = True
+
+    def follow(self, frame):
+        first = frame.body_at(np.array([frame.low], np.int32))
+        count = len(frame.site)
+        return pbdkit.FrameMap(np.arange(count), np.repeat(first, count), np.ones(count))
+
+
 class Shrinks(Following):
     """Follows by nine tenths, which ties the body to its place, and does not say so."""
 

@@ -112,6 +112,30 @@ def takes_every_point_alone(subject: Subject) -> None:
         raise NotAskedError(reason)
 
 
+@asked_of(FramePolicy)
+def follows_who_is_near(subject: Subject) -> None:
+    """Where it declares itself `local`, points follow particles that are nearest to them, or no
+    farther off than twice the layers in site index."""
+    policy = subject.component
+    if not policy.local:
+        raise NotAskedError("it does not declare itself `local`")
+    for scene in subject.scenes:
+        raster = scene.raster
+        frame = sites_of_frame(raster, scene.experiment.rule)
+        if frame is None:
+            continue
+        follow, layers = policy.follow(frame), policy.depth(scene.neighbourhood.reach)
+        way = np.abs(raster.site_of(follow.body) - frame.site[follow.point]).max(axis=1)
+        nearest = {*zip(*(each.tolist() for each in frame.nearest()), strict=True)}
+        for entry in np.flatnonzero(way > 2 * layers).tolist():
+            point, body = int(follow.point[entry]), int(follow.body[entry])
+            if (point, body) not in nearest:
+                raise PropertyError(
+                    f"frame point {point} follows a particle {way[entry]} sites away, beside "
+                    f"{layers} layers ({place_of(scene.experiment)}): leave out `local`"
+                )
+
+
 def _followed(follow: FrameMap, point: int) -> tuple[list[int], list[Any]]:
     """The body particles that a point follows, and their weights."""
     entries = follow.point == point
