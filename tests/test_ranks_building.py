@@ -2,7 +2,7 @@
 scene of the whole."""
 
 from dataclasses import fields, is_dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -143,6 +143,12 @@ def test_each_process_has_its_rows_alone():
     assert max(rows) < 404 / 4 + 2 * 40
 
 
+def of_the_first(frame):
+    every = np.arange(len(frame.site))
+    first = frame.body_at(np.array([frame.low], np.int32))
+    return FrameMap(every, np.repeat(first, len(every)), np.ones(len(every)))
+
+
 class Copied(FramePolicy):
     """Follows the body's first particle, wherever that is."""
 
@@ -152,14 +158,27 @@ class Copied(FramePolicy):
         return reach
 
     def follow(self, frame):
-        every = np.arange(len(frame.site))
-        first = frame.body_at(np.array([frame.low], np.int32))
-        return FrameMap(every, np.repeat(first, len(every)), np.ones(len(every)))
+        return of_the_first(frame)
 
 
-def test_where_frame_points_follow_particles_far_away_all_build_the_whole(tmp_path):
+class SaysItIsLocal(FramePolicy):
+    """And does the same."""
+
+    type: Literal["says-it-is-local"] = "says-it-is-local"
+
+    local: ClassVar[bool] = True
+
+    def depth(self, reach):
+        return reach
+
+    def follow(self, frame):
+        return of_the_first(frame)
+
+
+@pytest.mark.parametrize("frame", [Copied(), SaysItIsLocal()])
+def test_where_frame_points_follow_particles_far_away_all_build_the_whole(frame):
     experiment = pbdkit.Experiment(
-        **sheet(body={"type": "grid", "columns": 40, "rows": 3}) | {"frame": Copied()}
+        **sheet(body={"type": "grid", "columns": 400, "rows": 3}) | {"frame": frame}
     )
     extents = on_ranks(2, lambda ranks: ranks.scene(experiment).raster.extent)
     assert extents == [None, None]

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
-from pbdkit.interfaces import AppliesTwice, Cell
+from pbdkit.interfaces import AppliesTwice, Cell, FollowerRule
 from pbdkit.interfaces.frame import Indices
 from pbdkit.ranks.communicator import Ranks
 from pbdkit.ranks.divided_rows import deep_halo, deep_subdomains
 from pbdkit.ranks.subdomain import Subdomain, bounds_of, subdomains, widest_halo
 from pbdkit.ranks.survey import survey
+from pbdkit.registry.blame import blaming
 from pbdkit.scene.ground import Ground
 from pbdkit.scene.others import Others, Stretch
 from pbdkit.scene.places import Floats, Mask
@@ -130,16 +131,29 @@ def _built(ranks: Ranks, experiment: Experiment, others: OtherRanks) -> Scene:
     bounds = bounds_of(known.rows, ranks.size)
     begin, end = bounds[ranks.rank : ranks.rank + 2]
     search, reach = _search(ground), ground.neighbourhood.reach_in_cells[0]
-    levels = 2 + isinstance(experiment.rule, AppliesTwice)  # masses see one step farther
-    least = int(np.diff(bounds).min())
+    each, least = _levels(experiment.rule) * (reach + search), int(np.diff(bounds).min())
     cut = CUTS[type(experiment.solver)]
-    halo = cut.widest(levels * (reach + search), reach, least, ranks.size)
+    halo = cut.widest(each, reach, least, ranks.size)
 
     def around(rows: int) -> Stretch:
         return known.stretch(begin - rows, end + rows)
 
     others.at(around(halo + search + reach), around(0).lines, around(halo).lines)
-    return build_scene(experiment, others)
+    scene = build_scene(experiment, others)
+    if any(
+        p.low < p.begin - halo or p.high > p.end + halo for p in cut.subdomains(scene, ranks.size)
+    ):
+        raise ExperimentError("its points follow particles farther away than it says", ("frame",))
+    return scene
+
+
+def _levels(rule: FollowerRule) -> int:
+    """So many times what a step reaches a particle sees at most: masses see one step farther."""
+    levels = 2
+    while isinstance(rule, AppliesTwice):
+        with blaming(rule, "when asked for its inner rule", "rule"):
+            levels, rule = levels + 1, rule.inner()
+    return levels
 
 
 def _search(ground: Ground) -> int:
