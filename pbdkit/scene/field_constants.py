@@ -156,13 +156,11 @@ def _by_bond(
                 block.within(found[name][n])[some] = limits
         if values:
             _refuse_parameters(experiment, constants, plane.slot, values)
-    return {
-        name: planes
+    apart = {
+        name: any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
         for name, planes in found.items()
-        if raster.others.any(
-            any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
-        )
     }
+    return {name: v for name, v in found.items() if raster.others.any(apart[name])}
 
 
 def _rules_at(
