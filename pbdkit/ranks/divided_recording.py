@@ -133,9 +133,9 @@ class PartSink(KeepingSink):
         for name in [name for name in values if name in self._parts]:
             dim, axis = self._parts[name]
             part = np.asarray(values[name])[(*(slice(None),) * axis, self._own[dim])]
+            if name == "bond":  # a part counts its own
+                part += sum(self._lengths[name][: self._ranks.rank]) + 1 - part[:1]
             whole[name] = joined(self._ranks, part, axis, self._lengths[dim])
-        if "bond" in values:
-            whole["bond"] = np.arange(1, self._sizes["bond"] + 1, dtype=np.int32)
         self._first(lambda inner: inner.put(whole), whole)
 
     def due(self) -> bool:

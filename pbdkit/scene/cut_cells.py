@@ -14,7 +14,14 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Polygon, Tiling
 from pbdkit.scene.places import Floats
-from pbdkit.scene.sites import Filling, Lines, rounding_of, sites_from, sublattices_from, window
+from pbdkit.scene.sites import (
+    Filling,
+    Lines,
+    sites_from,
+    sublattices_from,
+    tolerance_of,
+    window,
+)
 
 Window = tuple[slice, ...]
 FINE = 8
@@ -45,12 +52,12 @@ def fill_with_cells(
     shape = tuple(b - a for a, b in zip(low, high, strict=True))
     share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *shape))
     corner, some = np.zeros(shape, bool), max(1, SITES_AT_ONCE // math.prod(shape[1:]))
+    tolerance = tolerance_of(body, lattice)
     for begin in range(low[0], high[0], some):
         # Cells reach so far from their first corner, and none begins as near to the window's end.
         end = min(begin + some, high[0])
-        cutter = _Cutter(
-            body, lattice, (begin - 2 * margin, *low[1:]), (end + 2 * margin, *high[1:])
-        )
+        wider = (begin - 2 * margin, *low[1:]), (end + 2 * margin, *high[1:])
+        cutter = _Cutter(body, lattice, *wider, tolerance)
         inner, here = slice(2 * margin, -2 * margin), slice(begin - low[0], end - low[0])
         for polygon in tiling.polygons:
             there, found = cutter.shares(polygon)
@@ -72,12 +79,14 @@ def margin_of(tiling: Tiling) -> int:
 class _Cutter:
     """The signed distance at all sites of a window, and within cells."""
 
-    def __init__(self, body: Body, lattice: Lattice, low: Index, high: Index) -> None:
+    def __init__(
+        self, body: Body, lattice: Lattice, low: Index, high: Index, tolerance: float
+    ) -> None:
         self.shape = tuple(b - a for a, b in zip(low, high, strict=True))
         self._body, self._of_sites = body, any(box.in_sites for box in body.boxes())
         sites = sites_from(lattice, low, self.shape)
-        self._cell, self._at = lattice.cell(), sites.at
-        self._sublattice = sublattices_from(self._cell, low, self.shape)
+        self._at, self._tolerance = sites.at, tolerance
+        self._sublattice = sublattices_from(lattice.cell(), low, self.shape)
         self._distance = self._signed(sites)
 
     def shares(self, polygon: Polygon) -> tuple[Window, Floats]:
@@ -109,7 +118,7 @@ class _Cutter:
 
     def _signed(self, at: Sites) -> Floats:
         distance = self._body.distance(at)
-        return np.where(np.abs(distance) <= rounding_of(self._cell, *at.at), 0.0, distance)
+        return np.where(np.abs(distance) <= self._tolerance, 0.0, distance)
 
 
 def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Floats:

@@ -156,13 +156,20 @@ def fill(body: Body, lattice: Lattice, lines: Lines | None = None) -> Filling:
             ("body",),
         )
     shape = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-    inside = has_sites(cell, low, shape)
+    inside, tolerance = has_sites(cell, low, shape), tolerance_of(body, lattice)
     some = max(1, CHUNK_ROWS // math.prod(shape[1:]))
     for begin in range(0, len(inside), some):
         part = inside[begin : begin + some]
         sites = sites_from(lattice, (low[0] + begin, *low[1:]), part.shape)
-        part &= body.distance(sites) <= rounding_of(cell, *sites.at)
+        part &= body.distance(sites) <= tolerance
     return Filling(inside, low)
+
+
+def tolerance_of(body: Body, lattice: Lattice) -> float:
+    """The distance up to which any site of a body's window counts as on the outline."""
+    corners = np.array([*product(*zip(*window(body, lattice), strict=True))]).T
+    at = positions(lattice.cell(), *cells_of_sites(lattice.cell(), *corners))
+    return float(rounding_of(lattice.cell(), *at.each(add, lattice.origin)).max())
 
 
 def rounding_of(cell: Cell, *at: Floats) -> Floats:
