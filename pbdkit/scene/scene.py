@@ -125,8 +125,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
     warnings += angles_in_radians(experiment)
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
-    lower, upper = body_box(raster)
-    setting = setting_of(raster, neighbourhood, lower, upper)
+    setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
     if neighbours.nearness() and any(constants.weights.values()):
@@ -144,6 +143,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     barriers = build_obstacles(raster, experiment)
     warnings += collisions(raster, leading, barriers, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
+    lower, upper = body_box(raster)
     facts = (overlap(raster, leading), loads, setting, (lower + upper) / 2)
     return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers))
 

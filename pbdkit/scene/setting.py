@@ -10,11 +10,9 @@ from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.raster import Raster, positions
 
 
-def setting_of(
-    raster: Raster, neighbourhood: Neighbourhood, lower: Components, upper: Components
-) -> Setting:
-    """What a rule may derive its constants from; the box is that of `body_box`."""
-    lower, upper = (end.each(add, raster.lattice.origin) for end in (lower, upper))
+def setting_of(raster: Raster, neighbourhood: Neighbourhood) -> Setting:
+    """What a rule may derive its constants from."""
+    lower, upper = (end.each(add, raster.lattice.origin) for end in body_box(raster))
     cell, slots = raster.lattice.cell(), neighbourhood.slots
     return Setting(cell, slots, lower, upper, neighbourhood.tiling)
 
