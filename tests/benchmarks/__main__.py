@@ -25,7 +25,7 @@ from engines import cache, engines, limit, threads
 from goals import all_goals
 from gpu import gpu
 from peers import peers
-from ranks import ranks
+from ranks import ranks, weak_scaling
 
 from pbdkit.stepping.choice import processors
 
@@ -53,6 +53,7 @@ PARTS = {
     "elements": elements,
     "gpu": gpu,
     "ranks": ranks,
+    "weak": weak_scaling,
 }
 
 

@@ -211,7 +211,24 @@ def _ranks(found: Data) -> str:
     return _table(("", "", ""), rows)
 
 
-SCALE = {"ranks"}
+def _weak(found: list[Data]) -> str:
+    rows = []
+    for part in found:
+        alone = part["alone"]
+        lines = [part["part"] / alone - 1, 2 * part["exchange"] / alone]
+        count = 1000 * part["rows"]
+        rows.append((
+            f"{count:,} rows of {10**9 // count:,}".replace(",", " "),
+            f"{part['rows']}",
+            f"{part['steps']}",
+            *(f"{share:.1%}" for share in lines),
+            f"{1 / (1 + sum(lines)):.0%}",
+        ))  # fmt: skip
+    head = ("lattice", "rows a part", "k", "halo and fewer steps a pass", "exchange", "not lost")
+    return _table(head, rows)
+
+
+SCALE = {"ranks", "weak"}
 """Those of docs/scale.md."""
 TABLES: dict[str, Callable[[Any], str]] = {
     "machine": _machine,
@@ -227,4 +244,5 @@ TABLES: dict[str, Callable[[Any], str]] = {
     "elements": _elements,
     "gpu": _gpu,
     "ranks": _ranks,
+    "weak": _weak,
 }

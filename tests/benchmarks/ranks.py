@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ from sheets import Running, moving, scene_of
 from pbdkit.ranks.divided_driver import Division
 from pbdkit.ranks.divided_run import SharingRanks
 from pbdkit.ranks.divided_stepper import DividedStepper
-from pbdkit.ranks.subdomain import subdomains
+from pbdkit.ranks.subdomain import MOST_STEPS, subdomains
 from pbdkit.runs.course import peak_memory
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
 SIZE, STEPS, TURNS = 3000, 32, 9
 HELD, PARTS, SMALL = 4000, 4, 200
+MILLION, ROWS = 10**6, (1000, 100, 32)
+"""Parts of 10⁹ particles among 1000 processes: of 10⁶ rows, of 100 000, and of a square."""
 PAUSE_S = 0.01
 
 
@@ -36,6 +39,15 @@ def ranks() -> dict[str, Any] | None:
     return found | {"alone_bytes": one, "rank_bytes": every}
 
 
+def weak_scaling() -> list[dict[str, float]] | None:
+    """None where there is no mpiexec, which is said."""
+    if not shutil.which("mpiexec"):
+        print("weak: not measured: there is no mpiexec: pip install mpich")
+        return None
+    found: list[dict[str, float]] = _on(2, "weak")[0]
+    return found
+
+
 def _on(size: int, what: str) -> list[Any]:
     """What the processes of a launch have noted, by rank."""
     with tempfile.TemporaryDirectory() as folder:
@@ -47,12 +59,14 @@ def _on(size: int, what: str) -> list[Any]:
 class Sharing:
     """A sheet under way on all ranks; a call makes so many steps more."""
 
-    def __init__(self, ranks: SharingRanks) -> None:
-        scene = scene_of(moving(SIZE))
+    def __init__(self, ranks: SharingRanks, parts: dict[str, Any]) -> None:
+        scene = scene_of(parts)
         self.division = Division(ranks, scene, subdomains(scene, ranks.size))
         part, self.halo = self.division.scene, self.division.halo
         engine, steps = CompiledStepper(part, 1), self.division.part.subdomain.steps
-        self.steps = steps
+        self.steps, self.sent = steps, 0
+        for rows in self.halo.received.values():
+            self.sent += (rows.stop - rows.start) * part.raster.shape[2] * 16
         self._stepper = DividedStepper(ranks, part, engine, self.halo, steps)
         self.state, _ = self.division.begun(scene)
 
@@ -62,27 +76,62 @@ class Sharing:
 
 def speed(ranks: SharingRanks) -> dict[str, float]:
     """Best seconds of so many steps, in turns; while one process works the others sleep."""
-    shared = Sharing(ranks)
+    shared = Sharing(ranks, moving(SIZE))
     alone = [Running(moving(SIZE), STEPS, threads=n) for n in (1, 2)] if ranks.first else []
     seconds: dict[str, list[float]] = {"shared": [], "exchange": [], "1": [], "2": []}
+    works = {"shared": shared, "exchange": lambda: shared.halo.renew(shared.state)}
     for turn in range(TURNS + 1):
-        for name, work in (
-            ("shared", shared),
-            ("exchange", lambda: shared.halo.renew(shared.state)),
-        ):
-            ranks.any(False)
-            begun = time.perf_counter()
-            work()
-            ranks.any(False)
-            seconds[name] += [time.perf_counter() - begun] * (turn > 0)
+        _timed(ranks, works, seconds, turn)
         for running in alone:
             begun = time.perf_counter()
             running()
             seconds[str(running.engine.threads)] += [time.perf_counter() - begun] * (turn > 0)
         _wait(ranks)
     best = {name: min(taken, default=0.0) for name, taken in seconds.items()}
-    sent = sum(rows.stop - rows.start for rows in shared.halo.received.values()) * SIZE * 32
-    return best | {"steps": STEPS, "size": SIZE, "between": shared.steps, "sent_bytes": sent}
+    known = {"steps": STEPS, "size": SIZE, "between": shared.steps}
+    return best | known | {"sent_bytes": shared.sent}
+
+
+def _timed(
+    ranks: SharingRanks,
+    works: dict[str, Callable[[], Any]],
+    seconds: dict[str, list[float]],
+    turn: int,
+) -> None:
+    """Notes what each takes in all processes at once; not of the first turn."""
+    for name, work in works.items():
+        ranks.any(False)
+        begun = time.perf_counter()
+        work()
+        ranks.any(False)
+        seconds[name] += [time.perf_counter() - begun] * (turn > 0)
+
+
+def weak(ranks: SharingRanks) -> list[dict[str, float]]:
+    """Of parts of a million particles with a neighbour on either side: what their steps between two
+    exchanges take, an exchange with one neighbour, and as many steps of such a body alone."""
+    return [_weak(ranks, rows, MILLION // rows) for rows in ROWS]
+
+
+def _weak(ranks: SharingRanks, rows: int, places: int) -> dict[str, float]:
+    def sheet(count: int) -> dict[str, Any]:
+        body = {"type": "grid", "columns": count, "rows": places}
+        return moving(0, body=body, frame={"type": "none"})
+
+    shared = Sharing(ranks, sheet(ranks.size * rows))
+    own = shared.division.part.subdomain
+    halo = max(own.begin - own.low, own.high - own.end)
+    works = {
+        "part": Running(sheet(rows + 2 * halo), shared.steps),
+        "exchange": lambda: shared.halo.renew(shared.state),
+        "alone": Running(sheet(rows), MOST_STEPS),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(TURNS + 1):
+        _timed(ranks, works, seconds, turn)
+    best = {name: min(taken) for name, taken in seconds.items()}
+    best["alone"] *= shared.steps / MOST_STEPS
+    return best | {"rows": rows, "places": places, "steps": shared.steps}
 
 
 def _wait(ranks: SharingRanks) -> None:
@@ -103,7 +152,6 @@ def memory(ranks: SharingRanks | None) -> float:
     from pbdkit.results.progress import Watch
     from pbdkit.runs.course import record
     from pbdkit.runs.processes import Processes
-    from pbdkit.scene.scene import build_scene
 
     held = []
     for size in (SMALL, HELD):
@@ -111,7 +159,8 @@ def memory(ranks: SharingRanks | None) -> float:
             parts = moving(size, initial={"type": "reference"}, steps=20, record={"every": 20})
             solver = {"type": "stepping", "engine": "compiled", "threads": 1}
             experiment = Experiment.model_validate(parts | {"solver": solver})
-            run = (ranks or Processes()).run(build_scene(experiment), Watch())
+            together = ranks or Processes()
+            run = together.run(together.scene(experiment), Watch())
             record(run, run.sink(NetcdfSink(Path(folder) / "out.nc")))
             held.append(peak_memory())
     return float(held[1] - held[0])
@@ -127,7 +176,7 @@ def main() -> None:
     if comm.size == 1:
         found = memory(None)
     else:
-        found = {"speed": speed, "memory": memory}[what](SharingRanks(comm))
+        found = {"speed": speed, "memory": memory, "weak": weak}[what](SharingRanks(comm))
     (Path(folder) / str(comm.rank)).write_text(json.dumps(found))
 
 
