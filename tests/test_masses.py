@@ -151,6 +151,10 @@ def particle_5(data):
             {"rule": {"type": "barycentre"}, "frame": {"type": "none"}},
             "rule: leaders that move by Newton's law need forces, and 'barycentre' knows none",
         ),
+        (
+            {"rule": {"type": "elastic", "poisson_ratio": -1.0}},
+            "'elastic' knows none with these parameters",
+        ),
     ],
 )
 def test_what_does_not_go_with_masses_is_refused(parts, text):

@@ -37,6 +37,32 @@ def sheet(columns=9, rows=6, **parts):
     }
 
 
+BARYCENTRES = {
+    "elastic": {"rule": {"type": "elastic", "poisson_ratio": -1.0}, "frame": {"type": "mean"}},
+    "barycentre": {
+        "rule": {"type": "barycentre"},
+        "frame": {"type": "mean"},
+        "neighbours": {"type": "coordination", "shells": 1},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        {"type": "stepping", "engine": "numpy"},
+        {"type": "stepping", "engine": "compiled"},
+        {"type": "equilibrium", "method": "lu"},
+        {"type": "equilibrium", "method": "multigrid"},
+    ],
+)
+def test_a_calibrated_rule_without_a_material_is_guided_as_a_plain_one(solver):
+    """With ν = -1 nothing is left on the diagonals, and no force is known."""
+    one, other = (run(sheet(solver=solver, **parts)) for parts in BARYCENTRES.values())
+    assert np.abs(one.u.values[-1, :, 0]).max() > STRETCH
+    np.testing.assert_allclose(one.u.values, other.u.values, rtol=0, atol=1e-7)
+
+
 def scene_of(data):
     return build_scene(pbdkit.Experiment(**data))
 

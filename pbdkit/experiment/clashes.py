@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pbdkit.experiment.newton import Newton
-from pbdkit.interfaces import Calibrated, Draws, Loadable, RenewsParticles, Softens
+from pbdkit.interfaces import Draws, Loadable, RenewsParticles, Softens
 from pbdkit.interfaces.fields import unknown_regions
 from pbdkit.interfaces.rule import material_of
 
@@ -88,18 +88,19 @@ def _of_forces(asked: Any) -> list[tuple[Key, bool, str]]:
     rests = not asked.solver.makes_steps or asked.stepping.settle is not None
     masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
     guided = any(group.axes is not None for group in asked.leaders)
-    knows_forces = material_of(asked.rule) is not None and isinstance(asked.rule, Loadable)
+    knows_forces = material_of(asked.rule) is not None
     return [
         ("solver", masses and rests,
          "leaders that move by Newton's law have no place at which they rest beforehand; take "
          "solver: {type: stepping} without settle, or a load on followers"),
-        ("rule", masses and not isinstance(asked.rule, Calibrated),
-         f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none; "
-         "take a calibrated rule: elastic, springs"),
+        ("rule", masses and not knows_forces,
+         f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none "
+         "with these parameters; take a calibrated rule: elastic with poisson_ratio above -1, or "
+         "springs"),
         ("obstacles", bool(asked.obstacles) and guided and rests,
          "with leaders along one axis the equilibrium before obstacles is not known; take solver: "
          "{type: stepping} without settle, or lead along both axes"),
-        ("loads", bool(asked.loads) and not knows_forces,
+        ("loads", bool(asked.loads) and not (knows_forces and isinstance(asked.rule, Loadable)),
          f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
          "particle goes, and of no material how far a force would move it; take a calibrated "
          "rule ('elastic' or 'strain-gradient' with poisson_ratio above -1, 'orthotropic', "

@@ -15,8 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.guides import Guided, guided_at, has_guides
 from pbdkit.scene.places import Places
@@ -41,7 +41,7 @@ class Guidance:
         self._scene = scene
         self.some = has_guides(scene.leading)
         """Whether there are any."""
-        self.slanted = self.some and isinstance(scene.experiment.rule, Calibrated)
+        self.slanted = self.some and material_of(scene.experiment.rule) is not None
         """Whether a move along one axis may add to that along another."""
         self._known: dict[tuple[bool, ...], tuple[Guided, Slants]] = {}
 

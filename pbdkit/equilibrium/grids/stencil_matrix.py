@@ -20,8 +20,8 @@ from pbdkit.equilibrium.grids.primitive_raster import PrimitiveRaster, primitive
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.strip import outside
-from pbdkit.interfaces import Calibrated
 from pbdkit.interfaces.frame import Indices
+from pbdkit.interfaces.rule import material_of
 from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.places import slot_step
 from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
@@ -143,7 +143,7 @@ class _Assembly:
 
     def matrix(self, rows: Rows) -> StencilMatrix | None:
         """None where a frame point shows a particle that lies outside the window."""
-        known = isinstance(self._scene.experiment.rule, Calibrated)
+        known = material_of(self._scene.experiment.rule) is not None
         answers = ("move", "force") if known else ("move",)
         fits, every = True, by_sublattice(self._scene, self._followers)
         with rows.agreeing():
