@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.results.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.results.netcdf_sink import FINAL_STATE
+from pbdkit.storage.pieced_array import PiecedArray
 from pbdkit.storage.seal import opened
 from pbdkit.storage.standing import Standing
 from pbdkit.storage.unfinished import UnfinishedRun
@@ -41,9 +43,12 @@ def asked(
     return source, origin
 
 
-def longer(dataset: Any, output: Path, steps: int, anyway: bool) -> tuple[Source, Standing]:
-    """The experiment of a result, of more steps, and where it stands. Raises ExperimentError where
-    it is to be run anew."""
+def longer(
+    dataset: Any, output: Path, steps: int, anyway: bool, kept: ExitStack | None = None
+) -> tuple[Source, Standing]:
+    """The experiment of a result, of more steps, and where it stands; its arrays stay in the file
+    until `kept` is closed, where that is given. Raises ExperimentError where it is to be run anew.
+    """
     about = dataset.attrs
     if about.get("status") not in ENDED:
         raise ExperimentError(f"is {about.get('status')}: there is nothing to continue")
@@ -52,7 +57,7 @@ def longer(dataset: Any, output: Path, steps: int, anyway: bool) -> tuple[Source
             f"is of schema_version {made_as}, and what is recorded now is laid out as "
             f"{SCHEMA_VERSION}; run it anew with --set steps={steps}"
         )
-    standing = _final_state(output)
+    standing = _final_state(output, kept)
     source = _source(about, str(output), steps, standing.facts.get("step"))
     experiment = Experiment.build(source)
     if not experiment.solver.makes_steps:
@@ -66,41 +71,60 @@ def longer(dataset: Any, output: Path, steps: int, anyway: bool) -> tuple[Source
     return source, standing
 
 
-def history(dataset: Any, columns: list[Column], experiment: Experiment) -> Iterator[Values]:
-    """What was recorded and would be by the longer run, entry by entry."""
+def history(
+    dataset: Any, columns: list[Column], experiment: Experiment, *, pieced: bool = False
+) -> Iterator[Values]:
+    """What was recorded and would be by the longer run, entry by entry; large ones `pieced` on
+    request."""
     for column in columns:
         if column.when is When.START:
-            yield {column.name: dataset[column.name].values}
+            yield {column.name: _entry(dataset[column.name], pieced)}
     for dim in ("time", "step"):
         along = [column.name for column in columns if column.grows and column.dims[0] == dim]
         steps = dataset[dim].values.tolist() if along else []
-        for step, values in zip(steps, _rows(dataset, along, dim), strict=False):
+        for step, values in zip(steps, _rows(dataset, along, dim, pieced), strict=False):
             if dim == "step" or experiment.records(step):
                 yield values
 
 
-def _rows(dataset: Any, names: list[str], dim: str) -> Iterator[Values]:
+def _rows(dataset: Any, names: list[str], dim: str, pieced: bool) -> Iterator[Values]:
     """Row by row along a dimension. They are read in blocks: to read anything takes far longer than
     to read one row of a small body."""
     count = dataset.sizes.get(dim, 0)
     size = sum(dataset[name].nbytes for name in names)
     block = max(1, BLOCK_BYTES * count // max(1, size))
     for start in range(0, count, block):
+        if pieced and block == 1:
+            yield {name: _entry(dataset[name][start], pieced) for name in names}
+            continue
         read = {name: dataset[name][start : start + block].values for name in names}
         for n in range(min(block, count - start)):
             yield {name: values[n] for name, values in read.items()}
 
 
-def _final_state(output: Path) -> Standing:
+def _entry(variable: Any, pieced: bool) -> Any:
+    """All that a variable holds."""
+    if not pieced or variable.dtype.kind not in "fiub" or variable.nbytes <= BLOCK_BYTES:
+        return variable.values
+    count, some = len(variable), max(1, BLOCK_BYTES * len(variable) // variable.nbytes)
+    pieces = (variable[at : at + some].values for at in range(0, count, some))
+    return PiecedArray(variable.shape, variable.dtype, pieces)
+
+
+def _final_state(output: Path, kept: ExitStack | None) -> Standing:
     content = opened(output)
-    try:
-        group = content.groups[FINAL_STATE]
-        arrays = {name: variable[...] for name, variable in group.variables.items()}
-        return Standing({}, json.loads(group.attrs["facts"]), arrays)
-    except KeyError:
-        raise StorageError("holds no final state: an older pbdkit made it") from None
-    finally:
-        content.close()
+    with ExitStack() as closing:
+        closing.callback(content.close)
+        try:
+            group = content.groups[FINAL_STATE]
+            facts, arrays = json.loads(group.attrs["facts"]), dict(group.variables)
+        except KeyError:
+            raise StorageError("holds no final state: an older pbdkit made it") from None
+        if kept is None:
+            arrays = {name: variable[...] for name, variable in arrays.items()}
+        else:
+            kept.push(closing.pop_all())
+        return Standing({}, facts, arrays)
 
 
 def _source(about: Mapping[str, Any], name: str, steps: int | None, done: Any) -> Source:

@@ -126,7 +126,8 @@ def _continued(
         with together.agreeing():
             if together.first:
                 dataset = open_until_read.enter_context(reading(output))
-                source, standing = longer(dataset, output, steps, anyway)
+                kept = open_until_read if together.size > 1 else None
+                source, standing = longer(dataset, output, steps, anyway, kept)
         experiment = Experiment.build(together.told(source))
         run = together.run(together.scene(experiment), watch)
         sink = NetcdfSink(output, True, experiment.record.compression)
@@ -134,7 +135,8 @@ def _continued(
         try:
             before: Iterable[Values] = ()
             if dataset is not None:
-                before = history(dataset, columns_of(run.scene), experiment)
+                columns, pieced = columns_of(run.scene), together.size > 1
+                before = history(dataset, columns, experiment, pieced=pieced)
                 recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)][-1]
             recorder.begin(before)
             take_up(run.driver, recorder, standing, together, recorded)
