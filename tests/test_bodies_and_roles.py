@@ -1,6 +1,8 @@
 """Bodies, category changes, and what is refused about them; their numbers are compared with the
 plain loops on random scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -197,3 +199,10 @@ def test_groups_that_agree_may_overlap():
     leaders = [{"select": {"edge": e}} | HOLD for e in ("left", "bottom", "right", "top")]
     ds = pbdkit.run(scene(leaders=leaders), progress=False)
     assert (ds.kind[-1] == 0).sum() == 2 * 6 + 2 * 3
+
+
+def test_whether_leaders_overlap_is_told_of_the_groups_that_a_scene_has():
+    """Also where somebody gives it others, as hands do."""
+    held = build_scene(pbdkit.load("paper/a"))
+    assert not held.leaders_overlap
+    assert replace(held, leading=(*held.leading, held.leading[0])).leaders_overlap

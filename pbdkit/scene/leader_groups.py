@@ -16,7 +16,7 @@ from pbdkit.experiment.motions import Rotation
 from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.force_shares import shares_of
-from pbdkit.scene.places import Floats, distinct
+from pbdkit.scene.places import Floats
 from pbdkit.scene.raster import LEADER, Raster
 from pbdkit.scene.selecting import Selecting, spacing
 
@@ -60,13 +60,6 @@ def build_leading(raster: Raster, experiment: Experiment) -> tuple[Leading, ...]
         if _known_beforehand(found[k].group, found[n].group, experiment.initial.at_rest):
             _refuse_contradiction(raster, found, k, n, steps)
     return tuple(found)
-
-
-def overlap(raster: Raster, leading: Iterable[Leading]) -> bool:
-    """Whether any particle belongs to two leader groups."""
-    rows = [each.rows for each in leading]
-    own = bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
-    return raster.others.any(own)
 
 
 def _meeting(found: list[Leading], steps: int) -> Iterator[tuple[int, int]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
@@ -19,11 +21,12 @@ from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.ground import Ground
 from pbdkit.scene.homes import SceneConstants, ask_for_constants
-from pbdkit.scene.leader_groups import Leading, build_leading, overlap
+from pbdkit.scene.leader_groups import Leading, build_leading
 from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
 from pbdkit.scene.others import ALONE, Others
+from pbdkit.scene.places import distinct
 from pbdkit.scene.raster import Raster
 from pbdkit.scene.setting import body_box, setting_of
 
@@ -34,9 +37,9 @@ class Scene:
 
     `constants` are what the elementwise functions are called with. `frame`, `cells`, `inner` (the
     scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
-    the leader groups, and `leaders_overlap` whether any particle belongs to two of them; `setting`
-    is what a rule may derive its constants from, `middle` that of the body's box, from the
-    lattice's site (0, 0); `warnings` are for the user, `barriers` the obstacles.
+    the leader groups; `setting` is what a rule may derive its constants from, `middle` that of the
+    body's box, from the lattice's site (0, 0); `warnings` are for the user, `barriers` the
+    obstacles.
     """
 
     experiment: Experiment
@@ -47,7 +50,6 @@ class Scene:
     cells: WeighedCells | None
     inner: Scene | None
     leading: tuple[Leading, ...]
-    leaders_overlap: bool
     loads: Loads | None
     setting: Setting
     middle: Components
@@ -97,6 +99,12 @@ class Scene:
         return len(self.raster.lattice.cell().vectors)
 
     @cached_property
+    def leaders_overlap(self) -> bool:
+        """Whether any particle belongs to two leader groups."""
+        rows = [leading.rows for leading in self.leading]
+        return bool(rows) and len(distinct(np.concatenate(rows))) < sum(map(len, rows))
+
+    @cached_property
     def bonds(self) -> BondTable:
         """The table of bonds."""
         return build_bond_table(self.raster, self.neighbourhood)
@@ -144,7 +152,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     warnings += collisions(raster, leading, barriers, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     lower, upper = body_box(raster)
-    facts = (overlap(raster, leading), loads, setting, (lower + upper) / 2)
+    facts = loads, setting, (lower + upper) / 2
     return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers))
 
 
