@@ -56,6 +56,10 @@ class ExperimentError(PbdkitError):
     """Whether the message already begins with the place in the experiment's file."""
 
 
+class NotSharedError(ExperimentError):
+    """Several processes cannot share it: one can run it."""
+
+
 class PluginError(PbdkitError):
     """A distribution that the experiment names is missing or broken, or a component of it fails;
     `where` is then the path of the field that asks for it, where one does."""

@@ -164,11 +164,12 @@ def certified(path):
 
 
 def test_what_the_certificate_says_is_true(tmp_path):
-    """Also where one process takes factors of a matrix."""
+    """By factors of a matrix it is found more accurately."""
     given_ = strip(body=RING, leaders=ENDS)
     exact = {"type": "equilibrium", "method": "lu", "tolerance": 1e-11}
     written(given_ | {"solver": exact}, tmp_path / "exact.nc")
-    sought, path = given_ | {"solver": {"type": "equilibrium"}}, tmp_path / "several.nc"
+    grids = {"type": "equilibrium", "method": "multigrid"}
+    sought, path = given_ | {"solver": grids}, tmp_path / "several.nc"
     outcomes = on_ranks(2, lambda ranks: written(sought, path, ranks))
     (right, _), (u, certificate) = certified(tmp_path / "exact.nc"), certified(path)
     assert {one.status for one in outcomes} == {"complete"}
@@ -352,8 +353,36 @@ def test_mpiexec_gives_the_file_of_one_process(tmp_path):
 
 
 @needs_mpi
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("material/bar", []),
+        ("material/gradient-layer", []),
+        ("paper/a", ["neighbours={type: euclidean, radius: 1.2, reevaluate: true}", "steps=20"]),
+    ],
+)
+def test_what_cannot_be_shared_the_first_process_runs_alone(name, settings, tmp_path):
+    how = [word for setting in settings for word in ("--set", setting)]
+    done = pbdkit_on(2, "run", name, *how, "-o", "two.nc", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("; the first of them runs it alone") == 1
+    assert done.stdout.count("complete: ") == 1
+    given_ = pbdkit.load(name, settings=settings).model_dump(mode="json", by_alias=True)
+    written(given_, tmp_path / "one.nc")
+    assert_same(tmp_path / "one.nc", tmp_path / "two.nc")
+
+
+@needs_mpi
+def test_what_the_first_process_alone_refuses_ends_all(tmp_path):
+    nobody = "leaders.0.select={box: [-9, -9, -8, -8]}"
+    done = pbdkit_on(2, "run", "material/bar", "--set", nobody, "-o", "two.nc", folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("selects no particle") == 1
+
+
+@needs_mpi
 def test_an_end_that_is_no_equilibrium_is_said_once(tmp_path):
-    how = ["--set", "solver.tolerance=1e-17"]
+    how = ["--set", "solver.tolerance=1e-17", "--set", "solver.method=multigrid"]
     done = pbdkit_on(2, "run", "modelling/strip", *how, "-o", "out.nc", folder=tmp_path)
     assert done.returncode == 4
     assert done.stderr.count("pbdkit: unconverged: ") == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +19,14 @@ from pbdkit.cli.options import (
     set_option,
 )
 from pbdkit.cli.stopping import Stop, asked_to_stop
+from pbdkit.errors import NotSharedError
 
 if TYPE_CHECKING:
     from pbdkit.results.netcdf_sink import NetcdfSink
     from pbdkit.results.progress import Watch
     from pbdkit.results.recorder import Outcome
     from pbdkit.runs.course import Report, Run
+    from pbdkit.runs.processes import Processes
 
 ENDED = ("complete", "settled")
 """How runs end that came to what was asked for."""
@@ -61,23 +63,27 @@ def run(
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if processes.first:
                 refuse_output(path, force=force, experiment=Path(experiment))
-        scene = processes.scene(loaded)
-        with processes.agreeing():
-            if processes.first:
-                refuse_unfinished(path, force=force)
         given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
         origin = {"experiment": given, "settings": list(settings)}
-        file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
         quiet = quiet or not processes.first
-        _warn(disk_warnings(path, scene), quiet)
-        with _watched(path, quiet or as_json, file) as (stop, watch):
-            one = processes.run(scene, watch)
-            del scene  # of which each of several processes goes on with its part alone
-            _warn(one.warnings, quiet)
-            report = record(one, one.sink(file))
-        if processes.first:
-            _tell(one, report, file, path, quiet, as_json)
-        return _exit_status(report.outcome, stop)
+
+        def run_by(those: Processes, again: bool) -> int:
+            scene = those.scene(loaded)
+            with those.agreeing():
+                if those.first:
+                    refuse_unfinished(path, force=force or again)
+            file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
+            _warn(disk_warnings(path, scene), quiet)
+            with _watched(path, quiet or as_json, file) as (stop, watch):
+                one = those.run(scene, watch)
+                del scene  # of which each of several processes goes on with its part alone
+                _warn(one.warnings, quiet)
+                report = record(one, one.sink(file))
+            if those.first:
+                _tell(one, report, file, path, quiet, as_json)
+            return _exit_status(report.outcome, stop)
+
+        return _shared(processes, quiet, run_by)
 
 
 @click.command()
@@ -93,18 +99,34 @@ def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: 
 
     with launched() as processes:
         quiet = quiet or not processes.first
-        with _watched(output, quiet or as_json) as (stop, watch):
-            found = resumption(output, watch, steps=steps, anyway=anyway, processes=processes)
-            if found is None:
-                if not quiet:
-                    click.echo(f"{output}: was finished, and is whole")
-                return 0
-            _warn(found.run.warnings, quiet)
-            with _told_what_is_kept(output, found.sink):
-                report = found.record()
-        if processes.first:
-            _tell(found.run, report, found.sink, output, quiet, as_json)
-        return _exit_status(report.outcome, stop)
+
+        def resume_by(those: Processes, _: bool) -> int:
+            with _watched(output, quiet or as_json) as (stop, watch):
+                found = resumption(output, watch, steps=steps, anyway=anyway, processes=those)
+                if found is None:
+                    if not quiet:
+                        click.echo(f"{output}: was finished, and is whole")
+                    return 0
+                _warn(found.run.warnings, quiet)
+                with _told_what_is_kept(output, found.sink):
+                    report = found.record()
+            if those.first:
+                _tell(found.run, report, found.sink, output, quiet, as_json)
+            return _exit_status(report.outcome, stop)
+
+        return _shared(processes, quiet, resume_by)
+
+
+def _shared(processes: Processes, quiet: bool, work: Callable[[Processes, bool], int]) -> int:
+    """Done by all processes together; where they cannot share it, again by the first of them."""
+    try:
+        return work(processes, False)
+    except NotSharedError as error:
+        told = str(error).replace("; run it in one process", "; the first of them runs it alone")
+        _warn([told], quiet)
+    from pbdkit.runs.processes import Processes
+
+    return processes.by_first(lambda: work(Processes(), True))
 
 
 @contextmanager
@@ -129,6 +151,8 @@ def _told_what_is_kept(path: Path, file: NetcdfSink) -> Iterator[None]:
     """Where a run fails that was kept, how to go on with it."""
     try:
         yield
+    except NotSharedError:
+        raise
     except BaseException:
         if file.kept:
             click.echo(_how_to_go_on(path), err=True)

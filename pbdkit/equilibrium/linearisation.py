@@ -15,7 +15,7 @@ from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import Floats, IndefiniteError, StuckError, System, one_thread
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import NotSharedError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import asks_for_grids
@@ -78,7 +78,7 @@ def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> 
 
     system = lattice_system(scene, state, step, watch, rows=rows)
     if system is None:
-        raise ExperimentError(NOT_SHARED, ("rule",))
+        raise NotSharedError(NOT_SHARED, ("rule",))
     return system
 
 

@@ -231,7 +231,7 @@ class Experiment(Strict):
         """The error with the place of its field in the file, once."""
         if error.located:
             return error
-        found = ExperimentError(self._source.message(error.where, str(error)), error.where)
+        found = type(error)(self._source.message(error.where, str(error)), error.where)
         found.located = True
         return found
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import atexit
 import pickle
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from platform import node
 from typing import Any
@@ -18,6 +19,8 @@ from pbdkit.storage.pieced_array import Bytes
 
 NUMBERS_AT_ONCE = 2**20
 """So many of all processes together are compared at a time."""
+PAUSE_S = 0.05
+"""For which processes sleep that wait for the first."""
 FAILED = 1
 """The exit status of a run that is given up because one process failed."""
 
@@ -120,6 +123,23 @@ class Ranks(Processes):
         first = next(n for n, one in enumerate(errors) if one is not None)
         raised: Exception = error if first == self.rank and error else errors[first]
         raise raised
+
+    def by_first(self, work: Callable[[], int]) -> int:
+        """The others sleep meanwhile."""
+        if not self.first:
+            while not self._comm.iprobe(source=0):
+                time.sleep(PAUSE_S)
+            return int(self._comm.recv(source=0))
+        status = FAILED
+        try:
+            status = work()
+        except PbdkitError as error:
+            status = error.exit_status
+            raise
+        finally:
+            for rank in range(1, self.size):
+                self._comm.send(status, rank)
+        return status
 
     @contextmanager
     def speaking(self) -> Iterator[None]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate
 from pbdkit.equilibrium.settlement import Settling
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import NotSharedError
 from pbdkit.experiment.solvers import Settle
 from pbdkit.interfaces import Draws
 from pbdkit.ranks.communicator import Ranks
@@ -186,8 +186,8 @@ class DividedStepwise(Stepwise):
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
-    """Raises ExperimentError for the first clash of what does not fit, of a field."""
+    """Raises NotSharedError for the first clash of what does not fit, of a field."""
     for clash, field, text in unfit:
         if clash:
             refusal = f"{text}, which several processes cannot share yet; run it in one process"
-            raise scene.experiment.located(ExperimentError(refusal, field))
+            raise scene.experiment.located(NotSharedError(refusal, field))

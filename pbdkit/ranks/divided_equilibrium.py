@@ -8,12 +8,13 @@ from typing import Any
 
 from pbdkit.equilibrium.increments import Way
 from pbdkit.equilibrium.system import StuckError
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import NotSharedError
 from pbdkit.ranks.divided_driver import DividedWatch, Division, refuse
 from pbdkit.ranks.divided_rows import DividedRows, strip_of
 from pbdkit.results.progress import Watch
 from pbdkit.runs.drivers import Straight
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.solver_sizes import asks_for_grids
 from pbdkit.stepping.choice import choose
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
@@ -53,7 +54,7 @@ class DividedStraight(Straight):
             way = increments(scene, state, self.watch, self.moment, finder, self._stepper)
             certificate = yield from way
         except StuckError:
-            raise ExperimentError(STUCK, ("solver",)) from None
+            raise NotSharedError(STUCK, ("solver",)) from None
         self._division.halo.renew(state)  # with what frame points show there
         return certificate
 
@@ -89,5 +90,10 @@ def _refuse(scene: Scene) -> None:
                 f"an equilibrium by method '{method}'",
             ),
             (not find_spec("numba"), ("solver",), "an equilibrium without numba"),
+            (
+                not asks_for_grids(experiment, method, scene.raster.total),
+                ("solver", "method"),
+                "an equilibrium so small that factors of a matrix find it",
+            ),
         ],
     )

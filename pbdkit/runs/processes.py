@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -29,6 +30,10 @@ class Processes:
     def scene(self, experiment: Experiment) -> Scene:
         """What this one needs of an experiment's scene: here all."""
         return build_scene(experiment)
+
+    def by_first(self, work: Callable[[], int]) -> int:
+        """What the first process alone comes to."""
+        return work()
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """The run of a scene that they make together."""
