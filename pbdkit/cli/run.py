@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -126,7 +126,9 @@ def _shared(processes: Processes, quiet: bool, work: Callable[[Processes, bool],
         _warn([told], quiet)
     from pbdkit.runs.processes import Processes
 
-    return processes.by_first(lambda: work(Processes(), True))
+    # A signal that all of them get must not end those who wait.
+    with nullcontext() if processes.first else asked_to_stop():
+        return processes.by_first(lambda: work(Processes(), True))
 
 
 @contextmanager
