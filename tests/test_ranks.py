@@ -35,7 +35,9 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.storage.run_files import has_committed
 from pbdkit.storage.run_status import status_of
 
-MPIEXEC = shutil.which("mpiexec")
+BESIDE = Path(sys.executable).parent
+"""Where the launcher of mpi4py's own MPI is, whether or not the environment is activated."""
+MPIEXEC = shutil.which("mpiexec", path=BESIDE) or shutil.which("mpiexec")
 NUMPY = {"type": "stepping", "engine": "numpy"}
 COMPILED = {"type": "stepping", "engine": "compiled"}
 
