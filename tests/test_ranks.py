@@ -12,6 +12,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar, Literal
 
 import h5netcdf
 import numpy as np
@@ -204,6 +205,39 @@ OTHERS = {
         "units": {"length": "1 mm", "youngs_modulus": "200 GPa", "thickness": "1 mm"},
     },
 }
+
+
+class AheadBefore(pbdkit.Diagnostic):
+    """Where the particle three lines ahead was a step ago."""
+
+    type: Literal["ahead-before"] = "ahead-before"
+    line: int
+
+    local: ClassVar[bool] = True
+
+    def variables(self):
+        dims = ("particle", "axis")
+        return (pbdkit.Variable("ahead_before", dims, "Ahead, a step ago", "lattice unit"),)
+
+    def measure(self, now):
+        found = np.zeros_like(now.displacement())
+        found[: -self.line] = now.previous_displacement()[self.line :]
+        found[~now.body] = np.nan
+        return (found,)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.3])
+def test_authors_look_at_where_others_were(memory, tmp_path):
+    """After several steps without an exchange a part has little of that right beyond its own."""
+    parts = {
+        "body": {"type": "grid", "columns": 200, "rows": 3},
+        "frame": {"type": "none"},
+        "initial": {"type": "noise", "amplitude": 0.3},
+        "diagnostics": [AheadBefore(line=3 * 3)],
+        "record": {"every": 8},
+        "solver": NUMPY | {"memory": memory},
+    }
+    compare(sheet(**parts), tmp_path, 3)
 
 
 def test_sums_over_cells_have_one_order(tmp_path, monkeypatch):

@@ -27,6 +27,13 @@ from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 
+def whole_of(ranks: Ranks, scene: Scene) -> Scene | None:
+    """The scene that processes have parts of, in the first of them."""
+    if not ranks.first:
+        return None
+    return build_scene(scene.experiment) if scene.raster.extent else scene
+
+
 class Division:
     """A scene cut up among processes: this one's part, and how a state of it is put together with
     those of the others. The first process keeps the `whole` scene where somebody looks at that."""
@@ -44,9 +51,7 @@ class Division:
 
     def whole_of(self, scene: Scene) -> Scene | None:
         """The scene that others have parts of, in the first process."""
-        if self.whole or not self.ranks.first:
-            return self.whole
-        return build_scene(scene.experiment) if scene.raster.extent else scene
+        return self.whole or whole_of(self.ranks, scene)
 
     def begun(self, scene: Scene) -> tuple[State, bool]:
         """The part of the state at time 0, and whether it can be made again from the part alone:
@@ -54,9 +59,10 @@ class Division:
         experiment, whole = scene.experiment, None
         draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
         if not (experiment.initial.is_drawn or draws):
-            state = initial_state(self.scene)
-            self.halo.renew(state)
-            return state, experiment.initial.at_rest
+            state, at_rest = initial_state(self.scene), experiment.initial.at_rest
+            if not at_rest:
+                self.halo.renew(state)
+            return state, at_rest
         with self.ranks.agreeing():
             if found := self.whole_of(scene):
                 whole = initial_state(found)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pbdkit.analysis.stencil import Bound, wave_bound
-from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
 from pbdkit.prediction.forecast import prediction, quick_warnings
 from pbdkit.ranks.building import CUTS, built
 from pbdkit.ranks.communicator import Ranks
-from pbdkit.ranks.divided_driver import DividedStepwise, Division
+from pbdkit.ranks.divided_driver import DividedStepwise, Division, whole_of
 from pbdkit.ranks.divided_equilibrium import DividedStraight
 from pbdkit.ranks.divided_recording import DividedRecorder, PartSink
 from pbdkit.results.progress import Watch
@@ -19,8 +18,8 @@ from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import KeepingSink, Sink
 from pbdkit.runs.course import Run
 from pbdkit.runs.drivers import Driver
-from pbdkit.runs.tuning import chosen_weights, with_solver
-from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.runs.tuning import tuned, with_solver
+from pbdkit.scene.scene import Scene
 
 DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
     Stepping: DividedStepwise,
@@ -70,15 +69,11 @@ def _tuned(ranks: Ranks, scene: Scene) -> Scene:
     """With numbers in place of `auto`, which the first process finds, of the whole."""
     if not scene.experiment.stepping.is_open:
         return scene
-    weights = None
+    found = None
     with ranks.agreeing():
-        if ranks.first:
-            whole = build_scene(scene.experiment) if scene.raster.extent else scene
-            try:
-                weights = chosen_weights(whole)
-            except ExperimentError as error:
-                raise scene.experiment.located(error) from None
-    return with_solver(scene, scene.experiment.stepping.with_weights(*ranks.told(weights)))
+        if whole := whole_of(ranks, scene):
+            found = tuned(whole).experiment.stepping
+    return with_solver(scene, ranks.told(found))
 
 
 class SharingRanks(Ranks):
