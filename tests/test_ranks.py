@@ -198,6 +198,7 @@ OTHERS = {
         "leaders": along(UP),
     },
     "lag": {"frame": {"type": "mean", "layers": 2, "lag": 1}, "leaders": along(UP)},
+    "weights that are found": {"solver": NUMPY | {"relaxation": "auto", "memory": "auto"}},
     "every diagnostic of cells": ELASTIC
     | {
         "leaders": along(UP),
