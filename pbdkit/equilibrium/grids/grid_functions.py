@@ -7,12 +7,13 @@ from importlib.resources import files
 from types import SimpleNamespace
 from typing import Any
 
-from pbdkit.stepping.compiled.kernel_cache import load_kernel
-
 
 @cache
 def kernels() -> SimpleNamespace:
     """The compiled functions: how grids are made, what is done on one, and with whole fields."""
+    # Only here: numba is the extra `fast`, and equilibria are found without it too.
+    from pbdkit.stepping.compiled.kernel_cache import load_kernel
+
     found: dict[str, Any] = {}
     for name in ("coarsening", "grid", "field"):
         file = files("pbdkit.equilibrium.grids").joinpath(f"{name}_kernels.py")
