@@ -55,6 +55,33 @@ def test_a_far_body_is_the_same_body():
     assert body_sites(far, lattice=origin) == near
 
 
+GRID = {"type": "grid", "columns": 5, "rows": 4}
+
+
+@pytest.mark.parametrize("frame", ["natural", "none"])
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+@pytest.mark.parametrize("made", ["grid", "difference", "union", "intersection"])
+def test_a_grid_is_the_same_body_in_all_units_and_wherever_it_lies(made, lattice, frame):
+    def sites(a, origin):
+        x, y = (n * a + shift for n, shift in zip((1.5, 1.5), origin, strict=True))
+        disc = {"type": "disc", "radius": 0.9 * a, "centre": [x, y]}
+        body = GRID if made == "grid" else {"type": made, "of": [GRID, disc]}
+        return body_sites(
+            body,
+            lattice={"type": lattice, "a": a, "origin": origin},
+            neighbours={"type": "chebyshev" if lattice == "square" else "coordination"},
+            rule={"type": "elastic", "poisson_ratio": 0.3},
+            frame={"type": frame},
+        )
+
+    expected = sites(1.0, [0.0, 0.0])
+    for a in (2.0**-40, 2.0**10, 2.0**30, 2.0**40):
+        assert sites(a, [0.0, 0.0]) == expected
+    if made == "grid":
+        assert len(expected) == 20
+        assert sites(1e3, [3e16, -2e16]) == expected
+
+
 def test_a_dogbone_is_narrow_in_the_middle():
     bone = {
         "type": "dogbone",

@@ -75,10 +75,10 @@ class Grid(Body):
         return [Box((0, 0), (self.columns - 1, self.rows - 1), in_sites=True)]
 
     def distance(self, sites: Sites) -> Floats:
-        """-1 for its sites, 1 for others."""
+        """-∞ for its sites, ∞ for others: it has no outline, near which rounding would decide."""
         i, j = sites.index
         inside = (i >= 0) & (i < self.columns) & (j >= 0) & (j < self.rows)
-        return np.where(inside, -1.0, 1.0)
+        return np.where(inside, -np.inf, np.inf)
 
 
 class Rectangle(Body):
