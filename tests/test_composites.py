@@ -262,3 +262,45 @@ def test_a_round_inclusion_is_that_of_the_exact_solution():
     for found, within in ((rough, 0.06), (fine, 0.03)):
         there, _, at_pole = found.pole
         assert max(abs(there - 1.0), abs(at_pole - 1.0)) < within
+
+
+NU_BY_REGION = {"poisson_ratio": {"otherwise": 0.2, "right": 0.0}}
+ORTHOTROPIC = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5}
+MIXED_RULES = {
+    "Poisson's ratio by region": NU_BY_REGION,
+    "over a grid": {"poisson_ratio": {"x": [0.0, 9.0], "y": [0.0], "values": [[0.0], [0.4]]}},
+    "by region, cut": {"poisson_ratio": {"otherwise": 0.2, "oblique": 0.45}},
+    "plane strain": {"plane": "strain"} | NU_BY_REGION,
+    "orthotropic": ORTHOTROPIC
+    | {"shear_ratio": 0.3, "modulus_ratio": {"otherwise": 0.5, "right": 2.0}},
+    "shear ratio": ORTHOTROPIC | {"shear_ratio": {"otherwise": 0.3, "oblique": 0.2}},
+}
+
+
+def loaded_sheet(rule: dict[str, Any], force: float) -> Any:
+    """The displacements of a sheet that is held on the left and loaded on the right, at rest."""
+    given = bar(8.0, 3.0) | {
+        "rule": {"type": "elastic"} | rule,
+        "regions": {
+            "right": {"type": "rectangle", "width": 9.0, "height": 9.0, "origin": [3.5, -1.0]},
+            "oblique": {"type": "polygon", "vertices": [[2.2, -1], [9, -1], [9, 4], [4.3, 4]]},
+        },
+        "loads": [{"select": {"edge": "right"}, "force": [force, 0.3 * force]}],
+        "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+        "diagnostics": [{"type": "displacement"}],
+        "solver": {"type": "equilibrium"},
+    }
+    return pbdkit.run(given, progress=False)["u"].isel(time=-1).values
+
+
+@pytest.mark.parametrize("stiffness", [4.0, "field", "course"])
+@pytest.mark.parametrize("name", MIXED_RULES)
+def test_a_stiffness_is_that_of_every_cell_whatever_else_differs(name, stiffness):
+    """Four times the stiffness under a load is the stiffness under a quarter of it."""
+    fourfold = {
+        "field": {"otherwise": 4.0},
+        "course": {"steps": [0, 1], "values": [1.0, 4.0]},
+    }.get(stiffness, stiffness)
+    expected = loaded_sheet(MIXED_RULES[name], 1e-3)
+    found = loaded_sheet(MIXED_RULES[name] | {"stiffness": fourfold}, 4e-3)
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())

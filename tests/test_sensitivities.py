@@ -196,6 +196,17 @@ def test_derivatives_are_those_of_differences_of_equilibria(name):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * size)
 
 
+def test_what_loads_do_falls_with_the_stiffness_beside_a_field_of_another_number():
+    """u is as 1/k: ∂u/∂k = -u/k, whatever Poisson's ratio of each cell."""
+    core = {"core": {"type": "disc", "radius": 1.2, "centre": [1.9, 1.4]}}
+    rule = ELASTIC | {"stiffness": 4.0, "poisson_ratio": {"otherwise": 0.3, "core": 0.1}}
+    load = {"select": {"edge": "right"}, "force": [0.1, -0.2]}
+    parts = {"rule": rule, "regions": core, "leaders": SHEET["leaders"][:1], "loads": [load]}
+    resting = Resting.of(pbdkit.Experiment(**SHEET | parts | {"frame": {"type": "natural"}}))
+    found, u = resting.change(Parameter("rule.stiffness")), resting.state.u
+    np.testing.assert_allclose(found, -u / 4.0, rtol=0.0, atol=1e-8 * np.abs(u).max())
+
+
 @pytest.mark.parametrize("frame", sensitivity_cases.FRAMES)
 @pytest.mark.parametrize("rule", sensitivity_cases.RULES)
 def test_derivatives_and_gradients_are_those_of_equilibria_found_anew(rule, frame):

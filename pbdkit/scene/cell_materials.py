@@ -153,7 +153,9 @@ class _Cells:
         if all(name == STIFFNESS for name in values) and not isinstance(rule, MixesCells):
             return self._factors(values[STIFFNESS]), np.zeros((len(x), 3, 3))
         mixed = self.phases() < 0
-        factor = values.get(STIFFNESS, np.ones(len(x))) / getattr(rule, STIFFNESS, 1.0)
+        factor = np.ones(len(x))
+        if STIFFNESS in values:
+            factor = values[STIFFNESS] / getattr(rule, STIFFNESS)
         others = [values[name] != getattr(rule, name) for name in values if name != STIFFNESS]
         apart = np.logical_or.reduce([mixed, *others])
         stiffness = np.zeros((len(x), 3, 3))
