@@ -3,6 +3,7 @@
 import json
 import math
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,13 +11,24 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 from test_calibrated_rules import NATURAL
+from thread_ranks import on_ranks
 
 import pbdkit
+from pbdkit.components.elasticity import Elastic, StrainGradient
 from pbdkit.equilibrium.load_path import moments
+from pbdkit.errors import NotSharedError
+from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.source import Source
+from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.scene_alike import scene_like
 from pbdkit.interfaces.course import Course
+from pbdkit.prediction.analysis import Analysis
 from pbdkit.results.explanation import Explained
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import Run
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import choose
+from pbdkit.sessions.session import Session
+from pbdkit.stepping.choice import choose, what_kernels_lack
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.prescription import last_event
 from pbdkit.stepping.state import initial_state
@@ -379,3 +391,130 @@ def test_check_warns_where_loads_have_no_time_to_come_to_rest(call, tmp_path):
     (tmp_path / "hasty.yaml").write_text(json.dumps(given_))
     said = json.loads(call("check", str(tmp_path / "hasty.yaml"), "--json").out)["warnings"]
     assert any(w.startswith("steps: under its loads the body comes to rest in") for w in said)
+
+
+class Leaning(pbdkit.FramePolicy):
+    """Frame points follow the nearest particle and the body's lowest corner, by a number of the
+    rule."""
+
+    type: Literal["leaning"] = "leaning"
+
+    def depth(self, reach):
+        return reach
+
+    def follow(self, frame):
+        points, first = np.unique(frame.nearest()[0], return_index=True)
+        nearest = frame.nearest()[1][first]
+        corner = frame.body_at(np.array([frame.low], np.int32))[0]
+        share = getattr(frame.rule, "K", 0.0) + getattr(frame.rule, "poisson_ratio", 0.0)
+        body = np.stack([nearest, np.full(len(points), corner)], axis=1).ravel()
+        weight = np.tile([1.0 - share, share], len(points))
+        return pbdkit.FrameMap(np.repeat(points, 2), body, weight)
+
+
+FOLLOWING = {
+    "parameter": {"rule": {"type": "mixed-coordinate", "K": course([1, 9], [0.0, 0.05])}},
+    "weights": {
+        "rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])},
+        "solver": {"relaxation": 0.5},
+    },
+    "limits": CHANGING["limits"]
+    | {"rule": {"type": "elastic", "poisson_ratio": course([2, 15], [0.1, 0.4])}},
+}
+"""What changes under a frame that reads the rule."""
+
+
+def leaning(**parts):
+    """The sheet under a frame that reads the rule, as an experiment."""
+    given_ = sheet(frame={"type": "leaning"}, **parts)
+    return Experiment.build(Source(data=given_), [Leaning])
+
+
+@pytest.mark.parametrize("name", FOLLOWING)
+def test_a_frame_that_reads_the_rule_follows_its_course(name):
+    parts = FOLLOWING[name]
+    scene = build_scene(leaning(**parts))
+    stepper = Stepper(scene)
+    state, plain = initial_state(scene), initial_state(scene)
+    for step in range(1, 25):
+        state = stepper.advance(state)
+        plain = Stepper(build_scene(leaning(**now(parts, step)))).advance(plain)
+        np.testing.assert_array_equal(state.u, plain.u)
+
+
+def test_a_frame_that_reads_no_number_is_made_once(monkeypatch):
+    scene = build_scene(pbdkit.Experiment(**sheet(**CHANGING["weights"])))
+    assert scene.at(3).frame is scene.frame
+    scene = build_scene(leaning(**FOLLOWING["weights"]))
+    assert scene.at(3).frame is not scene.frame
+
+
+def test_kernels_leave_frames_that_follow_a_course_to_numpy():
+    scene = build_scene(leaning(engine="auto", **FOLLOWING["parameter"]))
+    assert "numbers change in time by which the frame follows" in what_kernels_lack(scene)
+
+
+class Behind(StrainGradient):
+    """Applies a rule to the moves of another, whose weights alone hang on the length."""
+
+    type: Literal["behind"] = "behind"
+
+    def inner(self):
+        return Elastic(poisson_ratio=self.length, plane=self.plane)
+
+
+def test_kernels_leave_inner_rules_whose_weights_change_to_numpy():
+    rule = Behind(poisson_ratio=0.2, length=course([2, 15], [0.1, 0.4]))
+    scene = build_scene(pbdkit.Experiment(**sheet(rule=rule)))
+    assert what_kernels_lack(scene) == "numbers change in time that are written into kernels"
+
+
+def test_the_spectrum_on_the_way_is_that_of_the_frame_on_the_way():
+    parts = FOLLOWING["weights"]
+    on_the_way = Analysis(build_scene(leaning(**parts)).at(5))
+    anew = Analysis(build_scene(leaning(**now(parts, 5))))
+    assert on_the_way.spectral_radius == anew.spectral_radius
+
+
+@pytest.mark.parametrize("fracture", ["none", "strain"])
+def test_an_equilibrium_is_that_of_the_frame_in_the_end(fracture):
+    """Numbers still change when the run ends, in increments where bonds can break."""
+    parts = {
+        "rule": {"type": "elastic", "poisson_ratio": course([0, 60], [0.1, 0.4])},
+        "solver": {"type": "equilibrium", "tolerance": 1e-12},
+        "fracture": {"type": "none"} if fracture == "none" else BREAKING | {"failure": 9.0},
+    }
+    ends = []
+    for given_ in (parts, now(parts, 30)):
+        given_ = SHEET | {"frame": {"type": "leaning"}} | given_
+        ds = pbdkit.run(given_, components=[Leaning], progress=False)
+        ends.append(ds.position.values[-1])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-11)
+
+
+def test_turns_of_a_live_session_move_the_frame_too(tmp_path):
+    session = Session(leaning(**now(FOLLOWING["weights"], 0)), tmp_path / "live.yaml")
+    session.advance(5)
+    session.turn("rule.poisson_ratio", 0.4)
+    session.advance(5)
+    run = Run(build_scene(pbdkit.load(session.save().path, components=[Leaning])))
+    for state in run:
+        last = state.u.copy()
+    np.testing.assert_array_equal(session.state.u, last)
+
+
+def test_several_processes_leave_frames_that_follow_a_course_to_one():
+    def begun(ranks):
+        scene = ranks.scene(leaning(**FOLLOWING["parameter"]))
+        with pytest.raises(NotSharedError, match=r"^frame: a frame whose map follows numbers"):
+            ranks.run(scene, Watch())
+        return True
+
+    assert all(on_ranks(2, begun))
+
+
+def test_parameters_move_the_frame_too():
+    one = leaning(**now(FOLLOWING["weights"], 30))
+    other = Parameter("rule.poisson_ratio").put(one, 0.2)
+    found, anew = scene_like(build_scene(one), other), build_scene(other)
+    np.testing.assert_array_equal(found.frame.map.weight, anew.frame.map.weight)

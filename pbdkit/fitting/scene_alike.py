@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.scene.frame_points import build_frame
 from pbdkit.scene.scene import Scene, build_scene, renumbered
 
 GEOMETRY = ("lattice", "body", "regions", "neighbours", "frame", "initial", "loads", "cuts")
@@ -24,10 +23,6 @@ def scene_like(scene: Scene, experiment: Experiment) -> Scene:
             pairs = zip(scene.leading, experiment.leaders, strict=True)
             leading = tuple(replace(leading, group=group) for leading, group in pairs)
             scene = replace(scene, leading=leading)
-        if scene.frame and experiment.rule is not own.rule:
-            # Whom frame points follow may hang on the rule.
-            frame = build_frame(scene.raster, experiment.frame, experiment.rule)
-            scene = replace(scene, frame=frame)
         return renumbered(scene, experiment)
     found = build_scene(experiment)
     if found.raster.shape != scene.raster.shape or (found.raster.kind != scene.raster.kind).any():

@@ -41,7 +41,12 @@ class FrameSites(ABC):
     site: NDArray[np.int32]
     low: Index
     high: Index
-    rule: FollowerRule
+
+    @property
+    @abstractmethod
+    def rule(self) -> FollowerRule:
+        """The rule of the followers, with the numbers that it has in a step. A map that was made
+        with it is made again wherever these numbers change."""
 
     @abstractmethod
     def nearest(self) -> tuple[Indices, Indices]:

@@ -166,7 +166,11 @@ class DividedStepwise(Stepwise):
         ranks, self._division = division.ranks, division
         nearness = scene.experiment.neighbours.nearness()
         refuse(
-            scene, [(bool(nearness), ("neighbours",), "neighbours are found anew in every step")]
+            scene,
+            [
+                (bool(nearness), ("neighbours",), "neighbours are found anew in every step"),
+                (ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME),
+            ],
         )
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
@@ -189,6 +193,9 @@ class DividedStepwise(Stepwise):
     def take_up(self, standing: Mapping[str, Any]) -> None:
         """From the state of the whole, which the first process has."""
         super().take_up(self._division.taken_up(standing))
+
+
+CHANGING_FRAME = "a frame whose map follows numbers of the rule that change in time"
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:

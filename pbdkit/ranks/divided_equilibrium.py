@@ -9,7 +9,7 @@ from typing import Any
 from pbdkit.equilibrium.increments import Way
 from pbdkit.equilibrium.system import StuckError
 from pbdkit.errors import NotSharedError
-from pbdkit.ranks.divided_driver import DividedWatch, Division, refuse
+from pbdkit.ranks.divided_driver import CHANGING_FRAME, DividedWatch, Division, refuse
 from pbdkit.ranks.divided_rows import DividedRows, strip_of
 from pbdkit.results.progress import Watch
 from pbdkit.runs.drivers import Straight
@@ -27,8 +27,9 @@ class DividedStraight(Straight):
     break and without obstacles, on the stencils of a lattice with one site a cell."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
-        _refuse(scene)
         ranks, self._division = division.ranks, division
+        refuse(scene, [(ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME)])
+        _refuse(scene)
         start, anew = division.begun(scene)
         super().__init__(division.scene, start, DividedWatch(ranks, watch))
         self._start = None if anew else start.copy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import add
 from typing import Any
 
@@ -22,11 +22,15 @@ Floats = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame's points and their map on the raster: u[place[point]] = Σ weight · u[body]."""
+    """The frame's points and their map on the raster: u[place[point]] = Σ weight · u[body].
+
+    `depends_on_rule` is true where the policy read the rule to make the map.
+    """
 
     place: Indices
     map: FrameMap
     body_place: Indices
+    depends_on_rule: bool = False
 
     def follow(self, body: Floats, out: Floats) -> None:
         """Writes the frame's displacements into `out`; both are (axis, flat place)."""
@@ -52,7 +56,8 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
             f"'{policy.type}' gives frame point {rows[alone[0]] + 1} nobody to follow, "
             "and it would anchor the body"
         )
-    return Frame(raster.place_of(rows), follow, raster.place_of(follow.body))
+    place, body_place = raster.place_of(rows), raster.place_of(follow.body)
+    return Frame(place, follow, body_place, depends_on_rule=bool(frame.reads))
 
 
 def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
@@ -66,7 +71,7 @@ def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     if not len(rows):
         return None
     site = raster.site_of(rows).astype(np.int32)
-    return RasterFrame(raster.lattice.cell(), site, low, high, rule, raster, rows)
+    return RasterFrame(raster.lattice.cell(), site, low, high, raster, rows, rule)
 
 
 def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
@@ -89,10 +94,19 @@ def _refuse_unfit(follow: FrameMap, points: int, raster: Raster) -> None:
 
 @dataclass(frozen=True)
 class RasterFrame(FrameSites):
-    """The frame points of a raster; `frame_rows` are their rows in the table."""
+    """The frame points of a raster; `frame_rows` are their rows in the table. `reads` has an entry
+    for each time that the policy read the rule."""
 
     raster: Raster
     frame_rows: Indices
+    followers_rule: FollowerRule
+    reads: list[None] = field(default_factory=list)
+
+    @property
+    def rule(self) -> FollowerRule:
+        """The rule, whose reading is noted."""
+        self.reads.append(None)
+        return self.followers_rule
 
     def body_at(self, site: NDArray[np.int32]) -> Indices:
         """Looks the sites up on the raster."""

@@ -98,6 +98,12 @@ class Scene:
         """How many axes space has: the lattice says so."""
         return len(self.raster.lattice.cell().vectors)
 
+    @property
+    def frame_changes(self) -> bool:
+        """Whether the frame's map follows numbers of the rule that change in time."""
+        changing = bool(self.experiment.rule.courses)
+        return changing and self.frame is not None and self.frame.depends_on_rule
+
     @cached_property
     def leaders_overlap(self) -> bool:
         """Whether any particle belongs to two leader groups."""
@@ -125,7 +131,7 @@ def build_scene(experiment: Experiment, others: Others = ALONE) -> Scene:
 
 
 def _build(experiment: Experiment, ground: Ground) -> Scene:
-    neighbours, frame = experiment.neighbours, experiment.frame
+    neighbours = experiment.neighbours
     neighbourhood, layers = ground.neighbourhood, ground.layers
     raster, cells = ground.raster()
     warnings = [*ground.warnings, *doubts_of(experiment, neighbourhood, raster, layers)]
@@ -143,8 +149,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
             ("neighbours",),
         )
     leading = build_leading(raster, experiment)
-    with blaming(frame, "when asked whom its points follow", "frame"):
-        following = build_frame(raster, frame, experiment.rule)
+    following = _frame_of(raster, experiment)
     check_directions(experiment, has_frame=raster.others.any(following is not None))
     cells = weighed(experiment, raster, setting, cells)
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
@@ -161,8 +166,16 @@ def renumbered(scene: Scene, experiment: Experiment) -> Scene:
     constants = ask_for_constants(experiment, scene.setting)
     parts = (experiment, scene.raster, scene.neighbourhood, scene.setting)
     constants = with_fields(constants, *parts)
-    cells = weighed(experiment, scene.raster, scene.setting, scene.cells)
-    return with_inner(replace(scene, experiment=experiment, constants=constants, cells=cells))
+    cells, frame = weighed(experiment, scene.raster, scene.setting, scene.cells), scene.frame
+    if frame and frame.depends_on_rule and experiment.rule is not scene.experiment.rule:
+        frame = _frame_of(scene.raster, experiment)
+    found = replace(scene, experiment=experiment, constants=constants, cells=cells, frame=frame)
+    return with_inner(found)
+
+
+def _frame_of(raster: Raster, experiment: Experiment) -> Frame | None:
+    with blaming(experiment.frame, "when asked whom its points follow", "frame"):
+        return build_frame(raster, experiment.frame, experiment.rule)
 
 
 def with_inner(scene: Scene) -> Scene:

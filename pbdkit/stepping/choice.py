@@ -117,13 +117,25 @@ def what_kernels_lack(scene: Scene) -> str:
     masses = any(isinstance(leading.group.motion, Newton) for leading in scene.leading)
     if masses or scene.barriers or has_guides(scene.leading):
         return "numbers change in time by which masses, obstacles or leaders along an axis push"
+    if scene.frame_changes:
+        return "numbers change in time by which the frame follows"
     if constants.by_particle or constants.by_bond or (scene.cells and scene.cells.mixed):
         return "numbers differ from place to place and others change in time"
     for moment in sorted({bend for course in experiment.courses.values() for bend in course.bends}):
-        now = scene.at(moment).constants
-        if (now.weights, now.fracture) != (constants.weights, constants.fracture):
+        if _differ_in_kernels(scene, scene.at(moment)):
             return "numbers change in time that are written into kernels"
     return ""
+
+
+def _differ_in_kernels(scene: Scene, now: Scene) -> bool:
+    """Whether a scene with other numbers has other constants in its kernels, inner rules
+    included."""
+    one, other = scene.constants, now.constants
+    if (one.weights, one.fracture) != (other.weights, other.fracture):
+        return True
+    if scene.inner is None or now.inner is None:
+        return False
+    return _differ_in_kernels(scene.inner, now.inner)
 
 
 def _about_passes(scene: Scene) -> str:
