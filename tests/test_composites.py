@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from finite_elements.inclusion import jumps, plate
 from interpreted_kernels import interpreting
+from shapely import Polygon
 from test_engines import assert_bitwise_equal
 
 import pbdkit
-from pbdkit.scene.laminate import laminate
+from pbdkit.interfaces import Cell, Vector
+from pbdkit.scene.cut_cells import cut_by_border
+from pbdkit.scene.field_values import signed_distance
+from pbdkit.scene.laminate import laminate, layered
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 
@@ -304,3 +309,86 @@ def test_a_stiffness_is_that_of_every_cell_whatever_else_differs(name, stiffness
     expected = loaded_sheet(MIXED_RULES[name], 1e-3)
     found = loaded_sheet(MIXED_RULES[name] | {"stiffness": fourfold}, 4e-3)
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def layer(middle: float, height: float, angle: float = 0.0) -> dict[str, Any]:
+    """A long straight layer at y = `middle` above (4, 0), turned about (4, middle)."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    across = np.array([-along[1], along[0]])
+    corners = [a * 20.0 * along + b * height / 2 * across
+               for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]  # fmt: skip
+    return {"type": "polygon", "vertices": [[4.0 + x, middle + y] for x, y in corners]}
+
+
+def transposed(region: dict[str, Any]) -> dict[str, Any]:
+    return region | {"vertices": [[y, x] for x, y in region["vertices"]]}
+
+
+def pulled_along(axis: int, region: dict[str, Any]) -> Any:
+    """The displacements of a block of 4 by 5, of which the short sides are along the axis, pulled
+    by a stress of 1e-3 across a layer that is a thousandth as stiff, (component, x, y)."""
+    low, high = (("left", "right"), ("bottom", "top"))[axis]
+    sides = {"width": 4.0, "height": 5.0} if axis == 1 else {"width": 5.0, "height": 4.0}
+    given = bar(1.0, 1.0, stiffness={"otherwise": 1.0, "layer": 1e-3}) | {
+        "body": {"type": "rectangle"} | sides,
+        "regions": {"layer": region},
+        "leaders": [
+            {"select": {"edge": low}, "axes": ["xy"[axis]], "motion": {"type": "hold"}},
+            {"select": {"nearest": [[0.0, 0.0]]}, "motion": {"type": "hold"}},
+        ],
+        "solver": {"type": "equilibrium"},
+        "loads": [{"select": {"edge": high}, "force": (4e-3 * np.eye(2)[axis]).tolist()}],
+        "diagnostics": [{"type": "displacement"}],
+    }
+    u = pbdkit.run(given, progress=False)["u"].isel(time=-1).values
+    return u.reshape(1 + int(sides["width"]), 1 + int(sides["height"]), 2).transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("middle", [2.5, 2.53, 2.0])
+@pytest.mark.parametrize("height", [0.8, 0.4, 0.02])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_layer_thinner_than_a_cell_is_in_series_wherever_it_lies_in_it(axis, height, middle):
+    region = layer(middle, height)
+    u = pulled_along(axis, region if axis == 1 else transposed(region))
+    stretched = 5.0 - height + height * 1e3
+    far = u[1, :, -1] if axis == 1 else u[0, -1, :]
+    np.testing.assert_allclose(far, 1e-3 * stretched, rtol=1e-7)
+
+
+@pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 90.0])
+def test_thin_layers_are_the_same_with_the_axes_exchanged(angle):
+    region = layer(2.5, 0.3, np.radians(angle))
+    across, along = pulled_along(1, region), pulled_along(0, transposed(region))
+    np.testing.assert_allclose(
+        along, across[::-1].swapaxes(1, 2), rtol=0, atol=1e-6 * np.abs(across).max()
+    )
+
+
+@pytest.mark.parametrize("height", [0.9, 0.3, 0.02])
+@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0, 90.0, 160.0])
+def test_the_share_of_a_layer_in_a_cell_and_its_direction_are_exact(angle, height):
+    """In all cells that it passes through wholly, side by side, with its middle anywhere."""
+    body = pbdkit.Experiment(**bar(8.0, 3.0) | {"body": layer(0.3, height, np.radians(angle))}).body
+    outline = Polygon(body.vertices)
+    corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    cells = corners + np.stack(np.meshgrid(np.arange(2.0, 6.0), [-1.0, 0.0, 1.0]), -1).reshape(
+        -1, 1, 2
+    )
+    x, y = cells.transpose(2, 1, 0)
+    signed = partial(signed_distance, body, Cell((Vector(1.0, 0.0), Vector(0.0, 1.0))))
+    share, facing = cut_by_border(signed, x, y)
+    expected = [outline.intersection(Polygon(cell)).area for cell in cells]
+    np.testing.assert_allclose(share, expected, atol=2e-3 * height)
+    normal = np.array([-np.sin(np.radians(angle)), np.cos(np.radians(angle))])
+    for each, part in zip(facing, share, strict=True):
+        length = np.trace(each)
+        assert (length > 0.0) == (part > 0.0)
+        np.testing.assert_allclose(each, length * np.outer(normal, normal), atol=1e-3 * length)
+
+
+def test_a_square_within_a_cell_is_as_stiff_along_either_axis():
+    one, other = (np.diag([e, e, e / 2])[None] for e in (1.0, 100.0))
+    found = layered(one, other, np.array([0.3]), np.eye(2)[None])[0]
+    assert found[0, 0] == pytest.approx(found[1, 1], rel=1e-12)
+    assert np.abs(found[:2, 2]).max() < 1e-12 * found[0, 0]
+    assert 1.0 < found[0, 0] < 30.7

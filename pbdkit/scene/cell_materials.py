@@ -18,10 +18,10 @@ from pbdkit.interfaces.polygons import Polygon
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.cells import WeighedCells
-from pbdkit.scene.cut_cells import CELLS_AT_ONCE, NEAREST, shares_inside
+from pbdkit.scene.cut_cells import CELLS_AT_ONCE, NEAREST, cut_by_border
 from pbdkit.scene.field_values import Values, kinds_of, signed_distance, values_at
 from pbdkit.scene.homes import named_weights
-from pbdkit.scene.laminate import laminate
+from pbdkit.scene.laminate import layered
 from pbdkit.scene.places import Block, Floats, Mask
 from pbdkit.scene.raster import FOLLOWER, Raster
 
@@ -30,8 +30,6 @@ STIFFNESS = "stiffness"
 PLACES = {"xx": (0, 0), "yy": (1, 1), "xy": (0, 1), "x_shear": (0, 2), "y_shear": (1, 2)}
 PLACES["shear"] = (2, 2)
 """Where the components of a stiffness stand in a matrix."""
-NEAR = 1e-3
-"""The step of differences of a distance, as a share of a cell's width."""
 
 
 def weighed(
@@ -181,14 +179,14 @@ class _Cells:
             if isinstance(field, ByRegion):
                 here[name] = np.full(len(some), field.otherwise)
         found = stiffness_at(self.experiment, here)
-        for region, share, normal in self._borders:
+        for region, share, facing in self._borders:
             f, within = share[some], dict(here)
             for name, field in fields.items():
                 if isinstance(field, ByRegion) and region in dict(field.values):
                     within[name] = np.full(len(some), dict(field.values)[region])
             inner = stiffness_at(self.experiment, within)
             part = (f > 0.0) & (f < 1.0)
-            found[part] = laminate(found[part], inner[part], f[part], normal[some][part])
+            found[part] = layered(found[part], inner[part], f[part], facing[some][part])
             found[f == 1.0] = inner[f == 1.0]
             here = {name: np.where(f >= 0.5, within[name], value) for name, value in here.items()}
         if not np.isfinite(found).all():
@@ -212,8 +210,8 @@ class _Cells:
 
     @cached_property
     def _borders(self) -> list[tuple[str, Floats, Floats]]:
-        """The regions that some field names, each with the share of every cell inside and the
-        normal of its border there."""
+        """The regions that some field names, each with the share of every cell inside and where
+        its border faces there."""
         return [
             (name, *self._shares(region)) for name, region in regions_of(self.experiment).items()
         ]
@@ -222,17 +220,12 @@ class _Cells:
         signed = partial(signed_distance, region, self.experiment.lattice.cell())
         at_corners = signed(self.x, self.y)
         share = (at_corners <= 0.0).all(axis=0).astype(float)
-        normal = np.zeros((len(share), 2))
+        facing = np.zeros((len(share), 2, 2))
         width = max(math.dist(a, b) for a in self.polygon.rest for b in self.polygon.rest)
-        reach = width if region.exaggerates() else NEAREST * width
+        exaggerates = region.exaggerates()
+        reach = width if exaggerates else NEAREST * width
         near = np.flatnonzero(np.abs(at_corners).min(axis=0) <= reach)
         for some in np.split(near, range(CELLS_AT_ONCE, len(near), CELLS_AT_ONCE)):
-            share[some] = shares_inside(signed, self.x[:, some], self.y[:, some])
-        cut = np.flatnonzero((share > 0.0) & (share < 1.0))
-        x, y, h = self.x[:, cut].mean(axis=0), self.y[:, cut].mean(axis=0), NEAR * width
-        slope = np.stack([signed(x + h, y) - signed(x - h, y), signed(x, y + h) - signed(x, y - h)])
-        size = np.hypot(*slope)
-        slope = np.where(np.abs(slope) < 1e-9 * size, 0.0, slope)
-        slope[0] = np.where(size == 0.0, 1.0, slope[0])
-        normal[cut] = (slope / np.hypot(*slope)).T
-        return share, normal
+            corners = self.x[:, some], self.y[:, some]
+            share[some], facing[some] = cut_by_border(signed, *corners, exaggerates=exaggerates)
+        return share, facing

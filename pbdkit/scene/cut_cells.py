@@ -37,6 +37,12 @@ SMALLEST = 0.02
 """Cells with a smaller share than this are left out: corners that hang on a sliver of the body move
 as little else does, and say little about it."""
 
+BENT = 1e-3
+"""A distance that is off by more than this share of a triangle's width from a linear one in its
+middle bends within: at a corner of the outline, or between two sides of it."""
+HALVINGS = 8
+"""So often triangles in which the distance bends are halved."""
+
 
 def fill_with_cells(
     body: Body, lattice: Lattice, tiling: Tiling, lines: Lines | None = None
@@ -124,6 +130,88 @@ class _Cutter:
 def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats) -> Floats:
     """The share inside of cells with corners (corner, cell), given the signed distance at places:
     the mean over its triangles, cut into small ones in which the distance is linear."""
+    points, small = _points_within(x, y)
+    distance = signed(*points)
+    share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
+    cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
+    a, b, c = (distance[corner][..., cut] for corner in small.T)
+    parts = _negative_share(a, b, c).reshape(len(small) * distance.shape[1], -1)
+    # Added one after the other: what a cell comes to does not depend on who is looked at with it.
+    share[cut] = reduce(np.add, parts) / len(parts)
+    return share
+
+
+def cut_by_border(
+    signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floats, *, exaggerates: bool = False
+) -> tuple[Floats, Floats]:
+    """(share, facing): the share inside of cells with corners (corner, cell), (cell,), and where
+    the border in each of them faces, (cell, 2, 2): the sum of n nᵀ over its length, with its
+    normals n, of both sides of a thin layer alike.
+
+    As `shares_inside`, with smaller triangles where the distance bends in one, so that layers far
+    thinner than a cell are found; the distance is to be at most the way to the outline unless it
+    `exaggerates`.
+    """
+    points, small = _points_within(x, y)
+    distance, count = signed(*points)[small], len(small) * points[0].shape[1]
+    width = max(float(np.hypot(x - x[k], y - y[k]).max(initial=0.0)) for k in range(len(x))) / FINE
+    near = (np.abs(distance).min(axis=1) <= width) | exaggerates
+    share = (~near & (distance[:, 0] < 0.0)).sum(axis=(0, 1)) / count
+    facing = np.zeros((2, 2, len(share)))
+    part, triangle, cell = np.nonzero(near)
+    at = np.array([c[small[part].T, triangle, cell] for c in points])  # axis, corner, triangle
+    distance = distance[part, :, triangle, cell].T
+    for halved in range(HALVINGS + 1):
+        plain = np.abs(distance).min(axis=0) > (np.inf if exaggerates else width)
+        if halved == HALVINGS:
+            plain[:] = True
+        else:
+            off = np.abs(signed(*at[..., ~plain].mean(axis=1)) - distance[:, ~plain].mean(axis=0))
+            plain[~plain] = off <= BENT * width
+        done, where = distance[:, plain], cell[plain]
+        inside = 0.25**halved / count * _negative_share(*done)
+        share += np.bincount(where, inside, len(share))
+        across = _across(at[..., plain], done)
+        length = np.hypot(*across)
+        length[length == 0.0] = 1.0
+        for row, column in ((0, 0), (0, 1), (1, 1)):
+            product = across[row] * across[column] / length
+            facing[row, column] += np.bincount(where, product, len(share))
+        if plain.all():
+            break
+        at, cell, width = _in_four(at[..., ~plain]), np.tile(cell[~plain], 4), width / 2
+        distance = signed(*at)
+    facing[1, 0] = facing[0, 1]
+    return share, np.moveaxis(facing, -1, 0)
+
+
+def _across(at: Floats, distance: Floats) -> Floats:
+    """The straight pieces of an outline in triangles, (axis, corner, triangle), turned by a right
+    angle, (axis, triangle); 0 where there is none."""
+    inside = distance < 0.0
+    odd = np.where(inside.sum(axis=0) == 1, inside, ~inside)
+    apex, every = odd.argmax(axis=0), np.arange(at.shape[-1])
+    cut = inside.any(axis=0) & ~inside.all(axis=0)
+    tip, ends = distance[apex, every], []
+    for turn in (1, 2):
+        other = (apex + turn) % 3
+        rise = np.where(cut, tip - distance[other, every], 1.0)
+        ends.append(tip / rise * (at[:, other, every] - at[:, apex, every]))
+    x, y = np.where(cut, ends[1] - ends[0], 0.0)
+    return np.stack([-y, x])
+
+
+def _in_four(at: Floats) -> Floats:
+    """Each of some triangles, (axis, corner, triangle), in four halved ones."""
+    a, b, c = at.swapaxes(0, 1)
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
+    return np.concatenate([np.stack(three, axis=1) for three in corners], axis=-1)
+
+
+def _points_within(x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], Indices]:
+    """((x, y), small): points of the triangles that cells with corners (corner, cell) consist of,
+    (point, triangle, cell), and the points at the corners of each small triangle."""
     triangles, n = [(0, 1, 2)], len(x)
     if n > 3:
         x, y = (np.concatenate([c, c.mean(axis=0)[None]]) for c in (x, y))
@@ -132,14 +220,7 @@ def shares_inside(signed: Callable[[Floats, Floats], Floats], x: Floats, y: Floa
     weights, small = _small_triangles()
     a, b, c = weights.T[:, :, None, None]
     px, py = (a * at[corners[0]] + b * at[corners[1]] + c * at[corners[2]] for at in (x, y))
-    distance = signed(px, py)
-    share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
-    cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
-    a, b, c = (distance[corner][..., cut] for corner in small.T)
-    parts = _negative_share(a, b, c).reshape(len(small) * len(triangles), -1)
-    # Added one after the other: what a cell comes to does not depend on who is looked at with it.
-    share[cut] = reduce(np.add, parts) / len(parts)
-    return share
+    return (px, py), small
 
 
 def _shifted(window: Window, step: Index) -> Window:

@@ -11,6 +11,34 @@ Floats = NDArray[np.float64]
 ACROSS, ALONG = [0, 2], [1]
 """Which of the components (normal, tangential, shear) the layers share as stress, and as strain."""
 
+ROUND = 1e-6
+"""A border whose directions are as evenly spread as this has none: a square within a cell."""
+DIRECTIONS = 12
+"""Over so many the stiffness is then averaged: as many as turn every lattice into itself."""
+
+
+def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floats:
+    """(cell, 3, 3): the stiffness of cells of which the border faces so, (cell, 2, 2), the sum of
+    n nᵀ over its length: a laminate along its main direction, or where it has none the mean of
+    laminates of all directions."""
+    whole = facing[:, 0, 0] + facing[:, 1, 1]
+    spread = np.array([facing[:, 0, 0] - facing[:, 1, 1], 2 * facing[:, 0, 1]])
+    # Borders along an axis are along it to the last bit.
+    spread[np.abs(spread) <= 1e-9 * whole] = 0.0
+    angle = np.arctan2(spread[1], spread[0]) / 2
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    normal[(spread[1] == 0.0) & (spread[0] < 0.0)] = [0.0, 1.0]
+    found = laminate(outer, inner, share, normal)
+    even = np.hypot(*spread) <= ROUND * whole
+    if even.any():
+        parts = outer[even], inner[even], share[even]
+        angles = np.pi / DIRECTIONS * np.arange(DIRECTIONS)
+        turned = [
+            laminate(*parts, np.tile([np.cos(a), np.sin(a)], (len(parts[0]), 1))) for a in angles
+        ]
+        found[even] = sum(turned) / DIRECTIONS
+    return found
+
 
 def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Floats:
     """(cell, 3, 3): the stiffness of layers, `share` (cell,) of them of the material `inner` and
