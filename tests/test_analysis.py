@@ -285,6 +285,33 @@ def test_functions_that_take_no_complex_step_are_found_out(rule):
     assert pbdkit.run(given | {"steps": 3}, progress=False).attrs["status"] == "complete"
 
 
+@pytest.mark.parametrize("rule", ["springs", "distance-weighted", "elastic"])
+@pytest.mark.parametrize("a", [2.0**-40, 2.0**60])
+def test_a_step_is_linearised_alike_in_all_units(rule, a):
+    """Lengths are all of the lattice: the matrices are the same, to rounding, and what broken
+    bonds push is as much longer as lengths are."""
+
+    def operator(a):
+        cracks = [[[2.5 * a, -a], [2.5 * a, 1.5 * a]]]
+        fracture = {"type": "threshold", "thresholds": [1.7 * a], "placement": 1.5}
+        given = sheet(
+            columns=6,
+            rows=5,
+            lattice={"type": "square", "a": a},
+            neighbours={"type": "chebyshev", "shells": 1},
+            rule={"type": rule} | ({"poisson_ratio": 0.3} if rule == "elastic" else {}),
+            frame={"type": "none"},
+            fracture=fracture | {"cracks": cracks},
+        )
+        return step_operator(build_scene(pbdkit.Experiment(**given)))
+
+    one, other = operator(1.0), operator(a)
+    for name in ("now", "led"):
+        matrix, scaled = getattr(one, name).toarray(), getattr(other, name).toarray()
+        np.testing.assert_allclose(scaled, matrix, rtol=1e-14, atol=1e-15, err_msg=name)
+    np.testing.assert_allclose(other.source / a, one.source, rtol=1e-14, atol=1e-15)
+
+
 @pytest.mark.parametrize("memory", [1.5, -1.5])
 def test_no_bound_is_promised_where_there_is_none(memory):
     given = sheet(solver={"type": "stepping", "memory": memory})

@@ -174,6 +174,7 @@ class _Followers:
         self._here, self._slots = around.here(u, state), around.slots
         self._neighbours = list(zip(around.differences(u), around.neighbours(state), strict=True))
         steps = 1 + scene.axes * (1 + len(around.slots))
+        self._unit = scene.neighbourhood.nudge_unit
         self._shape, self._known = (steps, len(place)), dict[complex, Contributions]()
 
     def response(self, name: str, finite: bool) -> Response:
@@ -181,11 +182,11 @@ class _Followers:
         answer = {"move": self._evaluator.move, "force": self._evaluator.force}[name]
         ask = partial(self._asked, answer)
         if self._evaluator.rule.linear:
-            answers = array_of(ask(1.0), self._shape)
-            still, changes = answers[:, 0], answers - answers[:, :1]
+            answers = array_of(ask(self._unit), self._shape)
+            still, changes = answers[:, 0], (answers - answers[:, :1]) / self._unit
         else:
-            still = array_of(ask(SMALL), self._shape)[:, 0]
-            changes = derivative(ask, self._shape)
+            still = array_of(ask(SMALL * self._unit), self._shape)[:, 0]
+            changes = derivative(ask, self._shape, self._unit)
         if finite and not (np.isfinite(still).all() and np.isfinite(changes).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
         # (mover, place, axis of the answer, axis of u)

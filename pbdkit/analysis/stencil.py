@@ -30,17 +30,19 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
 
 TINY, SMALL = 1e-100, 1e-6
+"""The steps of derivatives, imaginary and real, as shares of the spacing."""
 Moved = Callable[[complex], tuple[Any, Any]]
 """The components of a function's value, for a step along one direction."""
 
 
-def derivative(moved: Moved, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """(component, *shape): the derivative at a step of zero."""
+def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.float64]:
+    """(component, *shape): the derivative at a step of zero; steps are shares of a unit."""
+    small, tiny = SMALL * unit, TINY * unit
     with np.errstate(all="ignore"):
-        ahead, behind = array_of(moved(SMALL), shape), array_of(moved(-SMALL), shape)
-        difference: NDArray[np.float64] = (ahead - behind).real / (2 * SMALL)
+        ahead, behind = array_of(moved(small), shape), array_of(moved(-small), shape)
+        difference: NDArray[np.float64] = (ahead - behind).real / (2 * small)
         try:
-            exact: NDArray[np.float64] = array_of(moved(1j * TINY), shape).imag / TINY
+            exact: NDArray[np.float64] = array_of(moved(1j * tiny), shape).imag / tiny
         except (TypeError, ValueError):  # a function that takes no complex numbers
             return difference
     known = np.isfinite(exact) & np.isfinite(difference)
@@ -88,7 +90,7 @@ def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:
 
         return move(scene, slots, difference, at._replace(u=vector(step * nudges[0])))
 
-    found = derivative(moved, nudges.shape[-1:])
+    found = derivative(moved, nudges.shape[-1:], scene.neighbourhood.nudge_unit)
     return found.reshape(axes, count, axes).swapaxes(0, 1)
 
 

@@ -83,6 +83,12 @@ class Neighbourhood:
             found[slot.shell - 1].append(math.hypot(*slot.rest))
         return found
 
+    @cached_property
+    def nudge_unit(self) -> float:
+        """A power of two near the shortest rest length: what is moved by a share of it moves as far
+        in all units, and scaling back rounds nothing."""
+        return float(2.0 ** round(math.log2(min(map(min, self.shells())))))
+
     def spans_space(self) -> bool:
         """Whether steps between neighbours reach in all directions; else rows do not feel each
         other."""
