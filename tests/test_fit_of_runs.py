@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -142,6 +143,135 @@ def test_a_weight_counts_like_a_smaller_noise(measured):
     assert one.value == pytest.approx(other.value, rel=1e-12)
 
 
+@pytest.mark.parametrize("noise", [{}, {"noise": NOISE}])
+def test_residuals_are_told_over_the_same_noise_whatever_the_weight(noise, measured):
+    """Birge's ratio takes back what a weight above 1 promises; one below 1 makes errors larger."""
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    given = {k: v for k, v in tracks(measured).items() if k != "noise"} | noise
+    found = {
+        weight: pbdkit.fit(
+            {"experiment": bar(), "unknown": unknown, "measured": given | {"weight": weight}}
+        )
+        for weight in (1.0, 0.25, 4.0)
+    }
+    whole = found.pop(1.0)
+    assert whole.met[0].noise == pytest.approx(NOISE, rel=0.1)
+    for weight, each in found.items():
+        assert each.met[0].noise == pytest.approx(whole.met[0].noise, rel=1e-6)
+        assert each.met[0].ratio == pytest.approx(whole.met[0].ratio, rel=1e-6)
+        assert each.ratio == pytest.approx(whole.ratio, rel=1e-6)
+        own = np.sqrt(np.mean(each.numbers().residual ** 2))
+        assert each.met[0].ratio * each.met[0].noise == pytest.approx(own, rel=1e-6)
+        errors = [f.values["rule.poisson_ratio"].error for f in (each, whole)]
+        assert errors[0] / errors[1] == pytest.approx(max(1.0, weight**-0.5), rel=0.1)
+
+
+def test_left_out_residuals_are_told_over_the_same_noise_whatever_the_weight(measured):
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    rival = {"settings": {"rule": {"type": "springs"}}, "unknown": {"rule.stiffness": [0.5, 2.0]}}
+    one, other = (
+        pbdkit.fit({
+            "experiment": bar(), "unknown": unknown, "folds": 2, "candidates": {"springs": rival},
+            "measured": tracks(measured, weight=weight),
+        }).candidates
+        for weight in (1.0, 4.0)
+    )  # fmt: skip
+    for a, b in zip(one, other, strict=True):
+        assert (a.name, b.left_out) == (b.name, pytest.approx(a.left_out, rel=1e-4))
+        assert b.differs == pytest.approx(a.differs, rel=1e-3, abs=1e-6)
+
+
+def small(**more):
+    """A bar that has settled soon, and the solver that looks for it."""
+    body = {"type": "rectangle", "width": 4.0, "height": 2.0}
+    return bar(body=body, steps=400, **more)
+
+
+SETTLING = {"type": "stepping", "relaxation": 0.8, "engine": "numpy", "settle": {"tolerance": 1e-5}}
+
+
+def posed(experiment, given):
+    fit = {"experiment": experiment, "unknown": {"rule.poisson_ratio": [0.0, 0.45]}}
+    asked, source = described_fit(fit | {"measured": given}, given=False)
+    return problem_of(asked, pbdkit.Experiment.build(source))
+
+
+@pytest.mark.parametrize("kind", ["tracks", "curve"])
+def test_a_run_that_has_settled_stays_at_rest(kind, tmp_path):
+    """At its last steps, and at steps between; derivatives as well."""
+    times = [3.0, 12.5, 250.0, 321.25, 400.0]
+    at = [[1.0, 1.0], [2.0, 0.5], [3.0, 2.0]]
+    if kind == "tracks":
+        rows = [[time, *place, 0.0, 0.0] for time in times for place in at]
+        write(tmp_path / "rows.csv", ["time", "x", "y", "ux", "uy"], rows)
+        given = {"type": "tracks"}
+    else:
+        write(tmp_path / "rows.csv", ["time", "force"], [[time, 0.0] for time in times])
+        given = {"type": "curve", "group": 1, "youngs_modulus": 1.0, "against": "time"}
+        given |= {"columns": ["time", "force"]}
+    given |= {"file": str(tmp_path / "rows.csv"), "noise": 1.0}
+    stays, goes_on = (posed(small(**more), given) for more in ({"solver": SETTLING}, {}))
+    z = stays.start()
+    short, whole = stays.at(z), goes_on.at(z)
+    assert pbdkit.run(small(solver=SETTLING), progress=False).attrs["status"] == "settled"
+    largest = np.abs(whole.residuals).max()
+    np.testing.assert_allclose(short.residuals, whole.residuals, atol=3e-5 * largest)
+    largest = np.abs(whole.jacobian).max()
+    np.testing.assert_allclose(short.jacobian, whole.jacobian, atol=1e-3 * largest)
+
+
+def on_rollers(**more):
+    """A bar that is drawn out by .1 % a step, at rest."""
+    held = {"type": "hold"}
+    drawn = {"type": "velocity", "velocity": [0.001 * WIDTH, 0.0], "steps": 10}
+    leaders = [
+        {"select": {"edge": "left"}, "motion": held, "axes": ["x"]},
+        {"select": {"edge": "right"}, "motion": drawn, "axes": ["x"]},
+        {"select": {"nearest": [[0.0, HEIGHT / 2]]}, "motion": held, "axes": ["y"]},
+    ]
+    return bar(leaders=leaders, steps=10, solver={"type": "equilibrium"}) | more
+
+
+def refused_unless_recorded(step):
+    """Whatever steps an equilibrium gives, others are refused."""
+    if pbdkit.Experiment(**on_rollers(record={"at": [step]})).records(step):
+        return nullcontext()
+    told = rf"need the state of step {step}, .* take solver: {{type: stepping}}"
+    return pytest.raises(pbdkit.ExperimentError, match=told)
+
+
+@pytest.mark.parametrize("times", [[10.0], [0.0, 10.0], [5.0, 7.5, 10.0]])
+def test_an_equilibrium_is_compared_where_the_run_gives_it(times, tmp_path):
+    """By closed form, with ν = .25."""
+    places = np.array([[3.0, 0.0], [3.0, HEIGHT], [6.5, 0.5]])
+    u = np.c_[places[:, 0], -0.25 * (places[:, 1] - HEIGHT / 2)]
+    pairs = list(zip(places, u, strict=True))
+    rows = [[time, *at, *(0.001 * time * v)] for time in times for at, v in pairs]
+    write(tmp_path / "tracks.csv", ["time", "x", "y", "ux", "uy"], rows)
+    fit = {
+        "experiment": on_rollers(),
+        "unknown": {"rule.poisson_ratio": [0.0, 0.49]},
+        "measured": {"type": "tracks", "file": str(tmp_path / "tracks.csv"), "noise": 1e-5},
+    }
+    with refused_unless_recorded(5) if 5.0 in times else nullcontext():
+        found = pbdkit.fit(fit)
+        assert found.values["rule.poisson_ratio"].value == pytest.approx(0.25, abs=1e-5)
+        assert found.ratio < 0.01
+
+
+def test_rows_beyond_the_end_of_a_curve_are_named(measured, tmp_path):
+    rows = np.loadtxt(measured / "curve.csv", delimiter=",", skiprows=1)
+    beyond = np.vstack([rows, [[0.3, 9.0], [0.4, 9.0]]])
+    write(tmp_path / "curve.csv", ["displacement", "force"], beyond)
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    given = curve(measured, file=str(tmp_path / "curve.csv"))
+    found = pbdkit.fit({"experiment": bar(), "unknown": unknown, "measured": given})
+    within(found)
+    said = "2 rows are left out: the run's displacements of the group go from 0 to 0.2"
+    assert any(line.endswith(said) for line in found.lines())
+    assert found.as_dict()["measured"][0]["left_out_because"] in said
+
+
 def test_a_measurement_may_have_settings_of_its_own(measured, tmp_path):
     """Two tests of one material: the second pulls the other way, and half as far."""
     back = {"leaders.1.motion.velocity": [-0.01, 0.0]}
@@ -189,6 +319,11 @@ def test_derivatives_are_those_of_differences(measured):
 
 WRONG = {
     "beyond the run": (lambda f: tracks(f), {"steps": 10}, "times go from 2 to 15"),
+    "a curve beyond the run": (
+        lambda f: curve(f, file="force.csv", columns=["time", "force"], against="time"),
+        {"steps": 12},
+        "curve goes from 0 to 16, and the run's times go from 0 to 12",
+    ),
     "no such group": (lambda f: curve(f, group=5), {}, "no leader group 5"),
     "does not move": (lambda f: curve(f, group=0), {}, "against: time"),
     "another way": (lambda f: curve(f, axis="y", file="force.csv"), {}, "no 'displacement'"),

@@ -178,9 +178,8 @@ def _solved(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     solution = solved(problem, problem.start())
     for _ in range(1 if fit.loss == "linear" else 2):  # a loss tells outliers by the noise
         (only,) = problem.observations
-        problem = replace(
-            problem, observations=(only.with_noise(max(solution.ratio, TINY) * only.noise),)
-        )
+        ratio = max(solution.ratio / np.sqrt(only.weight), TINY)
+        problem = replace(problem, observations=(only.with_noise(ratio * only.noise),))
         solution = solved(problem, solution.z, fit.loss)
     return problem, solution
 

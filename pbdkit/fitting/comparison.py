@@ -64,17 +64,24 @@ def compared(posed: Sequence[Posed], folds: int, loss: Loss, seed: int) -> tuple
     scores = [_left_out(each, blocks, folds, loss) for each in posed]
     best = int(np.argmin([score.mean() for score in scores]))
     right = posed[best].solution.at.residuals
+    weight = _mean_weight(posed[best].problem)
     found = [
         Candidate(
             each.name,
             *_mean(score),
             *_mean(score - scores[best]),
-            float(np.sqrt(np.mean((each.solution.at.residuals - right) ** 2))),
+            float(np.sqrt(np.mean((each.solution.at.residuals - right) ** 2) / weight)),
             _values(each),
         )
         for each, score in zip(posed, scores, strict=True)
     ]
     return tuple(sorted(found, key=lambda candidate: candidate.left_out))
+
+
+def _mean_weight(problem: Problem) -> float:
+    """The mean weight of the numbers that were measured."""
+    weights, counts = zip(*((o.weight, len(o.measured)) for o in problem.observations), strict=True)
+    return float(np.average(weights, weights=counts))
 
 
 def _mean(score: Floats) -> tuple[float, float]:
@@ -114,7 +121,7 @@ def _left_out(posed: Posed, blocks: Sequence[NDArray[np.intp]], folds: int, loss
                 own = blocks[n][c]
                 parts = (left.reshape(-1, len(own))[:, own == block] for block in np.unique(own))
                 found += [cost_of(part.ravel(), loss) / part.size for part in parts]
-    return np.array(found)
+    return np.array(found) / _mean_weight(posed.problem)
 
 
 def _residuals(problem: Problem, n: int, part: Observation, z: Floats) -> Floats:

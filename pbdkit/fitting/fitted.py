@@ -49,13 +49,23 @@ class FittedNumbers:
 @dataclass(frozen=True)
 class Met:
     """How well one measurement is met: its kind, the noise of its numbers, how much larger its
-    residuals are, how many numbers count and how many rows are left out."""
+    residuals are, how many numbers count, and how many rows are left out for which reason."""
 
     kind: str
     noise: float
     ratio: float
     numbers: int
     left_out: int
+    left_out_because: str = ""
+
+    def __str__(self) -> str:
+        text = (
+            f"residual of the {self.kind}: {self.ratio:.2f} times the noise of {self.noise:.3g}, "
+            f"over {self.numbers} numbers"
+        )
+        if not self.left_out:
+            return text
+        return f"{text}; {self.left_out} rows are left out: {self.left_out_because}"
 
 
 @dataclass(frozen=True)
@@ -63,26 +73,23 @@ class Fitted:
     """The answer of a fit.
 
     `values` by path, `correlations` (parameter, parameter), `youngs_modulus` where a force was
-    given. Residuals are measured - fitted; `ratio` is how much larger they are than the noise,
-    which standard errors take into account; `met` says so of each measurement. `profiles` by path,
-    `sample` and `candidates`, the best first, where they were asked for. `solution` and `problem`
-    have all else.
+    given. Residuals are measured - fitted; `ratio` is the standard deviation of all of them over
+    the noise, and `met` says so of each measurement: whatever its weight. Standard errors are
+    larger where residuals are larger than the noise over the root of the weight. `profiles` by
+    path, `sample` and `candidates`, the best first, where they were asked for. `solution` and
+    `problem` have all else.
     """
 
     values: Mapping[str, Estimate]
     correlations: Floats
     youngs_modulus: Estimate | None
     met: tuple[Met, ...]
+    ratio: float
     problem: Problem = field(repr=False)
     solution: Solution = field(repr=False)
     profiles: Mapping[str, Profile] = field(default_factory=dict)
     sample: Sample | None = field(default=None, repr=False)
     candidates: tuple[Candidate, ...] = ()
-
-    @property
-    def ratio(self) -> float:
-        """The standard deviation of all residuals over their noise."""
-        return self.solution.ratio
 
     @property
     def noise(self) -> float:
@@ -135,7 +142,7 @@ class Fitted:
         evidence = observation.evidence
         strengths = own[len(own) - evidence.distortions.shape[1] :]
         measured = evidence.measured - evidence.distortions @ strengths
-        left = self.solution.at.residuals[rows] * observation.noise
+        left = self.solution.at.residuals[rows] * observation.weighted_noise
         return FittedField(
             evidence.points, measured.reshape(2, -1).T, np.asarray(left.reshape(2, -1).T)
         )
@@ -163,7 +170,7 @@ class Fitted:
         if not isinstance(observation, TracksObservation | CurveObservation):
             raise ValueError(f"measurement {n} is a {observation.kind}")
         measured = observation.measured * observation.unit
-        left = self.solution.at.residuals[rows] * observation.noise * observation.unit
+        left = self.solution.at.residuals[rows] * observation.weighted_noise * observation.unit
         along = np.tile(observation.along, len(measured) // len(observation.along))
         what, over, joined = observation.names
         return FittedNumbers(along, measured, measured - left, left, what, over, joined)
@@ -189,12 +196,7 @@ class Fitted:
             for m, other in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {one} and {other}: {self.correlations[n, m]:.2f}"
-        for met in self.met:
-            yield (
-                f"residual of the {met.kind}: {met.ratio:.2f} times the noise of {met.noise:.3g}, "
-                f"over {met.numbers} numbers"
-                + (f"; {met.left_out} rows were left out" if met.left_out else "")
-            )
+        yield from map(str, self.met)
         for path, profile in self.profiles.items():
             yield f"{path}: {profile}, by its profile"
         if self.sample:
@@ -219,16 +221,22 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     }
     covariance = solution.covariance[:count, :count]
     correlations = covariance / np.outer(errors, errors)
-    met = tuple(
-        _met(observation, solution.at.residuals[rows], fit.loss)
-        for observation, rows in problem.rows()
-    )
-    return Fitted(
-        values, correlations, youngs_modulus(fit.force, problem, solution), met, problem, solution
-    )
+    left = solution.at.residuals.copy()
+    for observation, rows in problem.rows():
+        left[rows] /= np.sqrt(observation.weight)
+    met = tuple(_met(each, left[rows], fit.loss) for each, rows in problem.rows())
+    ratio = spread_of(left, problem.size, fit.loss)
+    modulus = youngs_modulus(fit.force, problem, solution)
+    return Fitted(values, correlations, modulus, met, ratio, problem, solution)
 
 
 def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
-    ratio = spread_of(residuals, 0, loss)
-    noise = observation.noise * observation.unit * float(np.sqrt(observation.weight))
-    return Met(observation.kind, noise, ratio, len(residuals), observation.left_out)
+    """How well an observation is met, by its residuals over the noise."""
+    return Met(
+        observation.kind,
+        observation.noise * observation.unit,
+        spread_of(residuals, 0, loss),
+        len(residuals),
+        observation.left_out,
+        observation.left_out_because,
+    )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.components.forces import reactions
+from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.run_observation import RunObservation, read_at
@@ -17,6 +18,9 @@ from pbdkit.results.moment import StateMoment
 from pbdkit.results.tables import Tables
 from pbdkit.runs.course import Run
 from pbdkit.stepping.state import Floats, State
+
+SLACK = 1e-9
+"""The share of a run's way by which a row may lie beyond its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,11 +73,12 @@ class CurveObservation(RunObservation):
         )
         come, _ = found.curve(Run(scene))
         inside = (places >= come.min()) & (places <= come.max())
-        if not inside.any():
-            what = "steps" if at_times else "displacements of the group"
+        what = "times" if at_times else "displacements of the group"
+        ends = f"the run's {what} go from {come.min():g} to {come.max():g}"
+        if not inside.any() or (at_times and not inside.all()):
             raise ExperimentError(
-                f"the curve goes from {places.min():g} to {places.max():g}, and the run's {what} "
-                f"from {come.min():g} to {come.max():g}",
+                f"the curve goes from {places.min():g} to {places.max():g}, and {ends}; leave "
+                "other rows out, or let the experiment go as far",
                 ("measured", "file"),
             )
         return replace(
@@ -82,6 +87,7 @@ class CurveObservation(RunObservation):
             along=places[inside],
             rows=np.flatnonzero(inside),
             left_out=int((~inside).sum()),
+            left_out_because=ends,
         )
 
     @property
@@ -100,17 +106,25 @@ class CurveObservation(RunObservation):
 
     def _read(self, run: Run) -> Floats:
         come, force = self.curve(run)
+        beyond = SLACK * (come.max() - come.min())
+        if self.along.min() < come.min() - beyond or self.along.max() > come.max() + beyond:
+            raise UnconvergedError(
+                f"the group goes from {come.min():g} to {come.max():g}, and the curve from "
+                f"{self.along.min():g} to {self.along.max():g}"
+            )
         return np.interp(self.along, come, force)
 
     def curve(self, run: Run) -> tuple[Floats, Floats]:
         """At each recorded step, until the group stops or turns, the place (step,) and the force
-        over Young's modulus and thickness (step,)."""
+        over Young's modulus and thickness (step,). After a run has settled its force stays."""
         tables, places, forces = Tables(run.scene), [], []
-        for state in run:
-            if run.scene.experiment.record.keeps(state.step, run.scene.experiment.steps):
-                moment = StateMoment(state, tables)
-                places.append(state.step if self.at_times else self._gone(state))
-                forces.append(np.dot(self.way, reactions(moment)[self.group]))
+        for state in self._recorded(run):
+            moment = StateMoment(state, tables)
+            places.append(state.step if self.at_times else self._gone(state))
+            forces.append(np.dot(self.way, reactions(moment)[self.group]))
+        if self.at_times and places[-1] < self.experiment.steps:
+            places.append(self.experiment.steps)
+            forces.append(forces[-1])
         return _going_on(np.array(places, float), np.array(forces))
 
     def _gone(self, state: State) -> float:

@@ -16,6 +16,8 @@ from pbdkit.stepping.state import Floats
 
 ON_EDGE = 1e-9
 """By what share of a cell a point beside it counts as within."""
+OUTSIDE = "they lie in no whole cell of the body"
+"""The reason to leave a point out."""
 
 
 @dataclass(frozen=True)

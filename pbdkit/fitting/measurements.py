@@ -83,9 +83,9 @@ class Measured(Component):
         return np.asarray(self._rows)
 
     @property
-    def weighted_noise(self) -> float:
-        """The noise over the root of the weight."""
-        return float((self.noise or GUESS) / np.sqrt(self.weight))
+    def assumed_noise(self) -> float:
+        """The noise, or a guess until residuals tell it."""
+        return self.noise or GUESS
 
     @abstractmethod
     def observation(self, experiment: Experiment, modes: int) -> Observation:
@@ -132,7 +132,7 @@ class MeasuredField(Measured):
         terms = self.distortion.ux, self.distortion.uy
         evidence = FieldEvidence.of(scene, points[far], displacements[far], terms)
         _refuse_other_unit(evidence.points, scene)
-        return FieldObservation.of(scene, evidence, self.weighted_noise, modes, far)
+        return FieldObservation.of(scene, evidence, self.assumed_noise, modes, far)
 
 
 class MeasuredTracks(Measured):
@@ -151,7 +151,7 @@ class MeasuredTracks(Measured):
     def observation(self, experiment: Experiment, modes: int) -> TracksObservation:
         """Of its run."""
         times, points, u = self.rows[:, 0], self.rows[:, 1:3], self.rows[:, 3:]
-        return TracksObservation.of(experiment, times, points, u, self.weighted_noise)
+        return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
 
 
 class MeasuredCurve(Measured):
@@ -176,7 +176,7 @@ class MeasuredCurve(Measured):
             experiment,
             self.rows[:, 0],
             self.rows[:, 1] / scale,
-            self.weighted_noise / scale,
+            self.assumed_noise / scale,
             self.group,
             WAYS[self.axis],
             at_times=self.against == "time",

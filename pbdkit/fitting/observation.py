@@ -17,8 +17,8 @@ from pbdkit.stepping.state import Floats
 
 @dataclass(frozen=True)
 class Seen:
-    """At some parameters: the residuals (measured - predicted) / noise, (number,), and how the
-    predictions over their noise change with each parameter, (number, parameter), with each unknown
+    """At some parameters: the residuals (measured - predicted) / weighted noise, (number,), and how
+    the predictions over it change with each parameter, (number, parameter), with each unknown
     of the observation's own, (number, own), and with Young's modulus, (number,)."""
 
     residuals: Floats
@@ -38,9 +38,9 @@ class Near:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation(ABC):
-    """Numbers that were measured of an experiment. `noise` is their standard deviation, over the
-    root of their weight; both come in `unit`s of what was given. `rows` are the numbers of the rows
-    that count among those that were given; `left_out` are of no use."""
+    """Numbers that were measured of an experiment. `noise` is their standard deviation; both come
+    in `unit`s of what was given. `rows` are the numbers of the rows
+    that count among those that were given; `left_out` are of no use, for that reason."""
 
     kind: ClassVar[str]
     experiment: Experiment
@@ -48,8 +48,14 @@ class Observation(ABC):
     noise: float
     rows: NDArray[np.intp]
     left_out: int = 0
+    left_out_because: str = ""
     unit: float = 1.0
     weight: float = 1.0
+
+    @property
+    def weighted_noise(self) -> float:
+        """The noise over the root of the weight: what residuals are counted in."""
+        return float(self.noise / np.sqrt(self.weight))
 
     @property
     def needs_modulus(self) -> bool:
@@ -79,8 +85,8 @@ class Observation(ABC):
         UnconvergedError where nothing can be predicted."""
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
-        """Σ measured · p and Σ p² over the noise squared, with the predictions p for a modulus of
-        1: their ratio is where the search for it begins."""
+        """Σ measured · p and Σ p² over the square of the weighted noise, with the predictions p for
+        a modulus of 1: their ratio is where the search for it begins."""
         return 0.0, 0.0
 
     @abstractmethod

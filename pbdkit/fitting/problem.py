@@ -37,8 +37,8 @@ class Unknown:
 
 @dataclass(frozen=True)
 class At:
-    """The problem at z: the residuals (measured - predicted) / noise of all observations, one
-    after another, their derivatives (residual, unknown), and each observation by itself."""
+    """The problem at z: the residuals (measured - predicted) / weighted noise of all observations,
+    one after another, their derivatives (residual, unknown), and each observation by itself."""
 
     z: Floats
     residuals: Floats

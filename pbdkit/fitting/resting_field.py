@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.boundary import Boundary, boundaries
 from pbdkit.fitting.evidence import FieldEvidence
+from pbdkit.fitting.interpolation import OUTSIDE
 from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
@@ -24,6 +25,8 @@ DERIVATIVES = 1e-5
 CLOSE = 0.02
 """Parameters that are away by so little leave the answers to boundaries as they were, to such a
 share: residuals stay exact, and estimates move by that share of their errors."""
+
+NEAR = ", or nearer to its outline than the margin"
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ class FieldObservation(Observation):
             noise=noise,
             rows=rows[evidence.interpolation.inside],
             left_out=len(inside) - len(evidence.points),
+            left_out_because=OUTSIDE + (NEAR if among is not None and not among.all() else ""),
             scene=scene,
             evidence=evidence,
             boundaries=boundaries(scene, modes) if modes else (),
@@ -117,11 +121,11 @@ class FieldObservation(Observation):
             answers, answering = before.answers, before.answering
         else:
             answers, answering, away = self._answers(resting), resting, 0.0
-        by = [self.evidence.seen(du, resting) / self.noise for du in (*changes, *answers)]
+        by = [self.evidence.seen(du, resting) / self.weighted_noise for du in (*changes, *answers)]
         rows, count = len(self.measured), len(parameters)
-        beside = self.evidence.distortions / self.noise
+        beside = self.evidence.distortions / self.weighted_noise
         predicted = self.evidence.seen(resting.state.u, resting)
-        residuals = (self.measured - predicted) / self.noise - beside @ own[n:]
+        residuals = (self.measured - predicted) / self.weighted_noise - beside @ own[n:]
         return FieldSeen(
             residuals,
             np.array(by[:count]).T.reshape(rows, count),

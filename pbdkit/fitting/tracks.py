@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.fitting.interpolation import Interpolation
+from pbdkit.fitting.interpolation import OUTSIDE, Interpolation
 from pbdkit.fitting.run_observation import RunObservation, read_at
 from pbdkit.runs.course import Run
-from pbdkit.stepping.state import Floats
+from pbdkit.stepping.state import Floats, State
+
+ON_STEP = 1e-9
+"""The share of a step by which a time beside one counts as on it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TracksObservation(RunObservation):
     """Displacements of points at times, x of all, then y of all. Between steps, and between
-    particles, they are linear."""
+    particles, they are linear; after a run has settled they stay."""
 
     kind: ClassVar[str] = "tracks"
     along: Floats
@@ -31,7 +34,7 @@ class TracksObservation(RunObservation):
         cls, experiment: Experiment, times: Floats, points: Floats, u: Floats, noise: float
     ) -> TracksObservation:
         """Of times (row,), points (row, axis) and displacements (row, axis). Raises
-        ExperimentError where a time lies beyond the run."""
+        ExperimentError for a time at which the run gives no state."""
         if times.min() < 0.0 or times.max() > experiment.steps:
             raise ExperimentError(
                 f"times go from {times.min():g} to {times.max():g}, and the run from 0 to "
@@ -40,6 +43,13 @@ class TracksObservation(RunObservation):
             )
         steps = np.unique(np.concatenate([np.floor(times), np.ceil(times)])).astype(int)
         scene = read_at(experiment, steps.tolist())
+        if unknown := [n for n in steps.tolist() if not scene.experiment.records(n)]:
+            raise ExperimentError(
+                f"times need the state of step {unknown[0]}, and solver '{experiment.solver.type}' "
+                f"gives those of steps 0 and {experiment.steps} alone; leave other times out, or "
+                "take solver: {type: stepping}",
+                ("measured", "file"),
+            )
         found = Interpolation.at(scene, points)
         inside = found.inside
         return cls(
@@ -48,6 +58,7 @@ class TracksObservation(RunObservation):
             noise=noise,
             rows=np.flatnonzero(inside),
             left_out=int((~inside).sum()),
+            left_out_because=OUTSIDE,
             scene=scene,
             along=times[inside],
             points=points[inside],
@@ -73,10 +84,23 @@ class TracksObservation(RunObservation):
         )
 
     def _read(self, run: Run) -> Floats:
-        found = np.zeros((len(self.along), 2))
-        for state in run:
+        found, left = np.zeros((len(self.along), 2)), np.ones(len(self.along))
+        for state in self._recorded(run):
             share = np.maximum(0.0, 1.0 - np.abs(self.along - state.step))
-            if (rows := np.flatnonzero(share)).size:
-                part = self.interpolation.part(rows)
-                found[rows] += share[rows, None] * part.of(state.u, run.scene)
+            self._add(found, share, state, run)
+            left -= share
+        # A run that has settled stays where it is.
+        after = self.along > run.state.step
+        self._add(found, np.where(after, left, 0.0), run.state, run)
+        if (missing := ~after & (left > ON_STEP)).any():
+            raise ExperimentError(
+                f"the run gives no state at time {self.along[missing][0]:g}; leave that time out",
+                ("measured", "file"),
+            )
         return np.asarray(found.T.ravel())
+
+    def _add(self, found: Floats, share: Floats, state: State, run: Run) -> None:
+        """Adds a share of a state, by row, to the displacements that were found."""
+        if (rows := np.flatnonzero(share)).size:
+            part = self.interpolation.part(rows)
+            found[rows] += share[rows, None] * part.of(state.u, run.scene)
