@@ -190,6 +190,94 @@ def test_what_the_data_cannot_tell_is_said(name, tmp_path):
         assert f"{path}: the data cannot tell it" in list(found.lines())
 
 
+def in_series(**more):
+    """A bar of two materials, one behind the other, drawn out."""
+    rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": {"otherwise": 1.0, "half": 2.5}}
+    drawn = {"type": "displace", "displacement": [0.1, 0.02]}
+    return (
+        plate(rule)
+        | {
+            "body": {"type": "rectangle", "width": WIDTH, "height": HEIGHT},
+            "lattice": {"type": "square", "a": 2.0},
+            "leaders": [
+                {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+                {"select": {"edge": "right"}, "motion": drawn},
+            ],
+        }
+        | more
+    )
+
+
+def fitted(made, path, unknown, noise, **more):
+    measured(made, path, noise=noise, count=60)
+    given = {"file": str(path), "noise": noise}
+    return pbdkit.fit({"experiment": made, "unknown": unknown, "measured": given} | more)
+
+
+BOTH = {"rule.stiffness.otherwise": [0.2, 8.0], "rule.stiffness.half": [0.3, 5.0]}
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-7])
+@pytest.mark.parametrize("more", [{}, {"rule.poisson_ratio": [0.0, 0.45]}])
+def test_a_ratio_is_found_where_both_of_its_parts_are_not_told(noise, more, tmp_path):
+    """The best fit is that with one of them known, and so is the error of the ratio."""
+    made, path = in_series(), tmp_path / "field.csv"
+    one = fitted(made, path, {"rule.stiffness.half": [0.3, 5.0]} | more, noise)
+    both = fitted(made, path, BOTH | more, noise)
+    residuals = [f.solution.at.residuals for f in (one, both)]
+    np.testing.assert_allclose(*residuals, atol=0.02)
+    assert not any(both.values[path].told for path in BOTH)
+    assert all(both.values[path].told for path in more)
+    ratio, product = both.combinations
+    assert ratio.name == "rule.stiffness.otherwise / rule.stiffness.half"
+    assert product.name == "rule.stiffness.otherwise · rule.stiffness.half"
+    assert (ratio.estimate.told, product.estimate.told) == (True, False)
+    alone, together = one.values["rule.stiffness.half"], ratio.estimate
+    assert together.value == pytest.approx(1.0 / alone.value, rel=0.02 * alone.error)
+    assert together.error / together.value == pytest.approx(alone.error / alone.value, rel=0.02)
+    assert f"{product.name}: the data cannot tell it" in both.lines()
+    assert both.as_dict()["combinations"][ratio.name]["exponents"] == {
+        "rule.stiffness.otherwise": 1.0,
+        "rule.stiffness.half": -1.0,
+    }
+
+
+def loaded(force):
+    loads = [{"select": {"edge": "right"}, "force": [each, 0.0]} for each in force]
+    rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": 2.0}
+    return in_series(rule=rule, leaders=in_series()["leaders"][:1], loads=loads)
+
+
+SUMS = {
+    "of a force and a stiffness": (
+        [0.05], {"loads.0.force.0": [-0.2, 0.2], "rule.stiffness": [0.3, 5.0]},
+        "loads.0.force.0 / rule.stiffness", 0.025,
+    ),
+    "of forces": (
+        [0.04, 0.01], {"loads.0.force.0": [0.001, 0.2], "loads.1.force.0": [0.001, 0.1]},
+        "loads.0.force.0 + loads.1.force.0", 0.05,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SUMS)
+def test_what_is_told_of_several_is_a_product_or_a_sum(name, tmp_path):
+    force, unknown, formula, value = SUMS[name]
+    found = fitted(loaded(force), tmp_path / "field.csv", unknown, 1e-4)
+    told, untold = found.combinations
+    assert (told.name, told.estimate.told, untold.estimate.told) == (formula, True, False)
+    assert told.estimate.error < 2e-3 * value
+    assert told.estimate.value == pytest.approx(value, abs=4 * told.estimate.error)
+
+
+def test_a_single_parameter_that_is_not_told_makes_no_combination(tmp_path):
+    unknown = {"rule.stiffness": [0.5, 2.0], "rule.poisson_ratio": [0.0, 0.45]}
+    rule = {"type": "elastic", "poisson_ratio": 0.2, "stiffness": 1.0}
+    found = fitted(in_series(rule=rule), tmp_path / "field.csv", unknown, 1e-4)
+    assert [estimate.told for estimate in found.values.values()] == [False, True]
+    assert found.combinations == ()
+
+
 def test_outliers_count_less_where_the_loss_says_so(tmp_path):
     made, path = plate(), tmp_path / "field.csv"
     measured(made, path, noise=NOISE)

@@ -210,7 +210,8 @@ def test_a_run_that_has_settled_stays_at_rest(kind, tmp_path):
         given = {"type": "curve", "group": 1, "youngs_modulus": 1.0, "against": "time"}
         given |= {"columns": ["time", "force"]}
     given |= {"file": str(tmp_path / "rows.csv"), "noise": 1.0}
-    stays, goes_on = (posed(small(**more), given) for more in ({"solver": SETTLING}, {}))
+    every = {"record": {"every": 25}}  # that of a curve
+    stays, goes_on = (posed(small(**more, **every), given) for more in ({"solver": SETTLING}, {}))
     z = stays.start()
     short, whole = stays.at(z), goes_on.at(z)
     assert pbdkit.run(small(solver=SETTLING), progress=False).attrs["status"] == "settled"

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from test_fit import NOISE, measured, plate
+from test_fit import NOISE, fitted, in_series, measured, plate
 
 import pbdkit
 from pbdkit.fitting.calling import problem_of
@@ -76,6 +76,15 @@ def test_a_profile_with_two_parameters_fits_the_other_anew(fit):
     found = pbdkit.fit(given | {"profile": ["rule.stiffness.half"]})
     estimate, profile = found.values["rule.stiffness.half"], found.profiles["rule.stiffness.half"]
     assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.05)
+
+
+def test_where_the_data_tell_a_ratio_the_bounds_of_one_part_bound_the_other(tmp_path):
+    """The stiffness of one half is that of the other, which is between its bounds, times 2.5."""
+    bounds = {"rule.stiffness.otherwise": [0.4, 1.2], "rule.stiffness.half": [0.3, 5.0]}
+    asked = {"profile": ["rule.stiffness.half"]}
+    found = fitted(in_series(), tmp_path / "field.csv", bounds, 1e-3, **asked)
+    profile = found.profiles["rule.stiffness.half"]
+    assert (profile.low, profile.high) == pytest.approx((2.5 * 0.4, 2.5 * 1.2), rel=0.05)
 
 
 def test_what_data_do_not_bound_has_no_end(fit):

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.fitting.least_squares import Loss, Solution, cost_of, solved
-from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
 from pbdkit.stepping.state import Floats
 
@@ -117,19 +116,11 @@ def _left_out(posed: Posed, blocks: Sequence[NDArray[np.intp]], folds: int, loss
         z = solved(replace(posed.problem, observations=kept), posed.solution.z, loss).z
         for n, (observation, c) in enumerate(zip(observations, chosen, strict=True)):
             if c.any():
-                left = _residuals(posed.problem, n, observation.part(c), z)
+                left = posed.problem.residuals_of(n, observation.part(c), z)
                 own = blocks[n][c]
                 parts = (left.reshape(-1, len(own))[:, own == block] for block in np.unique(own))
                 found += [cost_of(part.ravel(), loss) / part.size for part in parts]
     return np.array(found) / _mean_weight(posed.problem)
-
-
-def _residuals(problem: Problem, n: int, part: Observation, z: Floats) -> Floats:
-    """Of some rows of observation n."""
-    own = z[[*problem.owned()][n][1]]
-    modulus = float(z[len(problem.unknowns)]) if problem.with_modulus else 1.0
-    experiment = problem.experiment_at(part, z)
-    return part.at(experiment, (), own, modulus).residuals
 
 
 def _blocks(places: Floats, seed: int) -> NDArray[np.intp]:

@@ -58,9 +58,10 @@ def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     carried = Carried(seen.answering, force.group)  # answers in balance with this state alone
     for n, du in enumerate(seen.answers, start=count):
         gradient[n] = way @ carried.change(du)
-    told = [n for n, u in enumerate(problem.unknowns) if u.parameter.path not in solution.untold]
-    known = [*told, *range(count, problem.size)]
-    part = np.sqrt(gradient[known] @ solution.covariance[np.ix_(known, known)] @ gradient[known])
+    untold = [n for n, u in enumerate(problem.unknowns) if u.parameter.path in solution.untold]
+    matters = (np.abs(gradient[untold]) > 1e-9 * abs(unit)).any()
+    gradient[untold] = 0.0
+    part = solution.directions.error_of(gradient)
     if unit <= 0.0:
         raise ExperimentError(
             f"group {force.group} carries no force that way in this experiment, rather one the "
@@ -70,5 +71,4 @@ def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     size = float(np.hypot(*force.value))
     value = size / force.thickness / unit
     error = abs(value) * np.hypot(part / unit, force.noise / size)
-    matters = any(abs(gradient[n]) > 1e-9 * abs(unit) for n in range(count) if n not in told)
     return Estimate(value, float(error), told=not matters)

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pbdkit.fitting.combination import Combination, combinations
 from pbdkit.fitting.comparison import Candidate
 from pbdkit.fitting.estimate import Estimate, youngs_modulus
 from pbdkit.fitting.force_curve import CurveObservation
-from pbdkit.fitting.least_squares import Loss, Solution, spread_of
+from pbdkit.fitting.least_squares import MODULUS, Loss, Solution, spread_of
 from pbdkit.fitting.observation import Observation
 from pbdkit.fitting.problem import Problem
 from pbdkit.fitting.profile import Profile
@@ -73,8 +74,9 @@ class Fitted:
     """The answer of a fit.
 
     `values` by path, `correlations` (parameter, parameter), `youngs_modulus` where a force was
-    given. Residuals are measured - fitted; `ratio` is the standard deviation of all of them over
-    the noise, and `met` says so of each measurement: whatever its weight. Standard errors are
+    given; `combinations` of parameters that are not told one by one, those that are told and those
+    that are not. Residuals are measured - fitted; `ratio` is the standard deviation of all of them
+    over the noise, and `met` says so of each measurement: whatever its weight. Standard errors are
     larger where residuals are larger than the noise over the root of the weight. `profiles` by
     path, `sample` and `candidates`, the best first, where they were asked for. `solution` and
     `problem` have all else.
@@ -88,6 +90,7 @@ class Fitted:
     problem: Problem = field(repr=False)
     solution: Solution = field(repr=False)
     profiles: Mapping[str, Profile] = field(default_factory=dict)
+    combinations: tuple[Combination, ...] = ()
     sample: Sample | None = field(default=None, repr=False)
     candidates: tuple[Candidate, ...] = ()
 
@@ -106,6 +109,7 @@ class Fitted:
                 one: {other: float(self.correlations[n, m]) for m, other in enumerate(named)}
                 for n, one in enumerate(named)
             },
+            "combinations": {each.name: each.as_dict() for each in self.combinations},
             "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
             "measured": [asdict(met) for met in self.met],
@@ -191,7 +195,8 @@ class Fitted:
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
         if self.youngs_modulus:
-            yield f"Young's modulus: {self.youngs_modulus}"
+            yield f"{MODULUS}: {self.youngs_modulus}"
+        yield from map(str, self.combinations)
         for n, one in enumerate(self.values):
             for m, other in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
@@ -227,7 +232,10 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     met = tuple(_met(each, left[rows], fit.loss) for each, rows in problem.rows())
     ratio = spread_of(left, problem.size, fit.loss)
     modulus = youngs_modulus(fit.force, problem, solution)
-    return Fitted(values, correlations, modulus, met, ratio, problem, solution)
+    several = combinations(problem, solution)
+    return Fitted(
+        values, correlations, modulus, met, ratio, problem, solution, combinations=several
+    )
 
 
 def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:

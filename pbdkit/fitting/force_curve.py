@@ -59,7 +59,7 @@ class CurveObservation(RunObservation):
         scene = read_at(experiment)
         if group >= len(scene.leading):
             raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
-        found = cls(
+        return cls(
             experiment=experiment,
             measured=forces,
             noise=noise,
@@ -70,25 +70,23 @@ class CurveObservation(RunObservation):
             at_times=at_times,
             scaled=scaled,
             along=places,
-        )
-        come, _ = found.curve(Run(scene))
-        inside = (places >= come.min()) & (places <= come.max())
-        what = "times" if at_times else "displacements of the group"
+        )._within_the_run()
+
+    def _within_the_run(self) -> CurveObservation:
+        """Without the rows to which the run does not come. Raises ExperimentError where none is
+        left, and for times beyond the run."""
+        come, _ = self.curve(Run(self.scene))
+        inside = (self.along >= come.min()) & (self.along <= come.max())
+        what = "times" if self.at_times else "displacements of the group"
         ends = f"the run's {what} go from {come.min():g} to {come.max():g}"
-        if not inside.any() or (at_times and not inside.all()):
+        if not inside.any() or (self.at_times and not inside.all()):
             raise ExperimentError(
-                f"the curve goes from {places.min():g} to {places.max():g}, and {ends}; leave "
-                "other rows out, or let the experiment go as far",
+                f"the curve goes from {self.along.min():g} to {self.along.max():g}, and {ends}; "
+                "leave other rows out, or let the experiment go as far",
                 ("measured", "file"),
             )
-        return replace(
-            found,
-            measured=forces[inside],
-            along=places[inside],
-            rows=np.flatnonzero(inside),
-            left_out=int((~inside).sum()),
-            left_out_because=ends,
-        )
+        left_out = int((~inside).sum())
+        return replace(self.part(inside), left_out=left_out, left_out_because=ends)
 
     @property
     def names(self) -> tuple[str, str, bool]:

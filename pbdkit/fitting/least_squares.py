@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.fitting.problem import At, Problem
@@ -22,9 +24,15 @@ MOST_TURNS, SMALLEST = 30, 1e-3
 """Of Gauss and Newton; the smallest share of a step that is taken."""
 ENOUGH, SLACK = 0.25, 1e-9
 """The share of the gain that is foretold which a step has to bring (Armijo), but for rounding."""
-MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-13
+MOST_WEIGHTINGS, STEADY, RANK = 100, 1e-6, 1e-5
 """Of a linear problem with a loss; the change of residuals at which weights stay; the share of the
-largest singular value below which one is none."""
+largest singular value of columns of unit length below which one is none: derivatives are no more
+accurate."""
+INVOLVED = 1e-2
+"""An unknown has no part in a direction that is none where its column has less than that of it."""
+UNTOLD = 1e12
+"""The variance along such a direction."""
+MODULUS = "Young's modulus"
 SETTLED = 1e-2
 """The share of its standard error by which no unknown would move any more."""
 SWING = 0.25
@@ -38,17 +46,61 @@ OUTLIERS = 1.345
 
 
 @dataclass(frozen=True)
+class Directions:
+    """Independent directions of z, (direction, unknown), in which each unknown counts in its
+    `scale`, (unknown,), and the variance along each, (direction,)."""
+
+    ways: Floats
+    variance: Floats
+    scale: Floats
+
+    @property
+    def covariance(self) -> Floats:
+        """Of z."""
+        return (self.ways.T * self.variance) @ self.ways * np.outer(self.scale, self.scale)
+
+    @property
+    def are_none(self) -> NDArray[np.bool_]:
+        """The directions along which nothing changes, (direction,)."""
+        return self.variance >= UNTOLD
+
+    @property
+    def unsure(self) -> NDArray[np.bool_]:
+        """The unknowns of which each direction tells too little, (direction, unknown)."""
+        share = np.abs(self.ways)
+        moved = share * np.sqrt(self.variance)[:, None] > TELLS
+        few = (self.variance > TELLS**2)[:, None]
+        return np.where(self.are_none[:, None], share > 0.0, few & (moved | (share > PART)))
+
+    def errors(self, step: Floats) -> Floats:
+        """A step along each direction, in standard errors; 0 where nothing changes."""
+        along = (self.ways @ (step / self.scale)) / np.sqrt(self.variance)
+        return np.where(self.are_none, 0.0, along)
+
+    def error_of(self, gradient: Floats) -> float:
+        """The standard error of a number with that gradient by z, which is the same along
+        directions in which nothing changes."""
+        along = self.ways @ (gradient * self.scale)
+        return float(np.sqrt(np.square(along[~self.are_none]) @ self.variance[~self.are_none]))
+
+
+@dataclass(frozen=True)
 class Solution:
-    """The best z with the problem there, the covariance of z, how much larger residuals are than
+    """The best z with the problem there, how well it is known, how much larger residuals are than
     their noise, and by name the parameters that the data cannot tell, and those on their bounds."""
 
     z: Floats
     at: At
-    covariance: Floats
+    directions: Directions
     ratio: float
     untold: tuple[str, ...]
     on_bounds: tuple[str, ...]
     evaluations: int
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of z."""
+        return self.directions.covariance
 
     @property
     def errors(self) -> Floats:
@@ -58,28 +110,30 @@ class Solution:
 
 def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     """By Gauss and Newton with exact derivatives: the problem as it is linear at z is solved
-    between bounds, with its loss, until z stays where it is.
+    between bounds, with its loss, until z stays where it is along all directions that the data
+    tell; along others it stays where it began.
 
     The covariance is (JᵀJ)⁻¹, times the square of the ratio where residuals are larger than their
     noise says (Birge), or with a loss that of M-estimators (Huber). Raises UnconvergedError.
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
-    at, count, share, before = problem.at(z), 1, 1.0, np.zeros(problem.size)
+    at, count, share = problem.at(z), 1, 1.0
+    before = np.zeros(len(at.residuals))
     for _ in range(MOST_TURNS):
         step = _linear_step(at, low - z, high - z, loss)
-        covariance, untold = _known(problem, at, loss)
+        directions, untold = _known(problem, at, loss)
         ratio = spread_of(at.residuals, problem.size, loss)
-        own = step / np.sqrt(np.diag(covariance))
-        if (np.abs(own) <= SETTLED).all():
+        if (np.abs(directions.errors(step)) <= SETTLED).all():
             break
-        swings = own @ before < -SWING * (before @ before)
+        change = at.jacobian @ step
+        swings = change @ before < -SWING * (before @ before)
         share = share / 2.0 if swings else min(1.0, 2.0 * share)
         share, at, tried = _taken(problem, at, z, step, share, loss)
-        z, before, count = z + share * step, share * own, count + tried
+        z, before, count = z + share * step, share * change, count + tried
     else:
         raise UnconvergedError(f"the fit still moves after {MOST_TURNS} turns")
-    return Solution(z, at, covariance, ratio, untold, _on_bounds(problem, z), count)
+    return Solution(z, at, directions, ratio, untold, _on_bounds(problem, z), count)
 
 
 def _taken(
@@ -117,16 +171,25 @@ def _linear_step(at: At, low: Floats, high: Floats, loss: Loss) -> Floats:
     scaled, y = np.where(matters, at.jacobian / size, 0.0), np.zeros(len(size))
     for _ in range(1 if loss == "linear" else MOST_WEIGHTINGS):
         weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
-        basis, triangle = np.linalg.qr(scaled * weight[:, None])
+        basis, sizes, ways = _singular(scaled * weight[:, None])
         right = basis.T @ (at.residuals * weight)
-        before, y = y, np.linalg.lstsq(triangle, right, rcond=RANK)[0]
+        before, y = y, ways.T @ (right / sizes)
         if (y < low * size).any() or (y > high * size).any():
             from scipy.optimize import lsq_linear
 
-            y = lsq_linear(triangle, right, (low * size, high * size), tol=1e-14).x
+            seen = sizes[:, None] * ways
+            y = lsq_linear(seen, right, (low * size, high * size), tol=1e-14).x
         if (np.abs(y - before) <= STEADY).all():
             break
     return np.asarray(y / size)
+
+
+def _singular(columns: Floats) -> tuple[Floats, Floats, Floats]:
+    """The singular value decomposition of columns of unit length, without what is none."""
+    basis, triangle = np.linalg.qr(columns)
+    own, sizes, ways = np.linalg.svd(triangle, full_matrices=False)
+    told = sizes > RANK * sizes.max(initial=0.0)
+    return basis @ own[:, told], sizes[told], ways[told]
 
 
 def _weight(residuals: Floats, loss: Loss) -> Floats:
@@ -158,32 +221,30 @@ def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
     return float(1.4826 * np.median(np.abs(residuals)))
 
 
-def _known(problem: Problem, at: At, loss: Loss) -> tuple[Floats, tuple[str, ...]]:
-    """The covariance of z, for residuals at least as large as their noise, and whom the data cannot
-    tell.
+def _known(problem: Problem, at: At, loss: Loss) -> tuple[Directions, tuple[str, ...]]:
+    """How well z is known, for residuals at least as large as their noise, and the parameters that
+    the data cannot tell.
 
-    Parameters count in the way between their bounds; what cannot be told is left at that way.
+    Parameters count in the way between their bounds, Young's modulus in its own size.
     """
-    count = len(problem.unknowns)
-    scale = np.ones(problem.size)
+    count, size = len(problem.unknowns), np.linalg.norm(at.jacobian, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    scale = 1.0 / size
     scale[:count] = [u.span for u in problem.unknowns]
-    jacobian = at.jacobian * scale
-    rest = np.linalg.norm(jacobian[:, count:], axis=0)
-    jacobian[:, count:] /= np.where(rest > 0.0, rest, 1.0)
-    scale[count:] /= np.where(rest > 0.0, rest, 1.0)
-    _, sizes, ways = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
-    sizes = np.append(sizes, np.zeros(len(ways) - len(sizes)))  # of fewer residuals than unknowns
-    least = sizes.max(initial=0.0) * RANK
-    variance = np.array([1.0 / s**2 if s > least else np.inf for s in sizes])
-    variance *= _of_loss(at.residuals, problem.size, loss)
-    own = ways[:, :count]
-    unsure = (variance > TELLS**2) & (np.abs(own).max(axis=1, initial=0.0) > PART)
-    untold = {n for row in own[unsure] for n in np.flatnonzero(np.abs(row) > PART).tolist()}
-    variance = np.minimum(variance, 1e12)
-    covariance = (ways.T * variance) @ ways * np.outer(scale, scale)
-    spread = np.sqrt(np.diag(covariance))[:count]
-    untold |= {n for n, u in enumerate(problem.unknowns) if spread[n] > TELLS * u.span}
-    return covariance, tuple(problem.unknowns[n].parameter.path for n in sorted(untold))
+    if problem.with_modulus:
+        scale[count] = abs(at.z[count]) or 1.0
+    _, sizes, ways = _singular(at.jacobian / size)
+    told = len(sizes)
+    _, sizes, ways = np.linalg.svd(sizes[:, None] * ways * (size * scale))
+    variance = np.full(len(ways), UNTOLD)
+    variance[:told] = np.minimum(_of_loss(at.residuals, problem.size, loss) / sizes**2, UNTOLD)
+    shares = np.abs(ways[told:] * (size * scale))
+    ways[told:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
+    directions = Directions(ways, variance, scale)
+    spread = np.sqrt(np.diag(directions.covariance)) / scale
+    untold = (directions.unsure.any(axis=0) | (spread > TELLS))[:count]
+    names = [unknown.parameter.path for unknown in problem.unknowns]
+    return directions, tuple(name for name, each in zip(names, untold, strict=True) if each)
 
 
 def _of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:

@@ -150,6 +150,16 @@ class Problem:
                 jacobian[rows, len(parameters)] = found.by_modulus
         return At(z, residuals, jacobian, tuple(seen))
 
+    def residuals(self, z: Floats) -> Floats:
+        """The residuals at z alone. Raises as `at` does."""
+        return np.concatenate([self.residuals_of(n, o, z) for n, o in enumerate(self.observations)])
+
+    def residuals_of(self, n: int, part: Observation, z: Floats) -> Floats:
+        """Those of some rows of observation n."""
+        own = z[[*self.owned()][n][1]]
+        modulus = float(z[len(self.unknowns)]) if self.with_modulus else 1.0
+        return part.at(self.experiment_at(part, z), (), own, modulus).residuals
+
     def _near(self, at: At, z: Floats) -> list[Near]:
         ways = [abs(z[n] - at.z[n]) / u.span for n, u in enumerate(self.unknowns)]
         return [Near(seen, float(max(ways, default=0.0))) for seen in at.seen]

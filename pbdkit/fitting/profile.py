@@ -21,6 +21,11 @@ from pbdkit.stepping.state import Floats
 
 STEP, EVEN, MOST = 0.75, 4, 12
 """Values are so many standard errors apart, and after so many twice as far each time."""
+WIDEST = 0.1
+"""The largest first step, as a share of the way between bounds."""
+STRAIGHT, REFINEMENTS = 1.5, 30
+"""The root of the rise counts as straight over so much of it; the most values that are looked at
+until it is."""
 ENOUGH = 8.0
 """The rise after which no farther value is looked at."""
 RISE = 3.841
@@ -53,7 +58,12 @@ class Profile:
 def profiled(problem: Problem, solution: Solution, n: int, loss: Loss) -> Profile:
     """The profile of parameter n: outward from the fit until it has risen enough, on both sides."""
     best = (float(solution.z[n]), 0.0)
-    sides = [np.array([best, *_walk(problem, solution, n, way, loss)]) for way in (-1.0, 1.0)]
+    sides = [
+        _refined(
+            np.array([best, *_walk(problem, solution, n, way, loss)]), problem, solution, n, loss
+        )
+        for way in (-1.0, 1.0)
+    ]
     low, high = (_crossing(*side.T) for side in sides)
     values, rises = np.concatenate([sides[0][:0:-1], sides[1]]).T
     return Profile(values, rises, low, high)
@@ -64,9 +74,9 @@ def _walk(
 ) -> Iterator[tuple[float, float]]:
     """Values one way, and the rise at each, as far as all else can be fitted."""
     low, high = _ends(problem.unknowns[n])
-    value, z, step = float(solution.z[n]), solution.z, STEP * float(solution.errors[n])
-    unit = rise_of_loss(solution.at.residuals, problem.size, loss)
-    least = cost_of(solution.at.residuals, loss)
+    value, z = float(solution.z[n]), solution.z
+    step = min(STEP * float(solution.errors[n]), WIDEST * (high - low))
+    unit, least = _unit(problem, solution, loss)
     for count in range(MOST):
         value = min(max(value + way * step, low), high)
         try:
@@ -77,6 +87,30 @@ def _walk(
         if value in (low, high) or cost - least > ENOUGH * unit:
             return
         step *= 1.0 if count < EVEN else 2.0
+
+
+def _refined(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
+    """Values and rises going outward, (value, 2), with more of them where the rise comes to RISE:
+    where it is flat at first, it is not straight there."""
+    unit, least = _unit(problem, solution, loss)
+    for _ in range(REFINEMENTS):
+        roots = np.sqrt(np.maximum(side[:, 1], 0.0))
+        beyond = np.flatnonzero(roots >= np.sqrt(RISE))
+        if not beyond.size or (k := int(beyond[0])) == 0 or roots[k] - roots[k - 1] <= STRAIGHT:
+            break
+        value = float(side[k - 1 : k + 1, 0].mean())
+        try:
+            cost, _ = _fitted_at(problem, n, value, solution.z, loss)
+        except UnconvergedError:
+            break
+        side = np.insert(side, k, (value, (cost - least) / unit), axis=0)
+    return side
+
+
+def _unit(problem: Problem, solution: Solution, loss: Loss) -> tuple[float, float]:
+    """The rise of -2 log L that counts as 1, and its least value."""
+    residuals = solution.at.residuals
+    return rise_of_loss(residuals, problem.size, loss), cost_of(residuals, loss)
 
 
 def _ends(unknown: Any) -> tuple[float, float]:
