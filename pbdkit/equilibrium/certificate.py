@@ -228,7 +228,8 @@ class Foresight:
         try:
             if anew:
                 known.refuse_moving_floats(moves, self._moves.rounding(here.u))
-            return known.solve(moves, ACCURACY * self._scale, here), ""
+            rounding = known.amplification * self._moves.rounding(here.u)
+            return known.solve(moves, ACCURACY * self._scale, here, rounding), ""
         except ExperimentError as error:
             return None, str(error).partition("; ")[0] + "; let a leader hold it"
 

@@ -47,7 +47,7 @@ class _ContactSearch(Search):
                 went_loose = True
                 correction = system.solve_loose(self._left, spacing_of(self._finder.scene))
             else:
-                correction = system.solve(self._left, self._wanted)
+                correction = system.solve(self._left, self._wanted, None, self._rounding())
             before, size = size, float(np.abs(correction).max(initial=0.0))
             if same and not loose and not size <= CONTRACTION * before:
                 break

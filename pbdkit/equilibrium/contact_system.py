@@ -25,7 +25,7 @@ from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.moves import Moves
-from pbdkit.equilibrium.system import System
+from pbdkit.equilibrium.system import PUSH, System
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
@@ -116,13 +116,15 @@ class ContactSystem(System):
         planes.reshape(len(planes), -1)[:, self._place] = table.reshape(-1, len(planes)).T
         return planes
 
-    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
         """Part by part."""
         r = self._table(moves)
         x = np.zeros_like(r)
         for some, part in self._parts:
             try:
-                x[some] = part.solve(r[some])
+                x[some] = part.solve(r[some], None, rounding)
             except DriftingError:
                 raise ExperimentError(
                     f"there is no equilibrium: neither leaders nor obstacles hold a part of "
@@ -133,7 +135,7 @@ class ContactSystem(System):
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
         """By `solve`, which knows no tolerance."""
-        return self.solve(moves, 0.0)
+        return self.solve(moves, 0.0, rounding=PUSH * float(np.abs(moves).max(initial=0.0)))
 
     def pushed_by(self, led: Floats) -> None:
         """Unknown."""

@@ -90,9 +90,11 @@ class _Replaceable(System):
         self._system, self._otherwise, self._past = system, otherwise, 0
         self._at_rest = at_rest
 
-    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
         """By the first that can."""
-        return self._first_able(lambda system: system.solve(moves, tolerance, owed))
+        return self._first_able(lambda system: system.solve(moves, tolerance, owed, rounding))
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
         """By the first that can."""
@@ -136,6 +138,11 @@ class _Replaceable(System):
     def methods(self) -> str:
         """Of the present one."""
         return self._system.methods
+
+    @property
+    def is_stuck(self) -> bool:
+        """Of the present one."""
+        return self._system.is_stuck
 
     @property
     def how(self) -> str:

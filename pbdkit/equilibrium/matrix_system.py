@@ -18,8 +18,8 @@ from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.stage import Stage
-from pbdkit.equilibrium.system import System
-from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
+from pbdkit.equilibrium.system import PUSH, System
+from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part, TooSoftError
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
@@ -27,6 +27,15 @@ from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.intp]
+DRIFTS = (
+    "there is no equilibrium: nothing holds a part of {}, and it is pushed on for ever; let a "
+    "leader hold it"
+)
+SOFT = (
+    "double precision does not tell what holds a part of {}: it turns about a single particle, is "
+    "too slender, or held by too soft a region; let leaders hold more of it, or take stiffer "
+    "regions or fewer particles"
+)
 
 
 class MatrixSystem(System):
@@ -101,12 +110,19 @@ class MatrixSystem(System):
                         ("leaders",),
                     )
 
-    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+    @property
+    def is_stuck(self) -> bool:
+        """Part by part."""
+        return any(part.is_stuck for stage in self._stages for _, part in stage.parts)
+
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
         """Stage by stage, part by part."""
         back = None if owed is None else self._owed(owed)
-        return self._planes(self._solved(self._table(moves), back))
+        return self._planes(self._solved(self._table(moves), back, rounding))
 
-    def _solved(self, moves: Floats, owed: Floats | None) -> Floats:
+    def _solved(self, moves: Floats, owed: Floats | None, rounding: float) -> Floats:
         found = np.zeros_like(moves)
         for stage in self._stages:
             r = moves[:, stage.axes].ravel()
@@ -116,20 +132,19 @@ class MatrixSystem(System):
             x = np.zeros_like(r)
             for some, part in stage.parts:
                 try:
-                    x[some] = part.solve(r[some], None if back is None else back[some])
-                except DriftingError:
-                    raise ExperimentError(
-                        "there is no equilibrium: nothing holds a part of "
-                        f"{self._named(stage, some)}, and it is pushed on for ever; let a leader "
-                        "hold it",
-                        ("leaders",),
-                    ) from None
+                    own = None if back is None else back[some]
+                    x[some] = part.solve(r[some], own, rounding)
+                except DriftingError as error:
+                    soft = isinstance(error, TooSoftError) or self._is_fixed(stage.axes, some)
+                    text = SOFT if soft else DRIFTS
+                    named = self._named(stage, some)
+                    raise ExperimentError(text.format(named), ("leaders",)) from None
             found[:, stage.axes] = x.reshape(-1, len(stage.axes))
         return found
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
         """By `solve`, which knows no tolerance."""
-        return self.solve(moves, 0.0)
+        return self.solve(moves, 0.0, rounding=PUSH * float(np.abs(moves).max(initial=0.0)))
 
     def pushed_by(self, led: Floats) -> None:
         """Unknown."""
@@ -229,6 +244,23 @@ class MatrixSystem(System):
         before = self._operator.couplings_before
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
         return Floating(matrix, back, self._watch)
+
+    def _is_fixed(self, axes: list[int], some: Indices) -> bool:
+        """Whether what leads, led components and leaders beside these unknowns, leaves them no
+        motion as a whole: along the axes and, of two, a turn."""
+        led = self._operator.couplings_led.entries(axes)
+        beside = np.isin(led.rows, some) & (led.values != 0.0)
+        leaders, count = np.unique(led.columns[beside]), len(axes)
+        own = some[self._guided[:, axes].ravel()[some]]
+        at = np.concatenate([self._led[leaders // count], self._X[own // count]])
+        along = np.concatenate([leaders, own]) % count
+        if not len(at):
+            return False
+        motions = np.eye(count)[along]
+        if count > 1:
+            x, y = (at - at[0]).T / (float(np.ptp(at, axis=0).max()) or 1.0)
+            motions = np.column_stack([motions, np.where(along == 0, -y, x)])
+        return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
     def _ground(self, axes: list[int], some: Indices) -> Ground:
         """Where these unknowns lie; who leads along the one axis asked for is a leader."""

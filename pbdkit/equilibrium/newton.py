@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from pbdkit.equilibrium.certificate import FIRST_ORDER, LINEAR, Certificate, UnconvergedError
+from pbdkit.equilibrium.certificate import (
+    FIRST_ORDER,
+    LINEAR,
+    Certificate,
+    UnconvergedError,
+    spacing_of,
+)
 from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.rows import ALL, Rows
-from pbdkit.equilibrium.system import IndefiniteError, System, one_thread
+from pbdkit.equilibrium.system import IndefiniteError, StuckError, System, one_thread
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import Floats, State
 
 MOST_CORRECTIONS = 12
+LOOSEST = 0.1
+"""No tolerance from here on is proposed."""
 CONTRACTION = 0.5
 """What share of the last a correction may be: then there is one equilibrium nearby, and Newton's
 iteration leads there (Deuflhard)."""
@@ -27,8 +36,8 @@ SERVES, NEAR = 0.02, 1e-3
 accurately corrections are solved for at least, as a share of themselves."""
 NOT_LINEAR = "the rule declares itself linear, and does not move as its linearisation says"
 NUDGE, SHARE = 1e-6, 0.25
-"""By so much leaders are moved to see what their way does to others; the share of the tolerance
-that linear systems have."""
+"""By so much, in lattice spacings, leaders are moved to see what their way does to others; the
+share of the tolerance that linear systems have."""
 UNSTABLE = "what is found is not stable"
 
 
@@ -123,11 +132,19 @@ class Search(ABC):
         )
 
     def _why(self) -> str:
-        largest = self._finder.rows.largest(self._left)
-        if not math.isfinite(largest):
+        finder = self._finder
+        if not math.isfinite(finder.rows.largest(self._left)):
             return "it left the finite numbers"
-        if largest <= 8 * self._rounding():
-            return "rounding alone allows no better"
+        if self._system.is_stuck:
+            return (
+                f"{self._system.methods} got stuck, as where a body is slender or soft; take "
+                "solver.method: lu"
+            )
+        with suppress(StuckError):
+            rounding = self._rounding()
+            best = self._system.distance(np.zeros_like(self._left), rounding) / finder.scale
+            if best * finder.scale > SHARE * finder.tolerance:
+                return f"rounding alone allows no better than {best:.1g}{_reachable(best)}"
         return "no correction makes the moves smaller"
 
     def _linearised(self, at: State, what: str) -> System:
@@ -165,6 +182,14 @@ class Search(ABC):
         return self._system.amplification * finder.rows.most(finder.moves.rounding(own))
 
 
+def _reachable(share: float) -> str:
+    """A tolerance with room for a bound of so much, in words; a remedy where there is none."""
+    tolerance = 10.0 ** math.ceil(math.log10(share / SHARE)) if 0.0 < share < math.inf else 1.0
+    if tolerance < LOOSEST:
+        return f"; take solver.tolerance: {tolerance:.0e}"
+    return ": the body is too slender or soft for double precision"
+
+
 class _Linear(Search):
     """By one linearisation."""
 
@@ -185,7 +210,7 @@ class _Linear(Search):
     def _correct(self) -> None:
         for n in range(MOST_CORRECTIONS):
             moves, before = self._left, self._finder.rows.norm(self._left)
-            correction = self._system.solve(moves, self._wanted, self._owed)
+            correction = self._system.solve(moves, self._wanted, self._owed, self._rounding())
             self._shift(correction)
             self._owed = None
             after = self._finder.rows.norm(self._left)
@@ -219,11 +244,13 @@ class _Newton(Search):
     def _go_ahead(self) -> None:
         """As far as the equilibrium before says, leaders their whole way: by what moves a small
         part of it makes."""
-        moves, part = self._finder.moves, min(1.0, NUDGE / self._way) if self._way else 1.0
+        nudge = NUDGE * spacing_of(self._finder.scene)
+        moves, part = self._finder.moves, min(1.0, nudge / self._way) if self._way else 1.0
         here = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._led)
         pull = here + (moves.at(nudged, self._moment) - here) / part
-        correction = self._system.solve(pull, max(self._wanted, NEAR * self._way))
+        wanted = max(self._wanted, NEAR * self._way)
+        correction = self._system.solve(pull, wanted, None, self._rounding() / part)
         if self._finder.scene.loads:
             self._way = max(self._way, float(np.abs(correction).max(initial=0.0)))
         self._shift(correction)
@@ -239,7 +266,8 @@ class _Newton(Search):
                 return
             # Solved as well as it is linear (Eisenstat and Walker).
             share = min(NEAR, (far / farther) ** 2) if farther else NEAR
-            correction = self._system.solve(self._left, max(self._wanted, share * far))
+            wanted = max(self._wanted, share * far)
+            correction = self._system.solve(self._left, wanted, None, self._rounding())
             before, size = size, float(np.abs(correction).max(initial=0.0))
             if not size <= CONTRACTION * min(before, self._way or math.inf):
                 reason = "corrections do not become smaller"

@@ -43,6 +43,10 @@ FAR, TURNS = 8.0, 4
 often."""
 
 
+PUSH = 1e-10
+"""The share of moves, known by differences perhaps, that may push a part that nothing holds."""
+
+
 class StuckError(Exception):
     """An iteration got nowhere."""
 
@@ -70,14 +74,22 @@ class System(ABC):
         """Of all linear solvers together."""
 
     @property
+    def is_stuck(self) -> bool:
+        """Whether an iteration has got nowhere, and its method allows no other."""
+        return False
+
+    @property
     def amplification(self) -> float:
         """How much larger moves are, in rounding too, than the displacements that make them."""
         return 1.0
 
     @abstractmethod
-    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
         """The correction c, to within a length. A state is `owed` to where the step looks back:
-        what the invariants of parts that nothing holds have yet to gain.
+        what the invariants of parts that nothing holds have yet to gain. `rounding` is how far it
+        may have put the moves off.
 
         Raises ExperimentError where a part is pushed on for ever.
         """

@@ -33,17 +33,30 @@ ROUGH = 1e-3
 """The relative accuracy of solutions that only serve a bound."""
 TURNS = 20
 """Of inverse iteration."""
-SINGULAR = 1e-10
-"""Relative size below which a singular value counts as zero."""
-SHIFT, MOST_MODES = 1e-11, 6
-"""A large singular matrix is shifted by so much to find its kernel of so many modes at most, few
-for connected parts."""
+SOFT = 1e10
+"""Where A⁻¹ takes numbers of up to 1 farther, the part may be one that nothing holds."""
+TOO_SOFT = 1e13
+"""Where it takes them farther beside the modes that cost nothing, these cannot be told from soft
+ones in double precision."""
+NOTHING = 64.0 * float(np.finfo(float).eps)
+"""What rounding leaves of A y and of the push on a mode y that costs nothing, relative to the terms
+that cancel."""
+RANDOM_SHARE = 0.1
+"""The share that any one mode has in random numbers, over the root of how many they are, at
+least."""
+SHIFT, MODES, MOST_MODES = 1e-13, 6, 96
+"""A large singular matrix is shifted by so much, relative to its largest entry, to find its kernel
+among so many modes; among up to so many more where all of them belong to it."""
 LARGEST_FALLBACK = 400_000
 """Unknowns up to which an LU factorisation takes over where an iteration gets stuck."""
 
 
 class DriftingError(Exception):
     """A part that nothing holds is pushed on for ever."""
+
+
+class TooSoftError(DriftingError):
+    """Double precision does not tell whether a part is held softly or not at all."""
 
 
 class Part(ABC):
@@ -55,10 +68,13 @@ class Part(ABC):
     ) -> None:
         self._size, self._solver, self._watch, self._borders = size, solver, watch, borders
 
+    is_stuck = False
+    """Whether an iteration has got nowhere, and there is no other choice."""
+
     @abstractmethod
-    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
-        """The x to which steps from x = 0 converge; `owed` is what invariants have to gain. Raises
-        DriftingError where there is none."""
+    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
+        """The x to which steps from x = 0 converge; `owed` is what invariants have to gain,
+        `rounding` how far r may be off. Raises DriftingError where there is none."""
 
     @abstractmethod
     def solve_transposed(self, weights: Floats) -> Floats:
@@ -78,8 +94,8 @@ class Part(ABC):
         """max |A⁻¹ r|, and what rounding of r by so much may add to it."""
         if self._solver is None:
             return math.inf if r.any() or rounding else 0.0
-        found = np.abs(self._inverted(r)).max(initial=0.0)
-        return float(found) + self._spread * rounding
+        found = float(np.abs(self._inverted(r)).max(initial=0.0))
+        return found + (self._spread * rounding if rounding else 0.0)
 
     @property
     def how(self) -> str:
@@ -100,11 +116,11 @@ class Part(ABC):
             v, before = w, v
         return bool(v @ before > 0.0)
 
-    def _inverted(self, r: Floats) -> Floats:
+    def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
         """A⁻¹ r, roughly."""
         assert self._solver is not None
         b = np.append(r, np.zeros(self._borders))
-        return self._solver.solve(b, ROUGH)[: self._size]
+        return self._solver.solve(b, accuracy)[: self._size]
 
     @cached_property
     def _spread(self) -> float:
@@ -115,12 +131,13 @@ class Part(ABC):
             return float(inverse.sum(axis=1).max(initial=0.0))
         self._watch.begin("bounding the error")
         signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size)
-        return SAFETY * float(np.abs(self._inverted(signs)).max(initial=0.0))
+        # So accurately that the softest mode, with its share in random numbers, is not left out.
+        accuracy = min(ROUGH, RANDOM_SHARE / math.sqrt(max(1, self._size)))
+        return SAFETY * float(np.abs(self._inverted(signs, accuracy)).max(initial=0.0))
 
 
 class Held(Part):
-    """A part whose matrix has an inverse. Raises LinAlgError where it is worth nothing in double
-    precision."""
+    """A part whose matrix has an inverse. Raises LinAlgError where some motion costs nothing."""
 
     def __init__(
         self,
@@ -138,56 +155,69 @@ class Held(Part):
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
         solver = linear_solver(matrix, method, watch=watch, **self._how)
         super().__init__(matrix.shape[0], solver, watch)
-        if not self._spread < 1.0 / SINGULAR:
+        if self._spread < SOFT or matrix.shape[0] > LARGEST_FALLBACK:
+            return
+        if _left_kernel(matrix).size:
             raise np.linalg.LinAlgError("singular")
 
-    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
+    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
         """By this method; nothing is owed, for what is held has no invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
-        assert self._solver is not None
-        x = self._solver.solve(r, ACCURACY)
-        if self._is_stuck(self._matrix, x, r):
-            x = self._factorised().solve(r, ACCURACY)
-        return x
+        return self._solved(r, ACCURACY, 100 * ACCURACY)
 
     def solve_transposed(self, weights: Floats) -> Floats:
         """By the same method."""
-        assert self._solver is not None
-        found = self._solver.solve_transposed(weights, ACCURACY)
-        if self._is_stuck(self._matrix.T, found, weights):
-            found = self._factorised().solve_transposed(weights, ACCURACY)
-        return found
+        return self._solved(weights, ACCURACY, 100 * ACCURACY, transposed=True)
 
-    def _is_stuck(self, matrix: Any, x: Floats, r: Floats) -> bool:
-        """Whether there is another choice than the iteration that found x, and it got nowhere."""
-        if not (isinstance(self._solver, Krylov) and self._has_choice):
-            return False
-        left = float(np.linalg.norm(r - matrix @ x))
-        return not left <= 100 * ACCURACY * float(np.linalg.norm(r))
+    def _solved(
+        self, b: Floats, accuracy: float, most: float, *, transposed: bool = False
+    ) -> Floats:
+        """By factors where the iteration leaves more than `most` of b and there is that choice."""
+        matrix = self._matrix.T if transposed else self._matrix
+        for _ in range(2):
+            assert self._solver is not None
+            solve = self._solver.solve_transposed if transposed else self._solver.solve
+            x = solve(b, accuracy)
+            if not isinstance(self._solver, Krylov):
+                break
+            left = float(np.linalg.norm(b - matrix @ x))
+            self.is_stuck = not left <= most * float(np.linalg.norm(b))
+            if not (self.is_stuck and self._has_choice):
+                break
+            self._solver = linear_solver(self._matrix, "lu", **self._how)
+            self.is_stuck = False
+        return x
 
-    def _factorised(self) -> LinearSolver:
-        self._solver = linear_solver(self._matrix, "lu", **self._how)
-        return self._solver
+    def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
+        """Not finite where an iteration gets stuck: what it has found then bounds nothing."""
+        x = self._solved(r, accuracy, 2.0 * accuracy)
+        return np.full_like(x, math.inf) if self.is_stuck else x
 
     def farthest(self, r: Floats, rounding: float) -> float:
-        """Of what an iteration leaves, some times as far as it leads if it goes on."""
-        if not isinstance(self._solver, Krylov):
-            return super().farthest(r, rounding)
+        """Of what an iteration leaves, some times as far as it leads if it goes on, and as far as
+        what that leaves may lead."""
         x = self._inverted(r)
-        ahead = self._inverted(r - self._matrix @ x)
-        found, left = (float(np.abs(way).max(initial=0.0)) for way in (x, ahead))
-        return found + SAFETY * left + self._spread * rounding
+        found = float(np.abs(x).max(initial=0.0))
+        if isinstance(self._solver, Krylov) and math.isfinite(found):
+            left = r - self._matrix @ x
+            ahead = self._inverted(left)
+            found += SAFETY * float(np.abs(ahead).max(initial=0.0))
+            if math.isfinite(found):
+                rounding += float(np.abs(left - self._matrix @ ahead).max(initial=0.0))
+        return found + (self._spread * rounding if rounding else 0.0)
 
 
 class Floating(Part):
     """A part with modes that no step changes: what their invariants Yᵀ u, Yᵀ A = 0, were, they
     remain. `before` is the share of A that looks back a step: it has a share in the invariants,
-    K = Yᵀ (1 + before). Solves A x + Y μ = r, K x = k; without a solver where modes grow."""
+    K = Yᵀ (1 + before). Solves A x + Y μ = r, K x = k; without a solver where modes grow, or where
+    other modes cost hardly more than nothing."""
 
     def __init__(self, matrix: Any, before: Any, watch: Watch) -> None:
-        self._left = left = _left_kernel(matrix)
+        self._matrix, self._left = matrix, _left_kernel(matrix)
+        left = self._left
         rows = left.T + (left.T @ before if before is not None else 0.0)
         size, modes = left.shape
         solver: LinearSolver | None = None
@@ -196,20 +226,28 @@ class Floating(Part):
                 corner = np.zeros((modes, modes))
                 solver = Dense(np.block([[dense(matrix), left], [rows, corner]]))
             else:
-                solver = _sparse_bordered(matrix, left, np.asarray(rows))
-        super().__init__(size, solver, watch, modes)
+                from scipy.sparse import block_array
 
-    def solve(self, r: Floats, owed: Floats | None = None) -> Floats:
+                bordered = block_array([[matrix, left], [np.asarray(rows), None]], format="csr")
+                solver = SparseLU(bordered, False)
+        super().__init__(size, solver, watch, modes)
+        if solver is not None and not self._spread < TOO_SOFT:
+            self._solver = None
+
+    def solve(self, r: Floats, owed: Floats | None = None, rounding: float = 0.0) -> Floats:
         """By this method."""
-        push = self._left.T @ r
-        large = SINGULAR * max(1.0, float(np.linalg.norm(r)))
-        if (r.any() and self._solver is None) or np.abs(push).max(initial=0.0) > large:
-            raise DriftingError
         if self._solver is None:
+            if r.any():
+                raise TooSoftError
             return np.zeros_like(r)
-        kept = np.zeros(len(push)) if owed is None else self._left.T @ owed
-        b = np.concatenate([r - self._left @ push, kept])
-        return self._solver.solve(b, ACCURACY)[: self._size]
+        push = self._left @ (self._left.T @ r)
+        kept = np.zeros(self._borders) if owed is None else self._left.T @ owed
+        x = self._solver.solve(np.concatenate([r - push, kept]), ACCURACY)[: self._size]
+        terms = abs(self._matrix) @ np.abs(x) + np.abs(r)
+        large = NOTHING * float(terms.max(initial=0.0)) + 8.0 * rounding
+        if not np.abs(push).max(initial=0.0) <= large:
+            raise DriftingError
+        return x
 
     def solve_transposed(self, weights: Floats) -> Floats:
         """By the same method; nothing that pushes the part on for ever has a share."""
@@ -220,28 +258,29 @@ class Floating(Part):
         return np.asarray(found - self._left @ (self._left.T @ found))
 
 
-def _sparse_bordered(matrix: Any, left: Floats, rows: Floats) -> LinearSolver:
-    """Raises LinAlgError where the bordered matrix is singular."""
-    from scipy.sparse import block_array
-
-    solver = SparseLU(block_array([[matrix, left], [rows, None]], format="csr"), False)
-    if not np.abs(solver.solve(np.ones(sum(left.shape)), 0.0)).max() < 1.0 / SINGULAR:
-        raise np.linalg.LinAlgError("modes that grow")
-    return solver
-
-
 def _left_kernel(matrix: Any) -> Floats:
-    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0; of large matrices by inverse
-    iteration: whatever is not in the kernel shrinks by SHIFT / λ a turn."""
-    if matrix.shape[0] <= DENSE:
+    """(unknown, mode): an orthonormal basis of all y with yᵀ A = 0 to rounding; of large matrices
+    by inverse iteration: whatever is not in the kernel shrinks by SHIFT / λ a turn."""
+    size = matrix.shape[0]
+    largest = float(abs(matrix).max()) if size else 0.0
+    if not largest > 0.0:
+        return np.eye(size)
+    nothing = NOTHING * float(abs(matrix).sum(axis=1).max())
+    if size <= DENSE:
         left, values, _ = np.linalg.svd(dense(matrix))
-        found: Floats = left[:, values <= SINGULAR * max(1.0, values.max(initial=0.0))]
+        found: Floats = left[:, values <= nothing]
         return found
     from scipy.sparse import eye_array
 
-    shifted = SparseLU(matrix + SHIFT * eye_array(matrix.shape[0]), is_symmetric(matrix))
-    basis = np.random.default_rng(0).normal(size=(matrix.shape[0], MOST_MODES))
-    for _ in range(4):
-        basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
-    _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
-    return np.asarray(basis @ turned[values <= SINGULAR].T)
+    shift = SHIFT * largest
+    shifted = SparseLU(matrix + shift * eye_array(size), is_symmetric(matrix))
+    count = MODES
+    while True:
+        basis = np.random.default_rng(0).normal(size=(size, count))
+        for _ in range(4):
+            basis = np.linalg.qr(shifted.solve_transposed(basis, 0.0))[0]
+        _, values, turned = np.linalg.svd(matrix.T @ basis, full_matrices=False)
+        some = values <= nothing
+        if not some.all() or count >= min(MOST_MODES, size):
+            return np.asarray(basis @ turned[some].T)
+        count = min(4 * count, MOST_MODES, size)

@@ -119,7 +119,7 @@ def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, 
     the stiffness is symmetric, so that all λ are real."""
     from pbdkit.equilibrium.linearisation import linearised
     from pbdkit.equilibrium.moves import Moves
-    from pbdkit.equilibrium.system import one_thread
+    from pbdkit.equilibrium.system import PUSH, one_thread
 
     system = linearised(scene, rest, scene.experiment.steps, "auto", Watch())
     moves, linear = Moves(scene), scene.experiment.rule.linear
@@ -148,7 +148,7 @@ def _ends(scene: Scene, rest: State, place: NDArray[np.intp]) -> tuple[Complex, 
         """(1 - P)⁻¹ v."""
         nonlocal longest
         size = np.abs(v).max()
-        found = system.solve(planes(v / size), ROUGH * longest)
+        found = system.solve(planes(v / size), ROUGH * longest, rounding=PUSH)
         longest = float(np.abs(found).max())
         return of_followers(size * found)
 

@@ -13,7 +13,7 @@ from pbdkit.equilibrium.breaking.pattern import Pattern, pattern_at
 from pbdkit.equilibrium.breaking.settling_kernel import GOES_ON, SETTLED, write_settling
 from pbdkit.equilibrium.certificate import LINEAR
 from pbdkit.equilibrium.moves import ROUNDING
-from pbdkit.equilibrium.system_parts import SINGULAR
+from pbdkit.equilibrium.system_parts import SOFT
 from pbdkit.experiment.solvers import Stepping
 from pbdkit.registry.blame import blaming
 from pbdkit.results.progress import Watch
@@ -116,7 +116,7 @@ class Settler:
         equation = np.full(raster.kind.size, -1)
         equation[pattern.place] = np.arange(count)
         slots = max(map(len, self._scene.neighbourhood.slots)) + 1
-        facts = [0.0, 0.0, 1.0, pattern.reach, 1.0 / SINGULAR, ROUNDING, LINEAR]
+        facts = [0.0, 0.0, 1.0, pattern.reach, SOFT, ROUNDING, LINEAR]
         planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
         return {

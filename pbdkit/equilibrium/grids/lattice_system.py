@@ -90,7 +90,9 @@ class LatticeSystem(System):
         """Of all solutions and bounds together."""
         return self._iterations
 
-    def solve(self, moves: Floats, tolerance: float, owed: State | None = None) -> Floats:
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
         """Until the jumps of the iteration say that no more than the tolerance is left. Nothing is
         owed: all is held."""
         self._watch.begin("solving")
@@ -206,9 +208,13 @@ class LatticeSystem(System):
         found: Found = self._solver.solve(r, done)
         self._iterations += len(found.jumps)
         if isinstance(found, Descent):
+            if found.indefinite or found.left < 0.0 or any(turn < 0.0 for turn in found.turns):
+                raise IndefiniteError
+            if not math.isfinite(found.left):
+                raise StuckError
             if len(found.steps) > 1:
                 self._smallest = min(self._smallest, found.smallest())
-            if found.indefinite or found.left < 0.0 or self._smallest <= 0.0:
+            if self._smallest <= 0.0:
                 raise IndefiniteError
         return found
 
