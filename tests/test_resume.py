@@ -243,6 +243,186 @@ def test_a_finished_run_is_continued_to_the_longer_one(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shorter.nc", "whole.nc"]
 
 
+BLOCK: dict[str, Any] = {
+    "name": "block",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 5, "rows": 4},
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "rule": {"type": "elastic", "poisson_ratio": 0.3},
+    "frame": {"type": "natural"},
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+        {
+            "select": {"numbers": [20]},
+            "motion": {"type": "displace", "displacement": [0.1, 0.0]},
+        },
+    ],
+    "solver": {"type": "stepping", "relaxation": 0.8, "settle": {"tolerance": 0.1}},
+    "record": {"every": 50},
+}
+"""Settles within 60 steps, unless something is to happen later."""
+TURNS = {"type": "rotation", "centre": [0.0, 3.0], "angle": 2.0, "steps": 130}
+LATER: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "a group": {
+        "leaders": [
+            *BLOCK["leaders"],
+            {
+                "select": {"numbers": [13]},
+                "motion": {"type": "displace", "displacement": [0.0, 0.3]},
+                "from": 150,
+            },
+        ]
+    },
+    "a motion that goes on": {
+        "leaders": [BLOCK["leaders"][0], {"select": {"edge": "right"}, "motion": TURNS}]
+    },
+    "a group that ends": {"leaders": [BLOCK["leaders"][0], BLOCK["leaders"][1] | {"until": 140}]},
+    "a load": {"loads": [{"select": {"edge": "right"}, "force": [0.0, -0.2], "from": 150}]},
+    "a load that ends": {
+        "loads": [{"select": {"edge": "right"}, "force": [0.0, -0.2], "until": 150}]
+    },
+    "an obstacle": {
+        "obstacles": [
+            {
+                "shape": {"type": "disc", "radius": 3.0, "centre": [2.0, 5.9]},
+                "motion": {"type": "displace", "displacement": [0.0, -0.2]},
+                "from": 150,
+            }
+        ]
+    },
+    "a course": {
+        "rule": {
+            "type": "elastic",
+            "poisson_ratio": 0.3,
+            "stiffness": {"steps": [130, 160], "values": [1.0, 0.5]},
+        },
+        "loads": [{"select": {"edge": "right"}, "force": [0.0, -0.02]}],
+    },
+    "a course of a load": {
+        "loads": [
+            {
+                "select": {"edge": "right"},
+                "force": [0.0, {"steps": [40, 150], "values": [-0.01, -0.2]}],
+            }
+        ]
+    },
+    "a rule that is not linear": {
+        "rule": {"type": "distance-weighted"},
+        "frame": {"type": "mean"},
+        "leaders": [
+            BLOCK["leaders"][0],
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "displace", "displacement": [0.6, 0.2]},
+            },
+        ],
+        "solver": BLOCK["solver"] | {"relaxation": 0.5},
+    },
+}
+
+
+@pytest.mark.parametrize("later", LATER)
+@pytest.mark.filterwarnings("ignore:.* (begins|after the last step)")
+def test_a_run_that_settles_is_continued_to_the_longer_one(later: str, tmp_path: Path) -> None:
+    """Whether or not the shorter run has settled, what is to happen after it still does."""
+    given, whole = BLOCK | LATER[later] | {"steps": 400}, tmp_path / "whole.nc"
+    outcome = record(Run(scene_of(given)), NetcdfSink(whole)).outcome
+    assert outcome.status == "settled"
+    assert outcome.steps > (8 if later in ("nothing", "a rule that is not linear") else 129)
+    for shorter in (7, 60):
+        part = tmp_path / f"part-{shorter}.nc"
+        record(Run(scene_of(given | {"steps": shorter})), NetcdfSink(part))
+        found = resumption(part, Watch(), steps=400)
+        assert found is not None
+        found.record()
+        assert_same(whole, part)
+
+
+@pytest.mark.parametrize("later", ["a load", "a rule that is not linear"])
+def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) -> None:
+    given = BLOCK | LATER[later] | {"record": {"every": 1}}
+    whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
+    record(Run(scene_of(given | {"steps": 900})), NetcdfSink(whole))
+    record(Run(scene_of(given | {"steps": 80}), watch=stopping_after(40)), NetcdfSink(part))
+    found = resumption(part, Watch(), steps=900)
+    assert found is not None
+    assert found.record().first > 5
+    assert_same(whole, part)
+
+
+@pytest.mark.filterwarnings("ignore:.* begins to act after the last step")
+def test_an_interrupted_run_is_not_taken_for_a_shorter_one(tmp_path: Path) -> None:
+    """One of 100 steps would have settled before the load that the longer one waits for."""
+    given, part = BLOCK | LATER["a load"] | {"record": {"every": 1}}, tmp_path / "part.nc"
+    record(Run(scene_of(given | {"steps": 900}), watch=stopping_after(40)), NetcdfSink(part))
+    with pytest.raises(pbdkit.ExperimentError, match="of 100 steps looks from step 1 on whether"):
+        resumption(part, Watch(), steps=100)
+    found = resumption(part, Watch())
+    assert found is not None
+    assert found.record().outcome.status == "settled"
+
+
+def test_the_search_for_an_equilibrium_does_not_become_another_one(
+    tensile: dict[str, Any], tmp_path: Path
+) -> None:
+    given, part = tensile | RUNS["equilibrium, fracture"], tmp_path / "part.nc"
+    record(Run(scene_of(given), watch=stopping_after(9)), NetcdfSink(part))
+    steps = given["steps"]
+    with pytest.raises(pbdkit.ExperimentError, match="the way there depends on `steps`"):
+        resumption(part, Watch(), steps=steps + 5)
+    assert resumption(part, Watch(), steps=steps) is not None
+
+
+def test_weights_that_were_chosen_are_those_of_the_longer_run(tmp_path: Path) -> None:
+    """Roles that change between the ends of both runs ask for others."""
+    solver = {"type": "stepping", "relaxation": "auto", "memory": "auto"}
+    given = BLOCK | {"solver": solver}
+    whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
+    record(Run(scene_of(given | {"steps": 60})), NetcdfSink(whole))
+    record(Run(scene_of(given | {"steps": 9})), NetcdfSink(part))
+    for steps in (30, 60):  # what was chosen is known of a run that was itself continued
+        found = resumption(part, Watch(), steps=steps)
+        assert found is not None
+        found.record()
+    assert_same(whole, part)
+    given |= {"leaders": [BLOCK["leaders"][0], BLOCK["leaders"][1] | {"until": 20}]}
+    record(Run(scene_of(given | {"steps": 9})), NetcdfSink(part, True))
+    with pytest.raises(
+        pbdkit.ExperimentError, match=r": the steps were .* relaxation 1\.5782, .* takes 1\.8"
+    ):
+        resumption(part, Watch(), steps=60)
+    found = resumption(part, Watch(), steps=60, anyway=True)
+    assert found is not None
+    assert found.record().outcome.status == "complete"
+    given |= {"steps": 15, "record": {"every": 1}}
+    record(Run(scene_of(given), watch=stopping_after(5)), NetcdfSink(tmp_path / "left.nc"))
+    with pytest.raises(pbdkit.ExperimentError, match=r": the steps were .* takes 1\.8"):
+        resumption(tmp_path / "left.nc", Watch(), steps=60)
+    found = resumption(tmp_path / "left.nc", Watch())
+    assert found is not None
+    assert found.record().outcome.status == "complete"
+
+
+def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None:
+    """A body that loads push and nobody holds has no equilibrium."""
+    given = BLOCK | {
+        "rule": {"type": "springs"},
+        "leaders": [],
+        "loads": [{"select": {"edge": "right"}, "force": [0.01, -0.02]}],
+        "steps": 60,
+    }
+    whole, part = tmp_path / "whole.nc", tmp_path / "part.nc"
+    record(Run(scene_of(given | {"steps": 90})), NetcdfSink(whole))
+    run = Run(scene_of(given))
+    record(run, NetcdfSink(part))
+    assert run.driver.standing()["pace"].bounded[1] == np.inf
+    found = resumption(part, Watch(), steps=90)
+    assert found is not None
+    found.record()
+    assert_same(whole, part)
+
+
 def test_what_cannot_be_continued_is_refused(
     tensile: dict[str, Any], call: Call, tmp_path: Path
 ) -> None:

@@ -135,6 +135,45 @@ def test_it_never_ends_before_the_last_motion_and_change_of_roles(leaders):
     )
 
 
+BEYOND = {
+    "a group": {"leaders": [*PULLED, {"select": {"nearest": [[4.0, 3.0]]}, "from": 9000,
+                                      "motion": {"type": "displace", "displacement": [0, 1]}}]},
+    "a group that swings": {"leaders": [*PULLED, {
+        "select": {"nearest": [[4.0, 3.0]]}, "from": 9000,
+        "motion": {"type": "oscillation", "amplitude": [0.1, 0.0], "period": 9.0}}]},
+    "an obstacle": {"obstacles": [{"shape": {"half_plane": {"point": [0, -1], "normal": [0, 1]}},
+                                   "from": 9000}]},
+    "a load": {"loads": [{"select": {"edge": "top"}, "force": [0.0, 0.1], "from": 9000}]},
+    "a course of a load": {"loads": [{"select": {"edge": "top"}, "from": 9000, "force": [
+        0.0, {"steps": [0, 9500], "values": [0.0, 1.0]}]}]},
+    "a number that changes": {"rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness": {
+        "steps": [9000, 9500], "values": [1.0, 2.0]}}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("beyond", BEYOND)
+@pytest.mark.filterwarnings("ignore:.*(begins|after the last step|end at|last step)")
+def test_what_begins_after_the_last_step_does_not_delay_the_end(beyond):
+    elastic = {"rule": {"type": "elastic", "poisson_ratio": 0.3}, "frame": {"type": "natural"}}
+    parts = {"neighbours": {"type": "chebyshev", "shells": 1}, "tolerance": 0.02, "steps": 2000,
+             "solver": {"relaxation": 0.8, "engine": "numpy"}} | elastic  # fmt: skip
+    plain, ds = run(sheet(5, 4, **parts)), run(sheet(5, 4, **parts | BEYOND[beyond]))
+    assert plain.attrs["status"] == "settled"
+    assert (ds.attrs["status"], steps_of(ds)) == ("settled", steps_of(plain))
+    np.testing.assert_array_equal(ds.position[-1], plain.position[-1])
+
+
+def test_a_load_that_has_ended_does_not_delay_the_end_by_its_course():
+    """Its force would go on to change, and acts on nobody."""
+    force = [0.0, {"steps": [0, 1500], "values": [0.0, 1.0]}]
+    load = {"select": {"edge": "top"}, "force": force, "until": 60}
+    ds = run(sheet(5, 4, rule={"type": "springs"}, frame={"type": "natural"}, loads=[load],
+                   neighbours={"type": "chebyshev", "shells": 1}, solver={"relaxation": 0.8},
+                   tolerance=0.02, steps=3000))  # fmt: skip
+    assert ds.attrs["status"] == "settled"
+    assert 60 < steps_of(ds) < 600
+
+
 def test_a_body_at_rest_has_settled_in_the_first_step():
     ds = run(sheet(leaders=BOTH_ENDS_HELD))
     assert (ds.attrs["status"], steps_of(ds), certificate(ds)["distance"]) == ("settled", 1, 0.0)

@@ -152,6 +152,10 @@ class Foresight:
 
     for rules that are not linear with A linearised at u, the second term to first order, doubled,
     and only where the correction leaves a tenth of the moves at most.
+
+    An outlook follows from the state alone, so that a run that is gone on with has those of the
+    uninterrupted one. Between two of them only factors are kept: iterative solvers remember what
+    they have solved before.
     """
 
     def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
@@ -159,8 +163,6 @@ class Foresight:
         self._moves = Moves(scene)
         self._at_rest: System | None = None
         self._broken = 0
-        self._linear = False
-        self._past_iterations = self._linearisations = 0
 
     def from_(self, state: State) -> Outlook:
         """The outlook from the end of a step, which is left as it is.
@@ -174,20 +176,20 @@ class Foresight:
     def _from(self, state: State) -> Outlook:
         u, previous = (np.array(u, np.float64) for u in (state.u, state.previous))
         here = replace(state, u=u, previous=previous)
-        broken = broken_bonds(state)
-        if self._at_rest is None or broken != self._broken:
-            self._at_rest, self._broken = self._linearised(here, np.zeros_like(u)), broken
-            bare = not self._scene.barriers
-            self._linear = bare and self._is_linear(here, self._at_rest)
-        if self._linear:
-            return self._outlook(here, self._at_rest)
-        known = self._linearised(here, u)
-        found = self._outlook(here, known, anew=True)
-        self._past_iterations += known.iterations
-        return found
+        if not self._scene.barriers:
+            at_rest = self._system_at_rest(here)
+            if self._is_linear(here, at_rest):
+                return self._outlook(here, at_rest)
+        return self._outlook(here, self._linearised(here, u), anew=True)
+
+    def _system_at_rest(self, here: State) -> System:
+        system, broken = self._at_rest, broken_bonds(here)
+        if system is None or broken != self._broken or system.iterations:
+            system = self._linearised(here, np.zeros_like(here.u))
+            self._at_rest, self._broken = system, broken
+        return system
 
     def _linearised(self, state: State, u: Floats) -> System:
-        self._linearisations += 1
         at, steps = replace(state, u=u), self._scene.experiment.steps
         return linearised(self._scene, at, steps, "auto", self._watch)
 
@@ -207,12 +209,10 @@ class Foresight:
             if anew and not np.abs(left).max(initial=0.0) <= most:
                 distance, obstacle = math.inf, BENT
         distance = math.inf if math.isnan(distance) else distance
-        assert self._at_rest is not None
-        own = known.iterations if anew else 0
         certificate = Certificate(
             method=known.methods,
-            iterations=self._linearisations,
-            inner_iterations=self._past_iterations + self._at_rest.iterations + own,
+            iterations=1,
+            inner_iterations=known.iterations,
             residual=float(np.abs(moves).max(initial=0.0)),
             distance=distance,
             share=distance / self._scale,

@@ -80,7 +80,7 @@ class Pace:
     def _wait(self, step: int, steps: float) -> None:
         elapsed = step - self.begin
         least, most = max(1, elapsed // FINEST), max(1, elapsed // COARSEST)
-        self.next_look = step + math.ceil(min(max(steps, least), most))
+        self.next_look = step + math.ceil(min(max(least, steps), most))
 
 
 def _rate(earlier: tuple[int, float], later: tuple[int, float]) -> float:
@@ -130,13 +130,16 @@ class Settling:
 
     def look(self, state: State) -> Certificate | None:
         """At the end of that step: the certificate where the run has settled. Raises StoppedError
-        where the watch says so; then it has not looked."""
-        before = replace(self.pace)
+        where the watch says so. Neither changes the pace: another look finds the same."""
+        before, found = replace(self.pace), None
         try:
-            return self._look(state)
+            found = self._look(state)
         except StoppedError:
             self.pace = before
             raise
+        if found:
+            self.pace = before
+        return found
 
     def _look(self, state: State) -> Certificate | None:
         with np.errstate(all="ignore"):

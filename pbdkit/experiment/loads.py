@@ -59,6 +59,10 @@ class Load(Strict):
         gone = 0.0 if self.until is None else min(max(moment - self.until, 0.0), 1.0)
         return come - gone
 
+    def last(self, steps: int) -> int:
+        """The last step of a run of `steps` in which it acts."""
+        return steps if self.until is None else min(self.until, steps)
+
     def changes(self) -> tuple[int, ...]:
         """The steps in which it begins and ceases to act."""
         return (self.from_,) if self.until is None else (self.from_, self.until + 1)

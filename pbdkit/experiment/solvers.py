@@ -116,7 +116,13 @@ class Stepping(Solver):
     @property
     def is_open(self) -> bool:
         """Whether a number is yet to be chosen for the scene."""
-        return "auto" in (self.asked_relaxation, self.asked_memory)
+        return bool(self.open_parameters)
+
+    @property
+    def open_parameters(self) -> tuple[str, ...]:
+        """The names of the numbers that are yet to be chosen for the scene."""
+        asked = {"relaxation": self.asked_relaxation, "memory": self.asked_memory}
+        return tuple(name for name, number in asked.items() if number == "auto")
 
     @property
     def courses(self) -> dict[str, Course[float]]:

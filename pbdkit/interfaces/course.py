@@ -63,6 +63,14 @@ class Course(Strict, Generic[Value]):
         ways = zip(self.steps, pairwise(slopes), strict=True)
         return tuple(step for step, (before, after) in ways if before != after)
 
+    def bends_within(self, begin: int, end: int) -> list[int]:
+        """The bends between two steps, both included, and the second where it still changes there;
+        none where the second comes first."""
+        if end < begin:
+            return []
+        found = [bend for bend in self.bends if begin <= bend <= end]
+        return found if end in found or self.next_change(end - 1) > end else [*found, end]
+
     def next_change(self, step: int) -> float:
         """The first step after `step` at whose end it is another than at that one's; infinite where
         there is none."""

@@ -33,12 +33,14 @@ class DividedRun(Run):
     states of the part. Raises what any run does, in all processes."""
 
     def __init__(self, ranks: Ranks, scene: Scene, watch: Watch) -> None:
+        chosen = scene.experiment.stepping.open_parameters
         scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
         with ranks.agreeing():
             parts = CUTS[kind].subdomains(scene, ranks.size)
         self.division = Division(ranks, scene, parts)
         self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
         self.driver = DRIVERS[kind](self.division, scene, watch)
+        self.driver.chosen = chosen
         bound = wave_bound(scene)
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
@@ -82,6 +84,10 @@ class SharingRanks(Ranks):
     def scene(self, experiment: Experiment) -> Scene:
         """Each what it needs for its part."""
         return built(self, experiment)
+
+    def tuned(self, scene: Scene) -> Scene:
+        """Each its part of the scene, with the numbers that are found for the whole."""
+        return _tuned(self, scene)
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """Each its part."""

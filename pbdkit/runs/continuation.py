@@ -73,7 +73,9 @@ def _is_like(found: Any, own: Any) -> bool:
         return found.keys() == {"array"} and (own is None or isinstance(own, dict))
     if isinstance(own, str) or isinstance(found, str):
         return isinstance(own, str) and isinstance(found, str)
-    return found is None or (isinstance(found, int | float) and abs(found) < 2**63)
+    if isinstance(found, float):
+        return not isinstance(own, int)  # infinite is what a run may find, and no step
+    return found is None or (isinstance(found, int) and abs(found) < 2**63)
 
 
 def _parts(scene: Scene, own_standing: dict[str, Any], standing: Standing) -> dict[str, Any]:

@@ -52,12 +52,14 @@ class Run:
     def __init__(
         self, scene: Scene, *, start: State | None = None, watch: Watch | None = None
     ) -> None:
+        chosen = scene.experiment.stepping.open_parameters
         self.scene = scene = tuned(scene)
         self.outcome: Outcome | None = None
         """How the run ended; None until it has."""
         with _located(scene):
             make = DRIVERS[type(scene.experiment.solver)]
             self.driver = make(scene, start or initial_state(scene), watch or Watch())
+        self.driver.chosen = chosen
 
     def __iter__(self) -> Iterator[State]:
         with _located(self.scene):

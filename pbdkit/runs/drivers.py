@@ -8,6 +8,7 @@ from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
 from pbdkit.scene.scene import Scene
@@ -18,7 +19,7 @@ from pbdkit.stepping.state import State
 if TYPE_CHECKING:
     from pbdkit.equilibrium.certificate import Certificate
     from pbdkit.equilibrium.increments import Way
-    from pbdkit.equilibrium.settlement import Settling
+    from pbdkit.equilibrium.settlement import Pace, Settling
 
 States = Generator[State, None, Outcome]
 
@@ -37,6 +38,8 @@ class Driver(ABC):
         self.scene, self.state, self.watch = scene, state, watch
         self.ending = False
         self.stopped: Outcome | None = None
+        self.chosen: tuple[str, ...] = ()
+        """The parameters of the solver that were `auto`, and are numbers now."""
         self.rejection: FloatingPointError | None = None
         """Why whoever looked at the last state could not use it; its next move is up to the
         driver."""
@@ -86,14 +89,28 @@ class Stepwise(Driver):
         return {"state": self.state, "guard": guard, "kept": self.kept, **pace}
 
     def take_up(self, standing: Mapping[str, Any]) -> None:
-        """What follows from the scene is its own: the size of the body, and, where the run has not
-        begun to settle, when to look."""
+        """What follows from the scene is its own: the size of the body, and when to look whether
+        it has settled, where a run of so many steps has not looked by then."""
         self.state, self.kept = standing["state"], standing["kept"]
         is_good = standing["guard"]["good_step"] == self.state.step
         kept = self.state.copy() if is_good else self.guard.kept
         self.guard = replace(self.guard, kept=kept, **standing["guard"])
-        if self.settling and "pace" in standing and standing["pace"].seen:
-            self.settling.pace, self.settling.obstacle = standing["pace"], standing["obstacle"]
+        if self.settling and "pace" in standing:
+            self._take_up_settling(self.settling, standing["pace"], standing["obstacle"])
+
+    def _take_up_settling(self, settling: Settling, pace: Pace, obstacle: str) -> None:
+        step, own = self.state.step, settling.pace
+        if own.next_look > step:  # what is to happen by then, the other run may not have known
+            return
+        if pace.begin != own.begin:
+            experiment = self.scene.experiment
+            text = (
+                f"a run of {experiment.steps} steps looks from step {own.next_look} on whether it "
+                f"has settled, and step {step} was reached without; run it anew, or go on to more "
+                "steps"
+            )
+            raise experiment.located(ExperimentError(text, ("solver", "settle")))
+        settling.pace, settling.obstacle = pace, obstacle
 
     def states(self) -> States:
         """A run that diverges gives out the last good state at its end, where that is later than
@@ -130,12 +147,13 @@ class Stepwise(Driver):
         stops = [experiment.next_wanted(state.step), self.guard.next_look]
         stops += [self.settling.pace.next_look] if self.settling else []
         reached = min(*stops, state.step + self._patience)
-        looks = reached == self.guard.next_look or experiment.records(reached)
+        planned = experiment.recording.keeps(reached, reached + 1)  # by longer runs, too
+        notes = reached == self.guard.next_look or planned
         begun, steps = perf_counter(), reached - state.step
         self.state = self._engine.advance(state, steps)
         self._patience = self._steps_in((perf_counter() - begun) / steps)
-        if looks:
-            self.guard.look(self.scene, self.state)
+        if notes or reached == experiment.steps:
+            self.guard.look(self.scene, self.state, note=notes)
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """How many steps a call takes, where a step takes so long."""

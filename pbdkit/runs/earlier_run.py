@@ -37,10 +37,24 @@ def asked(
     if "finished" in left.facts:
         return None, origin
     source = _source(about, f"{output}, unfinished", steps, left.facts.get("step"))
+    experiment = Experiment.build(source)
+    if steps not in (None, about.get("steps")) and not experiment.solver.makes_steps:
+        raise ExperimentError(
+            f"{output}: an equilibrium is looked for, and the way there depends on `steps`: resume "
+            f"it without --steps, or run it anew with --set steps={steps}"
+        )
     if not anyway:
-        _refuse_versions(output, about, Experiment.build(source))
+        _refuse_versions(output, about, experiment)
         _refuse_changed_file(output, about, origin)
     return source, origin
+
+
+def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """The parameters of the solver that the run has chosen itself."""
+    found = facts.get("chosen", [])
+    if not isinstance(found, list) or not {*found} <= {"relaxation", "memory"}:
+        raise StorageError("what is noted under 'chosen' is damaged")
+    return tuple(found)
 
 
 def longer(

@@ -9,6 +9,7 @@ from typing import Any
 from pbdkit.experiment.model import Experiment
 from pbdkit.results.progress import Watch
 from pbdkit.runs.course import Run
+from pbdkit.runs.tuning import tuned
 from pbdkit.scene.scene import Scene, build_scene
 
 
@@ -30,6 +31,10 @@ class Processes:
     def scene(self, experiment: Experiment) -> Scene:
         """What this one needs of an experiment's scene: here all."""
         return build_scene(experiment)
+
+    def tuned(self, scene: Scene) -> Scene:
+        """The scene with numbers in place of `auto`."""
+        return tuned(scene)
 
     def by_first(self, work: Callable[[], int]) -> int:
         """What the first process alone comes to."""

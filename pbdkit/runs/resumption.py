@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -18,10 +19,15 @@ from pbdkit.results.recorder import Recorder, columns_of
 from pbdkit.results.result_file import reading
 from pbdkit.runs.continuation import take_up
 from pbdkit.runs.course import Report, Run, record
-from pbdkit.runs.earlier_run import asked, history, longer
+from pbdkit.runs.earlier_run import asked, chosen_parameters, history, longer
 from pbdkit.runs.processes import Processes
+from pbdkit.runs.tuning import with_solver
+from pbdkit.scene.scene import Scene
 from pbdkit.storage.run_files import is_unfinished
 from pbdkit.storage.unfinished import UnfinishedRun
+
+SAME_WEIGHT = 1e-6
+"""Relaxation and memory chosen on other machines differ by less."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +93,15 @@ def _unfinished(
 ) -> Resumption | None:
     left: UnfinishedRun | None = None
     standing, source, origin = None, None, dict[str, Any]()
+    chosen, is_same = tuple[str, ...](), True
     try:
         with together.agreeing():
             if together.first:
                 left = UnfinishedRun.open(output, writing=True)
                 source, origin = asked(left, output, steps, anyway)
-        source, origin = together.told((source, origin))
+                chosen = chosen_parameters(left.facts)
+                is_same = steps in (None, left.about.get("steps"))
+        source, origin, chosen, is_same = together.told((source, origin, chosen, is_same))
         sink = NetcdfSink(output, replace=origin.get("replace") is True, origin=origin)
         with together.agreeing(), _damage_named(output):
             if left and source is None:
@@ -102,7 +111,11 @@ def _unfinished(
         if source is None:
             return None
         experiment = Experiment.build(source)
-        run = together.run(together.scene(experiment), watch)
+        scene = together.scene(experiment)
+        if not (is_same or anyway):
+            _refuse_other_weights(f"{output}: ", scene, chosen, together)
+        run = together.run(scene, watch)
+        run.driver.chosen = chosen
         recorder = run.recorder(run.sink(sink))
         with _damage_named(output):
             take_up(run.driver, recorder, standing, together)
@@ -122,14 +135,20 @@ def _continued(
 ) -> Resumption:
     """The result stays as it is until the longer one takes its place."""
     with ExitStack() as open_until_read:
-        source, standing, dataset = None, None, None
+        source, standing, dataset, chosen = None, None, None, tuple[str, ...]()
         with together.agreeing():
             if together.first:
                 dataset = open_until_read.enter_context(reading(output))
                 kept = open_until_read if together.size > 1 else None
                 source, standing = longer(dataset, output, steps, anyway, kept)
-        experiment = Experiment.build(together.told(source))
-        run = together.run(together.scene(experiment), watch)
+                chosen = chosen_parameters(standing.facts)
+        source, chosen = together.told((source, chosen))
+        experiment = Experiment.build(source)
+        scene = together.scene(experiment)
+        if not anyway:
+            _refuse_other_weights("", scene, chosen, together)
+        run = together.run(scene, watch)
+        run.driver.chosen = chosen
         sink = NetcdfSink(output, True, experiment.record.compression)
         recorder, recorded = run.recorder(run.sink(sink)), None
         try:
@@ -144,3 +163,22 @@ def _continued(
             recorder.sink.abandon()
             raise
     return Resumption(run, sink, recorder)
+
+
+def _refuse_other_weights(
+    place: str, scene: Scene, chosen: tuple[str, ...], together: Processes
+) -> None:
+    """Raises ExperimentError where a run of the scene, which has another number of steps, would
+    choose other numbers in place of `auto`; they follow from the roles of the last step."""
+    before = scene.experiment.stepping
+    auto = before.model_copy(update={f"asked_{name}": "auto" for name in chosen})
+    now = together.tuned(with_solver(scene, auto)).experiment.stepping if chosen else before
+    for name in chosen:
+        old, new = getattr(before, name), getattr(now, name)
+        if not math.isclose(old, new, rel_tol=SAME_WEIGHT, abs_tol=SAME_WEIGHT):
+            raise ExperimentError(
+                f"{place}the steps were made with {name} {old:.6g}, chosen for the roles of the "
+                f"shorter run's last step, and a run of {scene.experiment.steps} steps takes "
+                f"{new:.6g}; run it anew with --set steps={scene.experiment.steps}, or --anyway "
+                "goes on with the former"
+            )

@@ -17,6 +17,7 @@ def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standi
     facts = {
         "run": taken_apart(driver.standing(), "run", arrays),
         "seen": taken_apart(recorder.seen, "seen", arrays),
+        "chosen": list(driver.chosen),
         "step": driver.state.step,
         "rate": rate,
         "at": time.time(),

@@ -15,7 +15,7 @@ from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 EVERY = 100
-"""Steps between two looks, at most; recorded steps are looked at too."""
+"""The multiples of so many steps are looked at; recorded steps are, too."""
 KEPT_EVERY = 5000
 """Steps between two copies of the state, at least; what comes after is stepped once more."""
 BEYOND = 1e6
@@ -41,21 +41,25 @@ class Guard:
     def of(cls, scene: Scene, start: State) -> Guard:
         """The guard of a run from that state."""
         kept = start.copy() if start.step else None
-        return cls(size_of(scene) + most_of(start), start.step, start.step + EVERY, kept)
+        return cls(size_of(scene) + most_of(start), start.step, next_multiple(start.step), kept)
 
-    def look(self, scene: Scene, state: State) -> None:
+    def look(self, scene: Scene, state: State, *, note: bool = True) -> None:
         """Raises FloatingPointError, with particle and step, where a displacement is not finite or
-        beyond all bounds."""
-        self.next_look = state.step + EVERY
+        beyond all bounds. A look at which longer runs make none is not to be noted."""
         most = self.most(state)
-        if most <= self.size:
-            self.good_step = state.step
-            if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
-                self.kept = state.copy(self.kept)
+        if note:
+            self.next_look = next_multiple(state.step)
+            self._note(state, most)
         if most <= BEYOND * self.size:
             return
         worst = self.worst(scene, state)
         raise FloatingPointError(f"particle {worst}, found at step {state.step},")
+
+    def _note(self, state: State, most: float) -> None:
+        if most <= self.size:
+            self.good_step = state.step
+            if state.step >= KEPT_EVERY + (self.kept.step if self.kept else 0):
+                self.kept = state.copy(self.kept)
 
     def most(self, state: State) -> float:
         """The largest displacement along an axis."""
@@ -83,6 +87,11 @@ class Guard:
         return None if stopping() else good
 
 
+def next_multiple(step: int) -> int:
+    """The first multiple of `EVERY` after a step."""
+    return (step // EVERY + 1) * EVERY
+
+
 def size_of(scene: Scene) -> float:
     """That of the body and its leaders' ways together."""
     ends = scene.raster.body_ends()
@@ -101,7 +110,8 @@ def most_of(state: State) -> float:
 def way_of(leading: Leading | Barrier, steps: int) -> float:
     """How far a group gets from where it starts, looked at here and there."""
     group = leading.group
-    last = group.last(steps) - group.from_ + 1
+    last, rests = group.last(steps) - group.from_ + 1, group.motion.rests_after()
+    last = last if rests is None else min(last, rests)  # the same however long the run is
     if last < 1:
         return 0.0
     looks = {*np.linspace(1, last, SAMPLES).astype(int).tolist(), *group.motion.knots()}

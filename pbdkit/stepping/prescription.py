@@ -120,17 +120,22 @@ def last_event(scene: Scene) -> int:
     events += bends_of(scene)
     for leading in scene.driven:
         first, last = leading.group.from_, leading.group.last(steps)
-        rests = leading.group.motion.rests_after() or 0
-        moments = (first, last + 1, min(last, first - 1 + rests))
-        events += [step for step in moments if step <= steps]
+        if first <= steps:
+            rests = leading.group.motion.rests_after() or 0
+            events += [first, min(last, first - 1 + rests)]
+            events += [last + 1] if last < steps else []
     return max(events)
 
 
 def bends_of(scene: Scene) -> list[int]:
-    """The moments within the run between which numbers and forces change evenly."""
-    courses = [*scene.experiment.courses.values(), *(scene.loads.courses if scene.loads else ())]
-    steps = scene.experiment.steps
-    return [min(bend, steps) for course in courses for bend in course.bends]
+    """The moments within the run between which numbers and forces change evenly; its end is one
+    where they still change there. The course of a load counts while the load acts."""
+    steps, every = scene.experiment.steps, list(scene.experiment.courses.values())
+    found = [bend for course in every for bend in course.bends_within(0, steps)]
+    for load in scene.loads.each if scene.loads else ():
+        begin, end = load.load.from_, load.load.last(steps)
+        found += [bend for each in load.load.courses for bend in each.bends_within(begin, end)]
+    return found
 
 
 def is_cut_short(leading: Leading | Barrier, steps: int) -> bool:
