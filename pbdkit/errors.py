@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -89,6 +91,14 @@ class StorageError(PbdkitError):
 
 class PbdkitWarning(UserWarning):
     """A run, or its result, deserves a doubt; the text says which, and the remedy."""
+
+
+def warn_caller(text: str) -> None:
+    """Issue a PbdkitWarning at the line outside pbdkit that made the call."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == "pbdkit":
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, PbdkitWarning, stacklevel=level)
 
 
 def dotted(where: Sequence[Any]) -> str:

@@ -24,6 +24,7 @@ from test_engines import (
     assert_bitwise_equal,
     sheet,
 )
+from turning_frame import Turning
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -42,11 +43,11 @@ SHEETS = {
     "by place": {"lattice": LATTICES["oblique"], "rule": RULES["mixed-coordinate-y"]},
     "torn": TEARS,
     "torn, no frame": TEARS | {"frame": {"type": "none"}},
-    "torn, traction-free": TEARS
+    "torn, matrices of a frame": TEARS
     | {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": ELASTIC,
-        "frame": {"type": "traction-free"},
+        "frame": Turning(),
     },
     "strength by bond, cut cells": CUT["square"]
     | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
@@ -90,7 +91,7 @@ SHIPPED = {
     "mixed-coordinate": {"rule": RULES["mixed-coordinate"]}
     | {"fracture": TORN, "frame": FRAMES["first"]},
     "springs": WHOLE | {"fracture": COHESIVE | {"energy": 1e-3}, "frame": {"type": "natural"}},
-    "elastic": WHOLE | {"rule": ELASTIC, "frame": {"type": "traction-free"}},
+    "elastic": WHOLE | {"rule": ELASTIC, "frame": {"type": "none"}},
     "orthotropic": WHOLE
     | {"rule": FIELDS["orthotropic"]["rule"] | {"modulus_ratio": 0.5}, "frame": {"type": "none"}},
     "strain-gradient": TWICE | {"solver": MOVING | {"precision": "float32"}},

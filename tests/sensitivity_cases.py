@@ -71,7 +71,7 @@ RULES = {
     ),
 }  # fmt: skip
 """By name: the rule, what else differs from SHEET, and the parameters."""
-FRAMES = ("none", "natural", "mean", "first", "mirror", "traction-free")
+FRAMES = ("none", "natural", "mean", "first", "mirror")
 BY_DISTANCE = (
     "barycentre", "mean-displacement", "distance-weighted", "mixed-coordinate",
     "mixed-coordinate, y",
@@ -80,7 +80,6 @@ ON_TRIANGLES = ("springs, hexagonal", "elastic, hexagonal")
 REFUSED = {
     "natural": (BY_DISTANCE, "does not work cell by cell"),
     "mirror": (ON_TRIANGLES, "needs a square or rectangular lattice"),
-    "traction-free": (BY_DISTANCE + ON_TRIANGLES, "needs a"),
 }
 """The rules that do not take a frame, and what is said then."""
 RIGHT = {"select": {"edge": "right"}}

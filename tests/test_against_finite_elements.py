@@ -81,24 +81,6 @@ def test_copying_frames_err_as_much_on_every_lattice_and_the_warning_says_so(nam
     assert "(copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever)" in warning
 
 
-@pytest.mark.parametrize(
-    ("name", "cells", "within"),
-    [
-        ("bar", 10, 2.0e-3),
-        ("bar", 20, 8.6e-4),
-        ("bar", 40, 3.45e-4),
-        ("cantilever", 10, 1.3e-3),
-        ("cantilever", 20, 5.1e-4),
-        ("cantilever", 40, 1.95e-4),
-    ],
-)
-def test_traction_free_edges_converge(name, cells, within):
-    problem = PROBLEMS[name]
-    parts = between_edges(problem, cells)
-    u = solved(problem, cells, frame={"type": "traction-free"}, **parts).u
-    assert 0.9 * within < error_at(problem, u, 2 * cells) < within
-
-
 @pytest.mark.parametrize(("cells", "within"), [(20, 2.7e-3), (40, 6.5e-4)])
 def test_a_boundary_layer_of_gradient_elasticity(cells, within):
     assert 0.9 * within < layer.error(cells) < within

@@ -31,14 +31,13 @@ ORTHOTROPIC = {
     "modulus_ratio": 0.3,
     "shear_ratio": 0.2,
 }
-NATURAL, TRACTION_FREE = {"type": "natural"}, {"type": "traction-free"}
+NATURAL = {"type": "natural"}
 MATERIALS = {"stress": STRESS, "auxetic": AUXETIC, "strain": STRAIN, "orthotropic": ORTHOTROPIC}
 GRID = {"type": "grid", "columns": 8, "rows": 6}
 CASES = {
-    f"{name}, {lattice}, {frame['type']}": parts | {"rule": rule, "frame": frame, "body": GRID}
+    f"{name}, {lattice}, natural": parts | {"rule": rule, "frame": NATURAL, "body": GRID}
     for name, rule in MATERIALS.items()
     for lattice, parts in {"square": SQUARE, "rectangular": RECTANGULAR}.items()
-    for frame in (NATURAL, TRACTION_FREE)
 } | {
     f"{name}, hexagonal, natural": HEXAGONAL | {"rule": rule, "frame": NATURAL, "body": GRID}
     for name, rule in MATERIALS.items()

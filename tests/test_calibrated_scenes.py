@@ -20,7 +20,7 @@ ORTHOTROPIC = {
     "shear_ratio": 0.2,
 }
 GRADIENT = {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 2.0}
-NATURAL, FREE, MEAN = {"type": "natural"}, {"type": "traction-free"}, {"type": "mean"}
+NATURAL, MEAN = {"type": "natural"}, {"type": "mean"}
 GRID = {"type": "grid", "columns": 6, "rows": 5}
 DISC = {"type": "disc", "radius": 3.0, "centre": [0.3, 0.1]}
 
@@ -86,16 +86,6 @@ UNFIT = {
         "body",
         "holds no cell of the lattice",
     ),
-    "traction-free disc": (
-        {"frame": FREE, "body": DISC},
-        "frame",
-        "needs a body that fills a rectangle of sites",
-    ),
-    "traction-free barycentre": (
-        {"frame": FREE, "rule": {"type": "barycentre"}},
-        "frame",
-        "needs a rule that is calibrated to one material",
-    ),
 }
 
 
@@ -127,7 +117,7 @@ def test_materials_that_do_not_exist_are_refused(rule, said):
     assert said in str(caught.value)
 
 
-@pytest.mark.parametrize(("frame", "warned"), [(MEAN, True), (NATURAL, False), (FREE, False)])
+@pytest.mark.parametrize(("frame", "warned"), [(MEAN, True), (NATURAL, False)])
 def test_copying_frames_are_warned_of_with_the_size_of_the_error(frame, warned):
     said = [w for w in scene(frame=frame).warnings if "edges are not free of stress" in w]
     assert len(said) == warned

@@ -11,6 +11,7 @@ from interpreted_kernels import interpreting
 from property_cases import FRAMES, LATTICES, NEIGHBOURS, RULES, pull_right
 from remembering_parts import Tiring, Weakest
 from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
+from turning_frame import Turning
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -172,10 +173,10 @@ COMPILED = {
         "rule": RULES["mixed-coordinate-y"],
         "initial": {"type": "noise", "amplitude": 0.1},
     },
-    "free edges that tear": {
+    "matrices of a frame that tears": {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": ELASTIC,
-        "frame": {"type": "traction-free"},
+        "frame": Turning(),
         "fracture": TORN,
     },
     "strength by bond in cut cells": CUT["square"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from finite_elements import weight
 from interpreted_kernels import interpreting
-from test_calibrated_rules import NATURAL, TRACTION_FREE
+from test_calibrated_rules import NATURAL
+from turning_frame import Turning
 
 import pbdkit
 from pbdkit.analysis.operator import step_operator
@@ -199,7 +200,7 @@ def test_forces_in_balance_need_no_leader():
     assert strain == pytest.approx(0.01, rel=1e-8)
 
 
-@pytest.mark.parametrize("frame", [NATURAL, TRACTION_FREE, {"type": "mean", "lag": 1}])
+@pytest.mark.parametrize("frame", [NATURAL, Turning(), {"type": "mean", "lag": 1}])
 def test_the_step_operator_knows_loads(frame):
     solver = {"type": "stepping", "relaxation": 0.7, "memory": 0.2}
     start = {"type": "noise", "amplitude": 0.1}

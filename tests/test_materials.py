@@ -54,24 +54,6 @@ def test_the_copying_frame_goes_elsewhere(name, off):
         assert error == pytest.approx(off, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("name", "off"), [("bar", [2.0e-3, 8.6e-4]), ("cantilever", [1.3e-3, 5.1e-4])]
-)
-def test_the_traction_free_frame_converges(name, off):
-    """Its outermost particles lie half a cell inside, on rows of the finer reference."""
-    for cells, error in zip((10, 20), off, strict=True):
-        exact = load(name, 2 * cells).u[:, ::2, 1::2]
-        columns, rows = exact.shape[1:]
-        lattice = f"lattice={{type: square, a: {1 / cells}, origin: [0.0, {0.5 / cells}]}}"
-        body = f"body={{type: grid, columns: {columns}, rows: {rows}}}"
-        ds = run(name, lattice, body, "frame={type: traction-free}", "diagnostics=[]")
-        weights = np.ones(columns)
-        weights[[0, -1]] = 0.5
-        u = on_sites(ds, (columns, rows))
-        squared = [(weights[:, None] * v**2).sum() for v in (u - exact, exact)]
-        assert math.sqrt(squared[0] / squared[1]) == pytest.approx(error, rel=0.03)
-
-
 def test_the_worked_example_finds_the_modulus_that_went_in():
     (given,) = re.findall(r"^```yaml\n(.*?)^```", PAGE.read_text(), re.M | re.S)
     experiment = pbdkit.Experiment.build(read_text(given, PAGE.name))

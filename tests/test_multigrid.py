@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
+from turning_frame import Turning
 
 import pbdkit
 from pbdkit.equilibrium import increments, linear_solver, linearisation, moves
@@ -124,7 +125,7 @@ MORE = {
         frame={"type": "none"},
     ),
     "strain gradient": sheet(rule={"type": "strain-gradient", "poisson_ratio": 0.3, "length": 1.0}),
-    "traction-free": sheet(frame={"type": "traction-free"}),
+    "matrices of a frame": sheet(frame=Turning()),
 }
 
 

@@ -78,9 +78,7 @@ def assert_built_as_cut(given_, size):
         assert part.scene.raster.whole_shape == whole.raster.shape
 
 
-local = st.one_of(experiments(), calibrated_experiments()).filter(
-    lambda parts: parts.get("frame", {}).get("type") != "traction-free"
-)
+local = st.one_of(experiments(), calibrated_experiments())
 
 
 @samples(40)

@@ -20,6 +20,7 @@ from test_ranks import (
     written,
 )
 from thread_ranks import on_ranks
+from turning_frame import Turning
 
 import pbdkit
 from pbdkit.equilibrium.grids import parted_grids
@@ -195,7 +196,7 @@ REFUSED = {
     | {"neighbours": {"type": "chebyshev", "shells": 2}, "frame": {"type": "none"}},
     "an equilibrium by method 'lu'": {"solver": MULTIGRID | {"method": "lu"}},
     "leaders must hold all of the body": {"leaders": []},
-    "its frame show particles nearby": {"frame": {"type": "traction-free"}},
+    "its frame show particles nearby": {"frame": Turning()},
     "each axis move the other or neither": {
         "rule": {"type": "mixed-coordinate", "K": -0.004},
         "frame": {"type": "mean"},

@@ -176,13 +176,6 @@ def test_what_is_no_field_is_left_to_the_parameter(given):
         ),
         (
             {
-                "rule": {"type": "elastic", "poisson_ratio": {"otherwise": 0.3, "disc": 0.2}},
-                "frame": {"type": "traction-free"},
-            },
-            r"frame: 'traction-free' needs a rule that is calibrated to one material",
-        ),
-        (
-            {
                 "fracture": {
                     "type": "damage",
                     "onset": {"x": [0, 8], "y": [0], "values": [[0.05], [0.3]]},

@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -158,7 +158,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", errors.PbdkitWarning)
-            warnings.showwarning = _warn
+            warnings.showwarning = _warn_once()
             refuse_little_memory()
             if COMPLETING in os.environ:
                 import_module("pbdkit.cli.completion").speak_bash()
@@ -178,10 +178,18 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code or 0)
 
 
-def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-    ours = issubclass(category, errors.PbdkitWarning)
-    told = str(message) if ours else f"{category.__name__}: {message}"
-    click.echo(f"warning: {errors.printable(told)}", err=True)
+def _warn_once() -> Callable[..., None]:
+    """Return a `warnings.showwarning` that prints each text once."""
+    printed = set[str]()
+
+    def warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        ours = issubclass(category, errors.PbdkitWarning)
+        text = str(message) if ours else f"{category.__name__}: {message}"
+        if text not in printed:
+            click.echo(f"warning: {errors.printable(text)}", err=True)
+        printed.add(text)
+
+    return warn
 
 
 def _report(error: BaseException) -> int:

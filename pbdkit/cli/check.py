@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -33,16 +35,20 @@ def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bo
     in how many steps it settles, what it takes in time and memory."""
     from pbdkit.api import load
     from pbdkit.cli.waiting import waiting
+    from pbdkit.errors import PbdkitWarning
     from pbdkit.prediction.forecast import forecast
     from pbdkit.runs.course import rehearse
     from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
 
-    loaded = load(experiment, settings=settings)
+    with warnings.catch_warnings(record=True) as of_loading:
+        warnings.simplefilter("always", PbdkitWarning)
+        loaded = load(experiment, settings=settings)
     with waiting(f"checking {loaded.name}", silent=as_json):
         scene = tuned(build_scene(loaded))
         rehearse(scene)
         found = forecast(scene)
+    found = replace(found, warnings=[*(str(w.message) for w in of_loading), *found.warnings])
     if as_json:
         click.echo(json.dumps(found.as_dict()))
         return

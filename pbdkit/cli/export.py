@@ -48,11 +48,10 @@ def export(file: Path, output: Path | None, force: bool) -> None:
 def _scene_of(dataset: xarray.Dataset) -> Scene | None:
     """The scene that the cells are those of; without it, which is told, there are no cells."""
     from pbdkit.errors import PbdkitError
-    from pbdkit.results.carried import experiment_of
-    from pbdkit.scene.scene import build_scene
+    from pbdkit.results.carried import scene_of
 
     try:
-        return build_scene(experiment_of(dataset))
+        return scene_of(dataset, "a grid of cells")
     except PbdkitError as error:
         click.echo(f"warning: without cells, as its experiment is not there: {error}", err=True)
         return None

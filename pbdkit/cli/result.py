@@ -99,13 +99,12 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
     is, or was, from breaking, and what happened around it."""
     from pbdkit.cli.waiting import waiting
-    from pbdkit.results.carried import experiment_of
+    from pbdkit.results.carried import scene_of
     from pbdkit.results.explanation import Explained
     from pbdkit.results.result_file import reading
-    from pbdkit.scene.scene import build_scene
 
     with waiting(f"reading {file}", silent=as_json), reading(file) as dataset:
-        explained = Explained(dataset, build_scene(experiment_of(dataset)))
+        explained = Explained(dataset, scene_of(dataset, "explain"))
         found = _of_one(explained, *bond) if bond else _of_all(explained)
         words = _bond_in_words(found) if bond else _run_in_words(found)
         said = json.dumps(found, default=asdict) if as_json else "\n".join(words)

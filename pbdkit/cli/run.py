@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -19,7 +20,7 @@ from pbdkit.cli.options import (
     set_option,
 )
 from pbdkit.cli.stopping import Stop, asked_to_stop
-from pbdkit.errors import NotSharedError
+from pbdkit.errors import NotSharedError, PbdkitWarning
 
 if TYPE_CHECKING:
     from pbdkit.results.netcdf_sink import NetcdfSink
@@ -58,7 +59,9 @@ def run(
 
     with launched() as processes:
         with processes.agreeing():
-            with folder_kept():
+            with folder_kept(), warnings.catch_warnings():
+                if quiet or not processes.first:
+                    warnings.simplefilter("ignore", PbdkitWarning)
                 loaded = load(experiment, settings=settings)
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if processes.first:

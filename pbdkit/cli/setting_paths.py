@@ -80,13 +80,14 @@ class SettingPaths:
                 yield Place(f"{begun}{key}", MISSING, schema)
 
     def _forms(self, schema: Schema) -> Iterator[Schema]:
-        """The ways to write it, references followed."""
+        """The ways to write it that are not deprecated, references followed."""
         if "$ref" in schema:
             yield from self._forms(self._definitions.get(schema["$ref"].split("/")[-1], {}))
             return
         ways = [way for name in ("anyOf", "oneOf", "allOf") for way in schema.get(name, ())]
         for way in ways:
-            yield from self._forms(way)
+            if not way.get("deprecated"):
+                yield from self._forms(way)
         if not ways or "properties" in schema:
             yield schema
 

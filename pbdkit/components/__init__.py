@@ -13,7 +13,6 @@ COMPONENTS = {
     "rules": "Barycentre MeanDisplacement DistanceWeighted MixedCoordinate Springs",
     "elasticity": "Elastic Orthotropic StrainGradient",
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame Natural",
-    "traction_free": "TractionFree",
     "fracture": "NoFracture Threshold",
     "strain_fracture": "StrainFracture Damage",
     "cohesive_fracture": "Cohesive",

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pbdkit.drawing.labels import in_its_units
 from pbdkit.drawing.series import BLOCK_BYTES, CHOSEN_BY, OF_A_RUN, in_units
 from pbdkit.errors import ExperimentError
-from pbdkit.results.carried import experiment_of
-from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.results.carried import scene_of
+from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:
     import xarray
@@ -90,7 +90,7 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
             f"who moves how far is not known of all members of a sweep (along {', '.join(more)}): "
             "take one with isel, or name x and y"
         )
-    scene = build_scene(experiment_of(dataset))
+    scene = scene_of(dataset, "the way of leaders and obstacles")
     if dim == "obstacle":
         steps = dataset["time"].values
         moved = np.stack([_of_barriers(scene, int(step)) for step in steps])

@@ -30,6 +30,7 @@ from pbdkit.experiment.names import Name, RegionName, Version
 from pbdkit.experiment.obstacles import Obstacle
 from pbdkit.experiment.parts import fault, open_part, report
 from pbdkit.experiment.record import Record
+from pbdkit.experiment.renewal import announce, renewed
 from pbdkit.experiment.sampling import sampled
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
@@ -236,6 +237,7 @@ class Experiment(Strict):
         return found
 
     def _validate(self, parts: dict[str, Any], registry: Registry, source: Source) -> None:
+        parts, source, retired = renewed(parts, source)
         try:
             units = Scales.model_validate({"units": parts.get("units")}).units
             context = {"registry": registry, "folder": source.folder, "units": units}
@@ -245,3 +247,4 @@ class Experiment(Strict):
         except PluginError as error:
             raise PluginError(source.message(error.where, str(error)), error.where) from None
         self._registry, self._source = registry, source
+        announce(retired, source, vars(self))

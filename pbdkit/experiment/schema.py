@@ -12,6 +12,7 @@ from pydantic.json_schema import models_json_schema
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import INTERFACES
 from pbdkit.registry.registry import Registry
+from pbdkit.registry.retired import RETIRED, Retired
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -38,8 +39,20 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
             part["items"] = {"oneOf": choice}
         else:
             kept = {k: v for k, v in part.items() if k == "default"}
+            choice += [_deprecated(one) for one in RETIRED if one.field == field]
             top["properties"][field] = {"oneOf": choice} | kept
     everything = json.dumps([top, definitions], ensure_ascii=False)
     used = sorted(name for name in definitions if f'"#/$defs/{name}"' in everything)
     top |= {"title": "pbdkit experiment", "$defs": {name: definitions[name] for name in used}}
     return {"$schema": DIALECT, "title": top["title"], **top}
+
+
+def _deprecated(retired: Retired) -> dict[str, Any]:
+    return {
+        "additionalProperties": False,
+        "deprecated": True,
+        "description": retired.advice,
+        "properties": {"type": {"const": retired.type, "title": "Type", "type": "string"}},
+        "required": ["type"],
+        "type": "object",
+    }

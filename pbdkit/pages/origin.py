@@ -11,6 +11,7 @@ from pbdkit.errors import PbdkitError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
 from pbdkit.experiment.yaml_text import yaml_text
+from pbdkit.registry.retired import retired_parts
 from pbdkit.results.carried import carried
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ def _type(part: Any) -> str:
 def experiment_text(parts: dict[str, Any]) -> str:
     """The experiment, or the sweep, as YAML; of an experiment without what is default, as far as
     that can be told."""
-    return yaml_text(_brief(parts) if "lattice" in parts else parts)
+    can_be_brief = "lattice" in parts and not retired_parts(parts)
+    return yaml_text(_brief(parts) if can_be_brief else parts)
 
 
 def _brief(parts: dict[str, Any]) -> dict[str, Any]:

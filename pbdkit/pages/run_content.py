@@ -15,9 +15,9 @@ from pbdkit.pages.lattice import bytes_a_particle, moving, resting, spacing_of
 from pbdkit.pages.origin import experiment_text, facts, file_name, title_of
 from pbdkit.pages.settling import settling
 from pbdkit.pages.thinning import thinned
-from pbdkit.results.carried import carried, experiment_of
+from pbdkit.results.carried import carried, scene_of
 from pbdkit.scene.raster import LEADER
-from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:
     import xarray
@@ -35,7 +35,7 @@ class Origin:
 def origin_of(dataset: xarray.Dataset) -> Origin:
     """Of a dataset: a page can be made without it, and then says what is missing."""
     try:
-        return Origin(build_scene(experiment_of(dataset)))
+        return Origin(scene_of(dataset, "the lattice of a page"))
     except PbdkitError as error:
         return Origin(None, str(error))
 

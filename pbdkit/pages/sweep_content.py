@@ -18,8 +18,8 @@ from pbdkit.pages.origin import experiment_text, file_name, made_by, title_of
 from pbdkit.pages.run_content import leaders_of, reference_of
 from pbdkit.pages.sweep_numbers import numbers
 from pbdkit.pages.thinning import Thinning, thinned
-from pbdkit.results.carried import carried, experiment_of
-from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.results.carried import carried, scene_of
+from pbdkit.scene.scene import Scene
 from pbdkit.sweeps.grid import CASE, MESSAGE, STATUS, TEXT, type_alone
 from pbdkit.sweeps.worker import WHOLE
 
@@ -176,6 +176,6 @@ def _scene(asked: dict[str, Any]) -> Scene | None:
         return None
     carrier = xarray.Dataset(attrs={"experiment": json.dumps(experiment)})
     try:
-        return build_scene(experiment_of(carrier))
+        return scene_of(carrier, "the lattice of a page")
     except PbdkitError:
         return None

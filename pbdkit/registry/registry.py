@@ -21,6 +21,7 @@ from pbdkit.registry.discovery import (
     installed_plugins,
 )
 from pbdkit.registry.plugin import checked, load_builtin, loaded
+from pbdkit.registry.retired import is_retired
 
 GIVEN = "components"
 """How classes that were handed over in Python appear among the plugins."""
@@ -176,7 +177,7 @@ def _judged_offer(plugin: Plugin, offer: Offer, plugins: list[Plugin], builtin: 
     if len(own) > 1:
         reason = f"it offers two classes with the type '{name}'; give one of them another"
         return replace(offer, component=None, reason=reason)
-    if _offers([builtin], offer.interface, name):
+    if _offers([builtin], offer.interface, name) or is_retired(offer.interface, name):
         what = f"'{name}' is the name of a built-in {interface_of(offer.component).__name__}"
         remedy = f"{chosen}, or give it another type" if plugin.distribution else "give it another"
         return replace(offer, reason=f"{what}; {remedy}")

@@ -11,6 +11,8 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN
+from pbdkit.registry.retired import refuse_retired
+from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
     import xarray
@@ -28,6 +30,15 @@ def carried(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise StorageError(f"its attribute '{attribute}' is damaged: it holds no map of keys")
     return found
+
+
+def scene_of(dataset: xarray.Dataset, what: str) -> Scene:
+    """Build the scene of the run that made a dataset, which `what` needs.
+
+    Raises ExperimentError where it cannot be built, as where a component of it is retired.
+    """
+    refuse_retired(carried(dataset, "experiment"), what)
+    return build_scene(experiment_of(dataset))
 
 
 def experiment_of(

@@ -10,6 +10,7 @@ from typing import Any
 from pbdkit.errors import StorageError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
+from pbdkit.registry.retired import refuse_retired
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.netcdf import NetcdfFile
 from pbdkit.results.netcdf_sink import reopened
@@ -63,6 +64,7 @@ def unfinished_dataset(output: Path) -> Any:
         seen = put_together(facts["seen"], standing.arrays, kinds)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise StorageError(f"{output}: its store is damaged: {error}") from None
+    refuse_retired(parts, f"{output}, which is unfinished,")
     scene = build_scene(Experiment.build(Source(f"{output}, unfinished", parts)))
     if not isinstance(state, State) or not state.fits(initial_state(scene)):
         raise StorageError(f"{output}: its store holds a state of another experiment")

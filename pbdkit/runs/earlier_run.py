@@ -14,6 +14,7 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_setting
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
+from pbdkit.registry.retired import refuse_retired
 from pbdkit.results.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.results.netcdf_sink import FINAL_STATE
 from pbdkit.storage.pieced_array import PiecedArray
@@ -143,6 +144,7 @@ def _final_state(output: Path, kept: ExitStack | None) -> Standing:
 
 def _source(about: Mapping[str, Any], name: str, steps: int | None, done: Any) -> Source:
     parts = _map(about, "experiment")
+    refuse_retired(parts, f"{name}: going on")
     if steps is not None:
         if isinstance(done, int) and steps <= done:
             raise ExperimentError(f"{name}: {done} steps are done; --steps takes a larger number")

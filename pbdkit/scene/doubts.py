@@ -53,7 +53,7 @@ def doubts_of(
             f"frame: under '{frame.type}' edges are not free of stress, and with the calibrated "
             f"rule '{rule.type}' the result does not converge to elasticity, however fine the "
             "lattice (copying frames err by 6.7 % on a bar in tension, 14.5 % on a cantilever); "
-            "take {type: natural} or {type: traction-free}"
+            "take {type: natural}"
         )
     return doubts
 
