@@ -10,8 +10,15 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
+from pbdkit.equilibrium.certificate import Foresight
+from pbdkit.equilibrium.increments import settle
+from pbdkit.equilibrium.linearisation import linearised
 from pbdkit.equilibrium.load_path import events, moments
+from pbdkit.equilibrium.moves import Moves
+from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.state import initial_state
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 STRAIGHT = {"type": "equilibrium"}
@@ -129,3 +136,49 @@ def test_a_motion_between_two_increments_is_not_skipped():
     solver = STRAIGHT | {"increments": 1}
     torn = run(sheet([HOLD, pulled], steps=60, fracture=fracture, solver=solver))
     assert (torn.broken_step.values >= 0).any()
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
+def test_no_bond_changes_by_more_than_the_tolerance_where_the_way_ends(tolerance):
+    cohesive = {"type": "cohesive", "energy": 6e-4, "onset": 0.01}
+    scene = build_scene(
+        pbdkit.Experiment(
+            **springs([0.07, 0.02], 7, 3)
+            | {
+                "lattice": {"type": "square", "a": 1.0},
+                "neighbours": {"type": "chebyshev"},
+                "rule": {"type": "elastic", "poisson_ratio": 0.3},
+                "fracture": cohesive,
+                "solver": {"type": "equilibrium", "tolerance": tolerance, "increments": 3},
+            }
+        )
+    )
+    state = initial_state(scene)
+    settle(scene, state)
+    before = [value.copy() for value in state.bond_values]
+    assert max(float(value.max()) for value in before) > 0.1
+    Fracturing.of(scene).break_bonds(state.u, state, 1)
+    for old, new in zip(before, state.bond_values, strict=True):
+        assert np.abs(new - old).max() <= tolerance
+
+
+def test_bounds_to_first_order_are_doubled():
+    """Of springs, by the search and of a state on its way."""
+    scene = build_scene(pbdkit.Experiment(**springs([0.5, 1.0])))
+    state = initial_state(scene)
+    certificate = settle(scene, state)
+    moves = Moves(scene)
+    system = linearised(scene, state, 1, "auto", Watch(), moves)
+    rounding = system.amplification * moves.rounding(state.u)
+    once = system.distance(moves.at(state, 1), rounding)
+    assert certificate.linearised
+    assert certificate.distance == pytest.approx(2.0 * once, rel=0.1)
+    state.u[...] += moves.at(state, 1) + 1e-4 * np.sin(state.u)  # off by a little
+    found = Foresight(scene, 1.0, Watch()).from_(state)
+    system = linearised(scene, state, 1, "auto", Watch())
+    correction = found.u - state.u
+    left = system.distance(moves.at(type(state)(**vars(state) | {"u": found.u}), 1),
+                           moves.rounding(found.u))  # fmt: skip
+    way = float(np.hypot(*correction).max())
+    assert found.certificate.distance == pytest.approx(way + 2.0 * left, rel=1e-9)
+    assert 2.0 * left > 1e-6 * way

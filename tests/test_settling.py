@@ -223,6 +223,10 @@ def test_it_does_not_end_before_a_bond_that_breaks_on_the_way_to_equilibrium():
     first = breaks.broken_step.values[breaks.broken_step.values >= 0].min()
     assert first > steps_of(whole)  # without a look at bonds it would have ended before
     assert steps_of(breaks) > first
+    # A limit just beyond is reached by none, which is known once the equilibrium is known better.
+    spared = torn(neck[1] + 1e-3)
+    assert (spared.broken_step == -1).all()
+    assert steps_of(spared) > steps_of(whole) + 10
     holds = torn(2.0 * neck[1])
     assert (holds.broken_step == -1).all()
     assert steps_of(holds) == steps_of(whole)
@@ -421,3 +425,13 @@ def test_parts_that_remember_have_no_known_distance():
     with pytest.raises(pbdkit.ExperimentError, match="'damage' remembers") as refused:
         pbdkit.Experiment(**given)
     assert "leave solver.settle out" in str(refused.value)
+
+
+@pytest.mark.parametrize("memory", [0.9, 0.97])
+def test_what_memory_may_carry_a_body_on_by_counts_as_distance(memory):
+    """A body that memory alone moves goes on by memory/(1 - memory) times its last step."""
+    solver = {"memory": memory, "relaxation": 0.5}
+    ds = run(sheet(solver=solver, tolerance=1e-3, record={"every": 1}))
+    last = np.abs((ds.position[-1] - ds.position[-2]).values).max()
+    assert ds.attrs["status"] == "settled"
+    assert certificate(ds)["distance"] >= memory / (1.0 - memory) * last
