@@ -70,12 +70,29 @@ class Boundary:
 
 def boundaries(scene: Scene, modes: int) -> tuple[Boundary, ...]:
     """Of every group that moves as it was measured. Raises ExperimentError for one that is no
-    line, and for too few particles."""
+    line, for too few particles, and for one that another group leads along the same axis."""
     found = []
     for n, leading in enumerate(scene.leading):
         if isinstance(leading.group.motion, Measured):
+            _refuse_shared(scene, n)
             found.append(Boundary(n, leading, _polynomials(leading.reference, modes, n)))
     return tuple(found)
+
+
+def _refuse_shared(scene: Scene, n: int) -> None:
+    own, steps = scene.leading[n], scene.experiment.steps
+    for k, other in enumerate(scene.leading):
+        alike = {*own.axes} & {*other.axes} and own.group.leads(steps) and other.group.leads(steps)
+        shared = np.intersect1d(own.rows, other.rows)
+        if k != n and alike and len(shared):
+            x, y = scene.raster.reference(shared[:1])[0]
+            raise ExperimentError(
+                f"leader groups {min(k, n)} and {max(k, n)} share the particle at ({x:g}, {y:g}), "
+                "and the displacement of a measured boundary is estimated by itself, so that there "
+                "would be two of it; select it in one group, by a box that ends before the corner, "
+                "or let `modes: 0` take boundaries as they were measured",
+                ("leaders", n, "select"),
+            )
 
 
 def _polynomials(at: Floats, modes: int, n: int) -> Floats:

@@ -20,7 +20,6 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.body import Sites
 from pbdkit.experiment.columns import read_columns
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.parts import closed_part
@@ -128,7 +127,9 @@ class MeasuredField(Measured):
         points, displacements = self.rows[:, :2], self.rows[:, 2:]
         far = np.ones(len(points), bool)
         if self.margin:
-            far = _depth(scene.experiment, points) >= self.margin
+            from pbdkit.fitting.depth import deeper  # shapely is loaded where it is needed
+
+            far = deeper(experiment.body, experiment.lattice, points, self.margin)
         terms = self.distortion.ux, self.distortion.uy
         evidence = FieldEvidence.of(scene, points[far], displacements[far], terms)
         _refuse_other_unit(evidence.points, scene)
@@ -194,14 +195,6 @@ def _refuse_other_unit(points: Floats, scene: Scene) -> None:
             "columns x, y, ux, uy count in the experiment's lattice units: multiply them",
             ("measured", "file"),
         )
-
-
-def _depth(experiment: Experiment, points: Floats) -> Floats:
-    """How far within the body points lie; below 0 outside."""
-    cell, origin = experiment.lattice.cell(), experiment.lattice.origin
-    index = np.linalg.solve(np.array(cell.vectors, float).T, (points - origin).T)
-    index *= np.array(cell.period)[:, None]
-    return -np.asarray(experiment.body.distance(Sites(tuple(index), tuple(points.T))))
 
 
 _Any = Annotated[Measured, closed_part(Measured, MeasuredField, MeasuredTracks, MeasuredCurve)]
