@@ -121,6 +121,26 @@ def test_youngs_modulus_follows_from_a_force(tmp_path):
     assert found.youngs_modulus.value == pytest.approx(70e3, rel=1e-4)
 
 
+def test_the_noise_of_a_force_is_part_of_the_error_of_youngs_modulus(tmp_path):
+    """E is F over what the group carries at E = 1: their relative errors add as squares."""
+    made = plate(lattice={"type": "square", "a": 2.0})
+    measured(made, tmp_path / "field.csv", noise=NOISE)
+    unknown = {"rule.poisson_ratio": [0.0, 0.49]}
+    given = {"file": str(tmp_path / "field.csv"), "noise": NOISE}
+    force = {"group": 1, "value": [3.0, 0.4], "thickness": 2.0}
+    size = np.hypot(3.0, 0.4)
+    fit = {"experiment": made, "unknown": unknown, "measured": given}
+    exact, noisy, noisier = (
+        pbdkit.fit(fit | {"force": force | {"noise": share * size}}).youngs_modulus
+        for share in (0.0, 0.01, 0.2)
+    )
+    assert exact.error > 1e-3 * exact.value
+    for share, each in ((0.01, noisy), (0.2, noisier)):
+        assert each.value == exact.value
+        expected = np.hypot(exact.error, share * exact.value)
+        assert each.error == pytest.approx(expected, rel=1e-9)
+
+
 def test_errors_are_those_of_repeats():
     """Noise on the field and on what is prescribed, as both are measured; the long trial has more
     repeats. Poisson's ratio is off by as much as its standard error says."""

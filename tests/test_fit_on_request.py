@@ -107,6 +107,27 @@ def test_the_posterior_of_a_straight_problem_is_the_normal_one(fit):
     assert np.sqrt(-0.5 / second) == pytest.approx(estimate.error, rel=0.03)
 
 
+def test_the_posterior_of_parameters_is_the_integral_over_all_else(fit):
+    """Boundaries are straight unknowns: the integral of exp(-½ r²) over them is as large as the
+    root of the determinant of JᵀJ is small, which changes with Poisson's ratio."""
+    problem, z = pbdkit.fit(fit).problem, pbdkit.fit(fit).solution.z
+    logs, volumes = [], []
+    for value in (0.02, 0.46):
+        here = np.concatenate([[value], z[1:]])
+        r = problem.residuals(here)
+        others = np.eye(len(here))[1:]
+        columns = np.stack([r - problem.residuals(here + each) for each in others], axis=1)
+        size = np.linalg.norm(columns, axis=0)
+        _, log_determinant = np.linalg.slogdet((columns / size).T @ (columns / size))
+        volumes.append(0.5 * log_determinant + np.log(size).sum())
+        least, *_ = np.linalg.lstsq(columns, r, rcond=None)
+        left = r - columns @ least
+        logs.append(-0.5 * left @ left - volumes[-1])
+    found = [_marginal(problem, z, np.array([value]), 1.0) for value in (0.02, 0.46)]
+    assert abs(volumes[1] - volumes[0]) > 0.05
+    assert found[1] - found[0] == pytest.approx(logs[1] - logs[0], abs=1e-3)
+
+
 def test_what_is_told_twice_leaves_the_posterior_as_it_is(fit):
     """A shift of all is one of the boundaries, and one of the images."""
     twice = fit["measured"] | {"distortion": {"ux": [[0, 0]], "uy": [[0, 0]]}}

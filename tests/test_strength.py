@@ -20,6 +20,7 @@ from pbdkit.fitting.first_break import BondStrains, Elastic, bond_strains, stren
 from pbdkit.fitting.specimens import Specimens, seeded
 from pbdkit.fitting.strength_laws import LAWS, Breaks, weibull_sums
 from pbdkit.fitting.strength_specification import Peaks, is_strength_fit
+from pbdkit.scene.raster import FRAME
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -230,6 +231,26 @@ def test_broken_and_spared_bonds_bear_nothing():
     assert (strains.q[gone] == 0.0).all()
     assert (strains.q[~gone] > 0.0).all()
     assert np.isinf(strains.load_at(np.full(len(gone), 0.1))[gone]).all()
+
+
+@pytest.mark.parametrize("breaks", [False, True])
+def test_bonds_to_the_frame_count_where_they_can_break(breaks):
+    """In a body that is drawn out with its frame all bonds are strained; those to the frame are
+    spared by `frame_bonds: false`, and so they are none of the links that may fail."""
+    framed = sheet(WHOLE | {"frame_bonds": breaks}) | {
+        "rule": {"type": "barycentre"}, "frame": {"type": "mean"},
+    }  # fmt: skip
+    scene = build_scene(pbdkit.Experiment(**framed))
+    state = initial_state(scene)
+    rows = np.arange(scene.raster.count)
+    u = 0.01 * scene.raster.reference(rows).T
+    state.u.reshape(2, -1)[:, scene.raster.place_of(rows)] = u
+    strains = bond_strains(scene, state)
+    framed = (scene.raster.table_kind[scene.bonds.ends] == FRAME).any(axis=1)
+    assert framed.any()
+    assert strains.p[~framed] == pytest.approx(0.01)
+    assert strains.p[framed] == pytest.approx(0.01 if breaks else 0.0)
+    assert strains.merged().count.sum() == (len(framed) if breaks else (~framed).sum())
 
 
 def test_where_the_first_break_is_not_the_failure_it_is_said():
