@@ -21,10 +21,16 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.scene_alike import scene_like
+from pbdkit.fitting.sensitivity import Resting
+from pbdkit.interfaces import FollowerRule, FractureModel
 from pbdkit.interfaces.course import Course
 from pbdkit.prediction.analysis import Analysis
+from pbdkit.prediction.forecast import forecast
+from pbdkit.registry.registry import Registry
 from pbdkit.results.explanation import Explained
+from pbdkit.results.moment import StateMoment
 from pbdkit.results.progress import Watch
+from pbdkit.results.tables import Tables
 from pbdkit.runs.course import Run
 from pbdkit.scene.scene import build_scene
 from pbdkit.sessions.session import Session
@@ -518,3 +524,123 @@ def test_parameters_move_the_frame_too():
     other = Parameter("rule.poisson_ratio").put(one, 0.2)
     found, anew = scene_like(build_scene(one), other), build_scene(other)
     np.testing.assert_array_equal(found.frame.map.weight, anew.frame.map.weight)
+
+
+@pytest.mark.parametrize("frame", ["natural", "mean"])
+def test_sensitivities_are_those_of_the_numbers_in_the_last_step(frame):
+    """How the body answers leaders that go on, where its numbers still change when the run ends."""
+    moved = {"type": "displace", "displacement": [0.1, 0.2]}
+    sheet_ = SHEET | {
+        "rule": {"type": "elastic", "poisson_ratio": course([1, 9], [0.1, 0.45])},
+        "frame": {"type": frame},
+        "leaders": [HELD, {"select": {"edge": "right"}, "motion": moved}],
+        "steps": 4,
+        "solver": {"type": "equilibrium", "tolerance": 1e-12},
+    }
+    resting = Resting.of(pbdkit.Experiment(**sheet_))
+    led = np.zeros_like(resting.state.u)
+    led.reshape(2, -1)[0, resting.scene.leading[1].place] = 1.0
+    expected = resting.change(Parameter("leaders.1.motion.displacement.0"))
+    np.testing.assert_allclose(resting.answer(led), expected, rtol=0, atol=1e-11)
+
+
+def test_parameters_of_selections_select_anew():
+    boxed = {"select": {"box": [7.5, -1.0, 9.0, 9.0]}, "motion": PULLED["motion"]}
+    one = pbdkit.Experiment(**sheet(leaders=[HELD, boxed]))
+    other = Parameter("leaders.1.select.box.0").put(one, 6.5)
+    found = scene_like(build_scene(one), other)
+    assert found.leading[1].rows.tolist() == build_scene(other).leading[1].rows.tolist()
+
+
+def experiment_of(parts):
+    return pbdkit.Experiment(**sheet(**parts))
+
+
+def test_check_looks_at_no_moment_after_the_run():
+    late = {"solver": {"relaxation": course([0, 20, 60, 80], [0.5, 0.8, 5.0, 0.5])}}
+    assert not any("diverge" in w for w in forecast(build_scene(experiment_of(late))).warnings)
+    late["solver"]["relaxation"] = course([0, 60], [5.0, 0.5])
+    told = forecast(build_scene(experiment_of(late))).warnings
+    assert any("at step 30 steps diverge, with solver.relaxation 2.75" in w for w in told)
+
+
+SHIPPED = {
+    "mixed-coordinate": ["K"],
+    "springs": ["stiffness"],
+    "elastic": ["poisson_ratio", "stiffness"],
+    "orthotropic": ["poisson_ratio", "modulus_ratio", "shear_ratio", "stiffness"],
+    "strain-gradient": ["poisson_ratio", "length", "stiffness"],
+    "threshold": ["placement"],
+    "strain": ["failure", "placement"],
+    "damage": ["onset", "failure", "placement"],
+    "cohesive": ["energy", "onset", "placement"],
+}
+"""The numbers of each shipped component that may change."""
+GIVEN = {
+    "orthotropic": {"poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3},
+    "elastic": {"poisson_ratio": 0.3},
+    "strain-gradient": {"poisson_ratio": 0.2, "length": 0.4},
+    "mixed-coordinate": {"K": 0.01},
+    "threshold": {"thresholds": [1.5]},
+    "strain": {"failure": 0.03},
+    "damage": {"onset": 0.02, "failure": 0.05},
+    "cohesive": {"energy": 1e-3, "onset": 0.01},
+}
+MEASURED = [
+    {"type": "stress", "youngs_modulus": 1.0},
+    {"type": "strain-energy", "youngs_modulus": 1.0},
+    {"type": "reaction", "youngs_modulus": 1.0},
+]
+
+
+def test_every_number_that_ships_and_may_change_is_among_those_compared():
+    kinds = (FollowerRule, FractureModel)
+    components = [c for kind in kinds for c in Registry().spellings(kind, installed=False)]
+    known = {c.type_name(): sorted(c.numbers() - {"scatter"}) for c in components}
+    assert {name: sorted(numbers) for name, numbers in SHIPPED.items()} == {
+        name: numbers for name, numbers in known.items() if numbers
+    }
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"), [(kind, number) for kind, own in SHIPPED.items() for number in own]
+)
+def test_states_and_measurements_of_each_step_are_those_of_its_numbers(kind, number):
+    """Of every number that ships, with masses, guides and an obstacle: against a scene built anew
+    for each step."""
+    part = {"type": kind} | GIVEN.get(kind, {})
+    begins = part.get(number, 1.0)
+    part[number] = course([1, 4], [begins, 1.2 * begins])
+    rules = Registry().spellings(FollowerRule, installed=False)
+    field = "rule" if kind in {rule.type_name() for rule in rules} else "fracture"
+    calibrated = field == "fracture" or kind != "mixed-coordinate"
+    push = {"type": "newton", "mass": 5.0, "force": [0.02, 0.005]}
+    wall = {"half_plane": {"point": [0.0, -0.02], "normal": [0.0, 1.0]}}
+    given_ = {
+        "body": {"type": "grid", "columns": 6, "rows": 4},
+        "rule": {"type": "springs"},
+        "frame": NATURAL if calibrated else {"type": "mean"},
+        "leaders": [
+            HELD,
+            {"select": {"edge": "right"}, "motion": push} if calibrated else PULLED,
+            {"select": {"box": [1.5, 2.5, 3.5, 3.5]}, "motion": HELD["motion"], "axes": ["y"]},
+        ],
+        "diagnostics": MEASURED if calibrated else [],
+        "solver": {"relaxation": 0.2},
+        field: part,
+    }
+    if kind != "strain-gradient":
+        rises = {"type": "displace", "displacement": [0.0, 0.05]}
+        given_["obstacles"] = [{"shape": wall, "motion": rises}]
+    scene = build_scene(experiment_of(given_))
+    stepper, tables = Stepper(scene), Tables(scene)
+    state, plain = initial_state(scene), initial_state(scene)
+    for step in range(1, 6):
+        state = stepper.advance(state)
+        anew = build_scene(experiment_of(now(given_, step)))
+        plain = Stepper(anew).advance(plain)
+        np.testing.assert_array_equal(state.u, plain.u)
+        moments_ = StateMoment(state, tables), StateMoment(plain, Tables(anew))
+        for diagnostic in scene.experiment.diagnostics:
+            for one, other in zip(*map(diagnostic.measure, moments_), strict=True):
+                np.testing.assert_array_equal(one, other)

@@ -40,7 +40,7 @@ def least_gap(
     u = _on_particles(field)
 
     def moves(experiment: Experiment) -> Floats:
-        scene = scene_like(field.scene, experiment)
+        scene = scene_like(field.scene, experiment).at(experiment.steps)
         with np.errstate(invalid="ignore"):
             found = Moves(scene, compiles=False).at(replace(state, u=u.copy()), experiment.steps)
         return np.asarray(found)
@@ -83,6 +83,6 @@ def _on_particles(field: FieldObservation) -> Floats:
     u = np.full((scene.axes, *raster.shape), np.nan)
     flat = u.reshape(scene.axes, -1)
     flat[:, raster.place_of(rows)] = known.T
-    if scene.frame:
-        scene.frame.follow(flat, flat)
+    if frame := scene.at(scene.experiment.steps).frame:
+        frame.follow(flat, flat)
     return u

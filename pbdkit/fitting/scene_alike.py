@@ -18,7 +18,9 @@ def scene_like(scene: Scene, experiment: Experiment) -> Scene:
     Raises ExperimentError where they decide which particles there are.
     """
     own = scene.experiment
-    if all(getattr(experiment, name) is getattr(own, name) for name in GEOMETRY):
+    groups = zip(experiment.leaders, own.leaders, strict=True)
+    same_leaders = all(a.select == b.select and a.axes == b.axes for a, b in groups)
+    if same_leaders and all(getattr(experiment, name) is getattr(own, name) for name in GEOMETRY):
         if experiment.leaders is not own.leaders:
             pairs = zip(scene.leading, experiment.leaders, strict=True)
             leading = tuple(replace(leading, group=group) for leading, group in pairs)

@@ -41,7 +41,7 @@ FORMER = 2
 @dataclass(frozen=True)
 class Resting:
     """A scene at its equilibrium; `accuracy` is that of derivatives, as a share of the largest.
-    `finder` knows whether the scene is linear."""
+    `finder` has the numbers of the last step, and knows whether the scene is linear then."""
 
     scene: Scene
     state: State
@@ -80,7 +80,7 @@ class Resting:
                 ("fracture",),
             )
         former = start.lent if isinstance(start, Resting) else ()
-        return cls(scene, state, certificate, finder, accuracy, former)
+        return cls(scene, state, certificate, finder.at(experiment.steps), accuracy, former)
 
     @property
     def lent(self) -> tuple[dict[bytes, Floats], ...]:
@@ -114,7 +114,7 @@ class Resting:
             at = replace(at, u=np.zeros_like(at.u))
         steps, method = self.scene.experiment.steps, self.finder.method
         with one_thread():
-            return linearised(self.scene, at, steps, method, Watch(), self.finder.moves)
+            return linearised(self.finder.scene, at, steps, method, Watch(), self.finder.moves)
 
     def change(self, parameter: Parameter) -> Floats:
         """∂u/∂θ as planes, (axis, sublattice, cell, cell): leaders as they are led, followers as
@@ -175,14 +175,14 @@ class Resting:
 
     def _with_frame(self, shown: Floats | float, change: Floats) -> Floats:
         """Both together, the frame going with the change."""
-        if self.scene.frame:
+        if frame := self.finder.scene.frame:
             flat = change.reshape(len(change), -1)
-            self.scene.frame.follow(flat, flat)
+            frame.follow(flat, flat)
         return shown + change
 
     def _from_frame(self, weights: Floats) -> Floats:
         """What weights of frame points come to at those whom they follow, with the others'."""
-        found, frame = weights.astype(float), self.scene.frame
+        found, frame = weights.astype(float), self.finder.scene.frame
         if frame:
             flat = found.reshape(len(found), -1)
             seen, weight = flat[:, frame.place[frame.map.point]], frame.map.weight

@@ -163,9 +163,10 @@ def _too_short(analysis: Analysis) -> list[str]:
 
 
 def _on_the_way(scene: Scene) -> list[str]:
-    """Where steps diverge with the numbers that they have before the last."""
-    courses = scene.experiment.courses
-    moments = sorted({bend for course in courses.values() for bend in course.bends})[:-1]
+    """Where steps diverge within the run with other numbers than the last."""
+    courses, steps = scene.experiment.courses, scene.experiment.steps
+    bends = sorted({min(bend, steps) for course in courses.values() for bend in course.bends})
+    moments = [n for n in bends if any(c.at(n) != c.last for c in courses.values())]
     found = list[str]()
     for moment in moments[:MOST_MOMENTS] if scene.experiment.solver.makes_steps else ():
         if Analysis(scene.at(moment)).stable is False:
