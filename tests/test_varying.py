@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import random
+import sys
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ import xarray
 from jsonschema import Draft202012Validator
 
 import pbdkit
+from pbdkit.experiment.field_file import read_field
 from pbdkit.interfaces.varying import Gridded, as_varying
 from pbdkit.scene.scene import build_scene
 
@@ -69,6 +73,54 @@ def test_a_variable_of_a_file_is_read_from_beside_the_experiment(tmp_path):
     x, y = np.array([1.0, 4.0]), np.array([2.0, 6.0])
     np.testing.assert_allclose(field.at(x, y, {}), values.interp(x=("n", x), y=("n", y)))
     assert pbdkit.Experiment(**experiment.model_dump(mode="json")) == experiment
+
+
+@pytest.fixture
+def field_file(tmp_path):
+    values = xarray.DataArray(
+        np.arange(1.0, 55.0).reshape(9, 6), {"x": np.arange(9.0), "y": np.arange(6.0)}, ("x", "y")
+    )
+    path = tmp_path / "m.nc"
+    values.to_dataset(name="E").to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def test_a_damaged_field_file_is_refused_by_name_and_in_silence(field_file, monkeypatch):
+    """Whatever the libraries below make of it: bytes changed by chance, the end missing."""
+    noise: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", noise.append)
+    sound, refused = field_file.read_bytes(), list[str]()
+    for seed in range(60):
+        by_chance = random.Random(seed)
+        damaged = bytearray(sound)
+        for _ in range(by_chance.choice([1, 2, 5, 20])):
+            start = by_chance.randrange(len(damaged))
+            damaged[start : start + 8] = by_chance.randbytes(8)
+        field_file.write_bytes(damaged[: by_chance.choice([None, len(damaged) // 2])])
+        try:
+            read_field({"file": "m.nc", "variable": "E"}, field_file.parent)
+        except ValueError as error:
+            refused.append(str(error))
+    gc.collect()
+    assert len(refused) > 20
+    assert all(text.startswith(f"{field_file}") and "\n" not in text for text in refused)
+    assert not noise
+
+
+@pytest.mark.parametrize("fault", [RuntimeError, OSError, AttributeError, ValueError, TypeError])
+def test_what_reading_a_field_raises_names_the_file(field_file, fault, monkeypatch):
+    def fails(*args: Any, **more: Any) -> None:
+        raise fault("Unspecified error in\n  H5DSget_num_scales")
+
+    monkeypatch.setattr(xarray, "open_dataset", fails)
+    text = json.dumps(with_rule(stiffness={"file": "m.nc", "variable": "E"}))
+    (field_file.parent / "plate.yaml").write_text(text)
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        pbdkit.load(field_file.parent / "plate.yaml")
+    assert "rule.stiffness" in str(caught.value)
+    assert str(caught.value).endswith(
+        f"{field_file} cannot be read as netCDF-4: Unspecified error in H5DSget_num_scales"
+    )
 
 
 def test_a_grid_is_bilinear_and_nowhere_else():
