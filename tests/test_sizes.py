@@ -40,6 +40,16 @@ def test_memory_and_output_are_what_check_says(change, tmp_path):
     assert path.stat().st_size / MIB == pytest.approx(said.output_mib, rel=0.05)
 
 
+@pytest.mark.parametrize("change", ["plain", "fracture"])
+def test_small_files_are_as_large_as_check_says(change, tmp_path):
+    """Columns take whole chunks of some MiB, of which the last is padded."""
+    settings = ["body.columns=40", "body.rows=30", "steps=60", "record.every=1", "diagnostics=[]"]
+    scene = build_scene(pbdkit.load("start", settings=[*settings, *CHANGES[change]]))
+    path = tmp_path / "out.nc"
+    record(Run(scene), NetcdfSink(path))
+    assert path.stat().st_size / MIB == pytest.approx(forecast(scene).output_mib, rel=0.05)
+
+
 def test_counts_are_those_of_the_dataset():
     experiment = pbdkit.load("paper/f2", settings=["steps=2"])
     said, ds = forecast(build_scene(experiment)), pbdkit.run(experiment, progress=False)

@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
 from pbdkit.results.layout import Column, Values, When
+from pbdkit.scene.sizes import CHUNK_BYTES, OPEN_CHUNK
 from pbdkit.storage.paged_file import PagedFile
 from pbdkit.storage.pieced_array import PiecedArray
 
-CHUNK_BYTES = 2**20
-"""About a chunk: several entries where they are small, a part of one where they are large. Reading
-the history of a particle touches one chunk a batch, reading a snapshot little more than itself."""
-OPEN_CHUNK = 1024
-"""Entries a chunk along a dimension whose length is known at the end only."""
 LEVEL = 1
 """Of zlib: the next levels cost much and gain little on positions."""
 LABELS = "coordinates"
@@ -133,8 +129,11 @@ class NetcdfFile:
             dim = column.dims[0]
             self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
         dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
+        attributes = column.attributes
+        if column.dtype == "bool":  # as xarray writes it: netCDF has no such type
+            dtype, attributes = "i1", attributes | {"dtype": "bool"}
         variable = self._content.create_variable(column.name, column.dims, dtype, **more)
-        variable.attrs.update(column.attributes)
+        variable.attrs.update(attributes)
         if not column.coordinate and (labels := self._labels({*column.dims})):
             variable.attrs[LABELS] = " ".join(labels)
 

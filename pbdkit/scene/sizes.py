@@ -33,6 +33,17 @@ LOADS, MATERIALS = 60, 250
 GRADIENT, FORCES, TABLES = 250, 160, 40
 """The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
 
+CHUNK_BYTES = 2**20
+"""About a chunk of a file: several entries of a column where they are small, a part of one where
+they are large. Columns take whole chunks. Reading the history of a particle touches one chunk a
+batch, reading a snapshot little more than itself."""
+
+OPEN_CHUNK = 1024
+"""Entries a chunk along a dimension whose length is known at the end only."""
+
+FRAMEWORK, VARIABLE = 40_000, 1500
+"""Bytes of a file besides values: of any, and of each variable that grows or is measured."""
+
 ANEW, ANEW_EACH = 150, 118
 """The same where neighbours are found anew, and a neighbour."""
 
@@ -98,27 +109,34 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     may break."""
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
-    each_time, every_step = 2 * recorded + 1.0, 0
+    records, steps = experiment.recording.count(experiment.steps), experiment.steps + 1
     each_bond = 4 + 2 * 4 + 1 + 12 * experiment.parts_bonds
-    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 1
+    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 2
     once += experiment.shows_bonds * planes * each_bond
+    growing = [(records, particles * size) for size in (2.0 * recorded, 1.0)] + [(records, 8.0)]
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
     of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
     for numbers, owners, renews in (of_bonds, of_particles):
         for number in (n for n in numbers if n.recorded):
             if renews and number.changes:
-                each_time += owners * _bytes_of(number.dtype, recorded)
+                entry = particles * owners * _bytes_of(number.dtype, recorded)
+                growing.append((records, entry))
             else:
                 once += owners * _bytes_of(number.dtype, 8)
-    per_record = math.ceil(particles * each_time)
-    for diagnostic in (d for d in experiment.diagnostics if not d.at_end):
-        entry = _bytes_an_entry(diagnostic, particles, recorded, in_mm=bool(experiment.units))
-        if diagnostic.every_step:
-            every_step += entry
-        else:
-            per_record += entry
-    records = experiment.recording.count(experiment.steps)
-    return math.ceil(particles * once) + records * per_record + (experiment.steps + 1) * every_step
+    for diagnostic in experiment.diagnostics:
+        entries = _bytes_an_entry(diagnostic, particles, recorded, in_mm=bool(experiment.units))
+        count = steps if diagnostic.every_step else records
+        growing += [(1 if diagnostic.at_end else count, entry) for entry in entries]
+    if any(d.every_step for d in experiment.diagnostics):
+        growing.append((steps, 8.0))
+    values = sum(_in_whole_chunks(*column) for column in growing) + particles * once
+    return math.ceil(values) + FRAMEWORK + len(growing) * VARIABLE
+
+
+def _in_whole_chunks(count: int, entry: float) -> float:
+    """The bytes of a column of the file with so many entries of so many bytes."""
+    batch = max(1, min(int(CHUNK_BYTES // max(entry, 1.0)), count))
+    return math.ceil(count / batch) * batch * entry
 
 
 def refuse_too_large(
@@ -152,13 +170,15 @@ def _bytes_of(dtype: str, value: int) -> int:
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 
-def _bytes_an_entry(diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool) -> int:
-    """With `in_mm` lengths stand there twice."""
-    sizes = {"particle": particles, "axis": 2}
+def _bytes_an_entry(
+    diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
+) -> list[float]:
+    """Of each variable in the file; with `in_mm` lengths stand there twice."""
+    sizes = {"particle": particles, "axis": 2, "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
-    return sum(
-        (1 + (in_mm and v.units == LENGTH.lattice))
-        * math.prod(sizes.get(dim, 1) for dim in v.dims)
-        * _bytes_of(v.dtype, recorded)
+    sizes |= {diagnostic.own_dimension: OPEN_CHUNK}
+    return [
+        float(math.prod(sizes.get(dim, 1) for dim in v.dims) * _bytes_of(v.dtype, recorded))
         for v in diagnostic.variables()
-    )
+        for _ in range(1 + (in_mm and v.units == LENGTH.lattice))
+    ]
