@@ -172,3 +172,17 @@ def test_a_diagnostic_of_ones_own_gets_the_cells():
     given = experiment(6, 5, initial={"type": "affine", "gradient": [[0.5, 0.0], [0.0, 0.0]]})
     ds = pbdkit.run(given | {"diagnostics": [Areas()]}, components=[Areas], progress=False)
     assert ds.areas[0] == pytest.approx(1.5 * 20)
+
+
+@pytest.mark.parametrize("sliver", [0.025, 0.05, 0.09, 0.5])
+def test_cells_of_a_fortieth_and_more_belong_to_the_body(sliver):
+    """Its area is that of the outline; below a fiftieth slivers are left out."""
+    rules = {"rule": {"type": "elastic", "poisson_ratio": 0.3}, "frame": {"type": "natural"}}
+    neighbours = {"type": "chebyshev", "shells": 1}
+
+    def area(sliver):
+        body = {"type": "rectangle", "width": 4.0 + sliver, "height": 3.0}
+        return scene_of(body=body, neighbours=neighbours, **rules).cells.share.sum()
+
+    assert area(sliver) == pytest.approx(12.0 + 3.0 * sliver, abs=0.15 * sliver)
+    assert area(0.015) == pytest.approx(12.0, rel=1e-12)

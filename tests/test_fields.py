@@ -40,6 +40,9 @@ FINITE = [
 ]
 
 
+DISC = {"type": "disc", "radius": 1.0, "centre": [0.0, 0.0]}
+
+
 def last(dataset, name):
     """The last values of the body particles: (particle,), or (particle, 3) of a tensor."""
     body = (dataset.kind[-1] != FRAME).values
@@ -100,6 +103,114 @@ def test_affine_deformations_are_exact_on_every_lattice_under_every_rule(lattice
     assert np.isnan(ds.rotation.values[0, frame]).all()
 
 
+def isotropic(nu, plane="stress"):
+    """Hooke's law of plane strains (xx, yy, xy) written out, as (xx, yy, zz, xy) over E."""
+    if plane == "strain":
+        lame, shear = nu / ((1 + nu) * (1 - 2 * nu)), 1 / (2 * (1 + nu))
+
+        def stress(xx, yy, xy):
+            volume = lame * (xx + yy)
+            return volume + 2 * shear * xx, volume + 2 * shear * yy, volume, 2 * shear * xy
+
+        return stress
+    return lambda xx, yy, xy: (
+        (xx + nu * yy) / (1 - nu**2), (yy + nu * xx) / (1 - nu**2), 0.0, xy / (1 + nu)
+    )  # fmt: skip
+
+
+def orthotropic(xx, yy, xy):
+    """With E_y = E/2, ν_xy = .2 and G = .3 E."""
+    compliance = np.array([[1.0, -0.2], [-0.2, 2.0]])
+    return *np.linalg.solve(compliance, [xx, yy]), 0.0, 2 * 0.3 * xy
+
+
+STRAINED = STRESS | {"plane": "strain"}
+SHEARED = {
+    "elastic": (STRESS | {"poisson_ratio": 0.3, "stiffness": 2.0}, isotropic(0.3), 2.0),
+    "plane strain": (STRAINED | {"poisson_ratio": 0.4}, isotropic(0.4, "strain"), 1.0),
+    "of cells": (
+        STRAINED | {"poisson_ratio": {"otherwise": 0.4, "none": 0.1}},
+        isotropic(0.4, "strain"),
+        1.0,
+    ),
+    "orthotropic": (
+        {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3},
+        orthotropic,
+        1.0,
+    ),
+    "springs": ({"type": "springs"}, isotropic(1 / 3), 1.0),
+}  # fmt: skip
+GRADIENTS = {
+    "pure shear": [[0.0, 0.01], [0.01, 0.0]],
+    "simple shear": [[0.0, 0.01], [0.0, 0.0]],
+    "all": [[0.012, 0.02], [-0.005, -0.004]],
+    "tiny": [[1.2e-170, 2e-170], [-5e-171, -4e-171]],
+}
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
+@pytest.mark.parametrize("name", SHEARED)
+def test_stresses_of_affine_deformations_are_those_of_hookes_law(name, gradient):
+    """All components, von Mises of the tensor in space, and principal values in the plane."""
+    rule, law, stiffness = SHEARED[name]
+    given = experiment(initial={"type": "affine", "gradient": gradient}) | SQUARE | {
+        "body": DISC | {"radius": 3.2}, "rule": rule, "frame": NATURAL, "diagnostics": FIELDS,
+        "regions": {"none": DISC | {"centre": [90.0, 0.0]}}, "steps": 1, "leaders": [],
+    }  # fmt: skip
+    with pytest.warns(pbdkit.PbdkitWarning):
+        ds = pbdkit.run(given, progress=False).isel(time=0)
+    small = (np.array(gradient) + np.transpose(gradient)) / 2
+    xx, yy, zz, xy = (E * stiffness * value for value in law(small[0, 0], small[1, 1], small[0, 1]))
+    within = ds.isel(particle=ds.inside.values)
+    scale = max(abs(value) for value in (xx, yy, xy))
+    for part, value in {"xx": xx, "yy": yy, "xy": xy}.items():
+        close(within[f"stress_{part}"].values / scale, value / scale)
+    stress = np.array([[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, zz]])
+    strain = np.pad(small, (0, 1)) + np.diag([0.0, 0.0, -np.trace(small)])
+    for name, tensor, factor in (("stress", stress, 3 / 2), ("strain", strain, 2 / 3)):
+        unit = np.abs(tensor).max()
+        tensor = tensor / unit
+        part = tensor - np.eye(3) * np.trace(tensor) / 3
+        close(within[f"{name}_von_mises"].values / unit, np.sqrt(factor * (part**2).sum()))
+        values = np.linalg.eigvalsh(tensor[:2, :2])[::-1]
+        close(within[f"{name}_principal"].values / unit, values)
+
+
+@pytest.mark.parametrize(
+    ("body", "beyond"),
+    [
+        (DISC | {"radius": 3.2}, lambda x, y: np.hypot(x, y) > 3.2),
+        (
+            {"type": "rectangle", "width": 3.0, "height": 2.6},
+            lambda x, y: np.maximum(np.abs(x - 1.5) - 1.5, np.abs(y - 1.3) - 1.3) > 1e-9,
+        ),
+        (GRID, lambda x, y: x < -1e9),
+        ({"type": "difference", "of": [GRID, DISC]}, lambda x, y: x < -1e9),
+    ],
+    ids=["disc", "rectangle", "grid", "grid less a disc"],
+)
+@pytest.mark.parametrize("frame", ["natural", "mean"])
+@pytest.mark.parametrize("lattice", [SQUARE, HEXAGONAL], ids=["square", "hexagonal"])
+def test_beyond_the_outline_there_is_no_stress(body, beyond, frame, lattice):
+    """Corners of cut cells lie beyond it; sites on it do not."""
+    lattice = lattice | {"lattice": lattice["lattice"] | {"a": 1.0}}
+    given = experiment(steps=1, leaders=[], frame={"type": frame}) | lattice | {
+        "body": body, "rule": STRESS, "diagnostics": [*FIELDS, {"type": "displacement"}],
+        "initial": {"type": "affine", "gradient": [[0.1, 0.02], [0.0, 0.0]]},
+    }  # fmt: skip
+    ds = pbdkit.run(given, progress=False)
+    of_body = (ds.role == 0).values
+    expected = of_body & ~beyond(*ds.reference.values.T)
+    assert ds.inside.dtype == bool
+    np.testing.assert_array_equal(ds.inside, expected)
+    assert expected.any()
+    for name in ("stress_xx", "stress_von_mises", "strain_xy", "strain_principal", "rotation"):
+        values = ds[name].values[-1].reshape(len(expected), -1)
+        np.testing.assert_array_equal(np.isfinite(values).all(axis=1), expected)
+        assert np.isnan(values[~expected]).all()
+    assert np.isfinite(ds.u.values[-1, of_body]).all()
+
+
 @pytest.mark.parametrize("angle", [30.0, 135.0, -90.0])
 def test_a_finite_rotation_strains_nothing(angle):
     turn = math.radians(angle)
@@ -121,7 +232,6 @@ def test_a_finite_rotation_strains_nothing(angle):
     assert abs(float(ds.strain_energy[-1])) < 1e-24
 
 
-DISC = {"type": "disc", "radius": 1.0, "centre": [0.0, 0.0]}
 HOLE = {
     "type": "difference",
     "of": [{"type": "rectangle", "width": 2.0, "height": 2.0}, DISC | {"radius": 0.5}],

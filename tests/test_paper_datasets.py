@@ -22,6 +22,7 @@ BASE = {
     "i": (("particle",), "int32"),
     "j": (("particle",), "int32"),
     "role": (("particle",), "int8"),
+    "inside": (("particle",), "bool"),
     "site": (("particle", "index"), None),
     "reference": (("particle", "axis"), "float64"),
     "position": (("time", "particle", "axis"), "float64"),
@@ -55,8 +56,12 @@ def test_datasets_have_the_names_dims_and_dtypes_of_the_contract(case):
     for name, (dims, dtype) in expected.items():
         assert ds[name].dims == dims, name
         assert dtype is None or ds[name].dtype == dtype, name
-        assert np.issubdtype(ds[name].dtype, np.integer) or dtype == "float64" or name == "axis"
-    labels = {"time", "axis", "number", "particle", "i", "j", "reference", "role", "bond"}
+        assert (
+            np.issubdtype(ds[name].dtype, np.integer)
+            or dtype in ("float64", "bool")
+            or name == "axis"
+        )
+    labels = {"time", "axis", "number", "particle", "i", "j", "reference", "role", "inside", "bond"}
     assert labels <= set(ds.coords)
     assert ds.axis.values.tolist() == ["x", "y"]
     assert np.array_equal(ds.particle, ds.number)

@@ -301,6 +301,42 @@ def test_part_of_a_dataset_is_drawn(torn):
     assert torn.isel(time=8).pbd.plot(color="broken_step").get_title() == "paper/f2, step 8"
 
 
+def test_fields_end_at_the_outline_and_scales_are_of_what_lies_inside():
+    """Cells that the outline cuts are drawn, with the mean of the corners that have a value."""
+    hole = {"type": "disc", "radius": 2.6, "centre": [5.0, 4.0]}
+    plate = {"type": "rectangle", "width": 10.0, "height": 8.0}
+    ds = pbdkit.run(
+        {
+            "name": "hole",
+            "lattice": {"type": "square", "a": 1.0},
+            "body": {"type": "difference", "of": [plate, hole]},
+            "neighbours": {"type": "chebyshev"},
+            "rule": {"type": "elastic", "poisson_ratio": 0.3},
+            "frame": {"type": "natural"},
+            "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
+            "loads": [{"select": {"edge": "right"}, "force": [1e-6, 0.0]}],
+            "steps": 1,
+            "solver": {"type": "equilibrium"},
+            "diagnostics": [{"type": "stress", "youngs_modulus": 1.0}],
+        },
+        progress=False,
+    )
+    distance = np.hypot(*(ds.reference - [5.0, 4.0]).values.T)
+    np.testing.assert_array_equal(ds.inside, distance >= 2.6)
+    image = image_of(ds.pbd.plot(color="stress_von_mises", filled=True))
+    assert image.get_clim()[1] == pytest.approx(float(ds.stress_von_mises.max()))
+    pixels = np.ma.filled(image.get_array(), np.nan)
+    left, right, bottom, top = image.get_extent()
+
+    def drawn(x, y):
+        row, column = (y - bottom) / (top - bottom), (x - left) / (right - left)
+        return np.isfinite(pixels[int(row * pixels.shape[0]), int(column * pixels.shape[1])])
+
+    assert drawn(5.0, 6.8)  # between the outline at 6.6 and the next line of particles
+    assert drawn(2.1, 4.0)
+    assert not drawn(5.0, 4.0)
+
+
 def test_axes_are_drawn_into(torn):
     figure = Figure((8, 4), layout="constrained")
     axes = figure.subplots(1, 2)

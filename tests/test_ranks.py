@@ -183,6 +183,18 @@ OTHERS = {
         "steps": 8,
     },
     "cuts": {"cuts": [{"from": [5.5, -1.0], "to": [5.5, 3.5], "at": 5}]},
+    "cells that the outline cuts": ELASTIC
+    | {
+        "body": {
+            "type": "difference",
+            "of": [
+                {"type": "rectangle", "width": 16.4, "height": 6.3},
+                {"type": "disc", "radius": 2.2, "centre": [8.1, 3.2]},
+            ],
+        },
+        "leaders": [HOLD_LEFT, {"select": {"edge": "top"}, "motion": UP}],
+        "diagnostics": [{"type": "strain"}, {"type": "stress", "youngs_modulus": 1.0}],
+    },
     "a course": {
         "rule": {"type": "mixed-coordinate", "K": {"steps": [0, 20], "values": [0.0, -0.004]}}
     },

@@ -139,6 +139,10 @@ class IsotropicElastic(CellElastic):
             return math.nan, ratios  # no positive stiffness belongs to it
         return 1 / (out_of_plane * (1 - in_plane * in_plane)), ratios
 
+    def through_thickness(self) -> float:
+        """ν in plane strain."""
+        return self.poisson_ratio if self.plane == "strain" else 0.0
+
 
 class Elastic(IsotropicElastic):
     """Isotropic linear elasticity with a Poisson ratio, in plane stress or plane strain.

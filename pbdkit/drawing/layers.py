@@ -36,7 +36,8 @@ class Layer(ABC):
 
 class Field(Layer):
     """A quantity of particles over whole cells, as pixels; particles in none are dots of a size in
-    points, and a pixel where that is next to nothing."""
+    points, and a pixel where that is next to nothing. A corner beyond the outline that has no value
+    takes the mean of the others of its cell."""
 
     def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale, size: float) -> None:
         self._body, self._grid = body, grid
@@ -51,12 +52,16 @@ class Field(Layer):
         cells = self._body.whole_cells(self._body.cells, now.broken)
         valued = np.isfinite(now.values)
         if not valued[self._body.inside].all():
-            cells = cells[valued[cells].all(axis=1)]
+            fillable = (valued | self._body.beyond)[cells].all(axis=1)
+            cells = cells[fillable & valued[cells].any(axis=1)]
         alone = _alone(cells, self._body.inside & valued)
         self._alone.set_offsets(now.position[alone])
         self._alone.set_array(now.values[alone])
-        cells, values = _with(cells, alone), now.values.astype(np.float32)
-        self._image.set_data(self._grid.mean(self._grid.places(now.position)[cells], values[cells]))
+        cells = _with(cells, alone)
+        values = now.values.astype(np.float32)[cells]
+        if not np.isfinite(values).all():
+            values = np.where(np.isfinite(values), values, np.nanmean(values, axis=1)[:, None])
+        self._image.set_data(self._grid.mean(self._grid.places(now.position)[cells], values))
 
 
 class BondField(Layer):

@@ -31,7 +31,8 @@ MEASURED = 50_000
 class Body:
     """What does not change: `reference` (particle, axis), `site` (particle, index), `number`
     (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
-    each bond (bond, 2), and when each broke (bond,), -1 where it did not."""
+    each bond (bond, 2), and when each broke (bond,), -1 where it did not. Of the body `beyond` are
+    corners of cut cells that lie beyond its outline."""
 
     reference: Array
     site: Array
@@ -39,6 +40,7 @@ class Body:
     inside: Array
     ends: Array
     broken_step: Array
+    beyond: Array
 
     @cached_property
     def cells(self) -> Array:
@@ -124,7 +126,10 @@ class Recording:
         reference = dataset["reference"].transpose("particle", "axis").values[rows]
         site = np.stack([dataset[name].values[rows] for name in "ij"], axis=1).astype(np.int64)
         inside = dataset["role"].values[rows] == OF_BODY
-        return Body(reference, site, numbers, inside, ends, broken)
+        beyond = np.zeros(len(rows), bool)
+        if "inside" in dataset.variables:
+            beyond = inside & ~dataset["inside"].values[rows].astype(bool)
+        return Body(reference, site, numbers, inside, ends, broken, beyond)
 
     def row(self, time: int | None) -> int:
         """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""

@@ -33,12 +33,13 @@ class Variable:
     dtype: str = "f8"
     attributes: dict[str, Any] = field(default_factory=dict)
 
-    def is_recordable(self, values: Any, body: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which values can go into the dataset: finite ones, and NaN at frame points."""
+    def is_recordable(self, values: Any, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which values can go into the dataset: finite ones, and NaN at particles that are not
+        `inside` the body's outline, such as frame points."""
         fine: NDArray[np.bool_] = np.isfinite(values)
         if "particle" in self.dims:
             shape = [-1 if dim == "particle" else 1 for dim in self.dims]
-            fine |= np.isnan(values) & ~body.reshape(shape)
+            fine |= np.isnan(values) & ~inside.reshape(shape)
         return fine
 
 
@@ -104,7 +105,8 @@ class CellValues(ABC):
 
         The mean over the cells that meet there, by the share of each that belongs to the body,
         carried on from the middle of those cells to the particle. Cells with a broken bond between
-        corners do not count. NaN at frame points, 0 at body particles without a cell.
+        corners do not count. NaN at frame points, 0 at body particles without a cell. Beyond the
+        outline (`Moment.inside`) it is carried on from the part of the body nearby.
         """
 
 
@@ -116,6 +118,12 @@ class ForceValues(ABC):
     @abstractmethod
     def stiffness(self) -> Stiffness:
         """The material."""
+
+    @property
+    @abstractmethod
+    def through_thickness(self) -> Any:
+        """σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain; one number, or
+        one for each particle."""
 
     @abstractmethod
     def on_particles(self) -> Floats:
@@ -138,6 +146,12 @@ class Moment(ABC):
     @abstractmethod
     def body(self) -> NDArray[np.bool_]:
         """(particle,): which are leaders or followers; the others are frame points."""
+
+    @property
+    @abstractmethod
+    def inside(self) -> NDArray[np.bool_]:
+        """(particle,): which particles of the body lie inside or on its outline; corners of cut
+        cells may lie beyond it."""
 
     @property
     @abstractmethod
@@ -240,11 +254,12 @@ class Diagnostic(Component):
 
     def check(self, particles: int, leader_groups: int) -> None:
         """Raise ExperimentError where it does not go with a scene of so many particles and leader
-        groups. A variable can have a dimension `leader_group`, an entry a group, or
-        `obstacle`."""
+        groups. A variable can have a dimension `leader_group`, an entry a group,
+        `obstacle`, or `principal`, the larger and the smaller principal value in the plane."""
         return
 
     @abstractmethod
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """The values of its variables, one array each, shaped as their `dims` say; finite, but for
-        NaN at frame points in what is measured of the body."""
+        NaN at frame points in what is measured of the body, and at particles that are not
+        `inside` in what has no meaning beyond the outline."""

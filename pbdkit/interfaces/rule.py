@@ -131,6 +131,10 @@ class Calibrated(ABC):
         """The material whose linear elasticity the rule is; None where its parameters leave it
         without one."""
 
+    def through_thickness(self) -> float:
+        """σ_zz over σ_xx + σ_yy: 0 in plane stress, Poisson's ratio in plane strain."""
+        return 0.0
+
     @staticmethod
     @abstractmethod
     def force(total: Any, here: Here, p: Any) -> Any:

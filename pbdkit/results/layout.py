@@ -96,6 +96,7 @@ def base_columns(axes: int = 2) -> list[Column]:
     """What every dataset has, on a lattice with so many axes."""
     each, on, number = ("particle",), When.RECORD, "number of the particle"
     by_site, now = "counted from 1, by site: i, then j", "during the step; at time 0 during step 1"
+    beyond = "corners of cells that the outline cuts may not; stress and strain are NaN there"
     kinds = _flags({"leader": LEADER, "follower": FOLLOWER, "frame": FRAME})
     roles = _flags({"body": OF_BODY, "frame": OF_FRAME})
     return [
@@ -104,6 +105,7 @@ def base_columns(axes: int = 2) -> list[Column]:
         coordinate("number", number, dims=each, comment=by_site),
         *(coordinate(name, f"site index {name}", "i4", each) for name in INDICES[:axes]),
         coordinate("role", "role of the particle", "i1", each, more=roles),
+        coordinate("inside", "whether it lies inside the outline", "bool", each, comment=beyond),
         coordinate("axis", "axis", "str"),
         coordinate("site", "site indices", "i4", (*each, "index")),
         coordinate("reference", "reference position", "f8", (*each, "axis"), units=LENGTH.lattice),
@@ -120,8 +122,8 @@ def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
 
 def optional_columns() -> list[list[Column]]:
     """What only some datasets have, whatever their diagnostics: the table of bonds, when each
-    broke, the coordinate of what is measured at every step, and those of leader groups, of loads
-    and of obstacles."""
+    broke, the coordinate of what is measured at every step, and those of leader groups, of loads,
+    of obstacles and of principal values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"
@@ -142,6 +144,7 @@ def optional_columns() -> list[list[Column]]:
         [coordinate("leader_group", "leader group", comment=place)],
         [coordinate("load", "load", comment=place)],
         [coordinate("obstacle", "obstacle", comment=place)],
+        [coordinate("principal", "principal value", comment="1 the larger one, 2 the smaller one")],
     ]
 
 

@@ -54,6 +54,11 @@ class Measured:
         """Whether anything is measured of each obstacle."""
         return self._shows("obstacle")
 
+    @cached_property
+    def shows_principal(self) -> bool:
+        """Whether principal values are measured."""
+        return self._shows("principal")
+
     def _shows(self, dim: str) -> bool:
         return any(dim in v.dims for d in self._diagnostics for v in d.variables())
 
@@ -70,6 +75,8 @@ class Measured:
             sizes["load"] = len(scene.experiment.loads)
         if self.shows_obstacles:
             sizes["obstacle"] = len(scene.barriers)
+        if self.shows_principal:
+            sizes["principal"] = 2
         return sizes | {name: len(values) for name, values in self.coordinates.items()}
 
     def columns(self) -> list[Column]:
@@ -161,7 +168,7 @@ def _refuse_taken(name: str, taken: set[str], what: str) -> None:
 
 
 def _refuse_infinite(variable: Variable, value: Any, now: Moment, before: int) -> None:
-    fine = variable.is_recordable(value, now.body)
+    fine = variable.is_recordable(value, now.inside)
     if not fine.all():
         place = np.argwhere(~fine)[0]
         whose = (

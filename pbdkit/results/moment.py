@@ -52,6 +52,11 @@ class StateMoment(Moment):
         """The same at every moment."""
         return self._tables.body
 
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """The same at every moment."""
+        return self._tables.inside
+
     @cached_property
     def cells(self) -> StateCells:
         """Made where somebody asks."""
@@ -207,6 +212,11 @@ class StateForces(ForceValues):
                 '"material" or "forces" among the `needs`'
             )
         return stiffness
+
+    @property
+    def through_thickness(self) -> Any:
+        """The rule's, of each particle where fields make it differ."""
+        return self._tables.through_thickness
 
     def on_particles(self) -> Floats:
         """Once a moment, whoever asks."""

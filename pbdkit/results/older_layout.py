@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The dataset itself, or one of version 1 with the names of now: indices and roles of
-    particles, and bonds by number, which were places from 0.
+    """The dataset itself, or an older one with the names of now: indices and roles of particles,
+    and bonds by number, which were places from 0; all of the body counts as inside its outline.
 
     What was measured stays as it was: frame points hold 0 in what is NaN there now.
     """
@@ -30,6 +30,9 @@ def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
     if "particle" in dims.get("kind", ()) and "role" not in found:
         frame = found["kind"].isel(time=0, missing_dims="ignore") == FRAME
         new["role"] = frame.copy(data=np.where(frame, OF_FRAME, OF_BODY))
+    role = new.get("role", found.get("role"))
+    if role is not None and "inside" not in found:
+        new["inside"] = (role.dims, role.values == OF_BODY)
     if dims.get("bond") == ("bond", "end"):
         new["bond_ends"] = found["bond"] + 1
         places = {"crack_bond": found["crack_bond"] + 1} if "crack_bond" in found else {}

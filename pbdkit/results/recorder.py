@@ -71,6 +71,7 @@ class Recorder:
         site = raster.site_table()
         yield {"site": site, **dict(zip(layout.INDICES, site.T, strict=False))}
         yield {"role": np.where(raster.table_kind == FRAME, layout.OF_FRAME, layout.OF_BODY)}
+        yield {"inside": self._tables.inside.astype(np.int8)}
         yield {"reference": raster.reference()}
         if scene.experiment.shows_bonds:
             bonds = scene.bonds
@@ -86,6 +87,8 @@ class Recorder:
             yield {"load": np.arange(len(scene.experiment.loads))}
         if self._measured.shows_obstacles:
             yield {"obstacle": np.arange(len(scene.barriers))}
+        if self._measured.shows_principal:
+            yield {"principal": np.array([1, 2])}
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
@@ -169,6 +172,7 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.shows_leaders,
         measured.shows_loads,
         measured.shows_obstacles,
+        measured.shows_principal,
     )
     some = chain(*compress(layout.optional_columns(), wanted))
     all_of_them = [*layout.base_columns(scene.axes), *some, *measured.columns()]

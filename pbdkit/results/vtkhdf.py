@@ -138,7 +138,7 @@ def _put(parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: Gr
     along = {*dims} - {"time", "axis"}
     if parts.name in ELSEWHERE or values.dtype.kind not in "biuf" or "step" in along:
         return
-    where = "PointData" if along == {"particle"} else "FieldData"
+    where = "PointData" if along - {"principal"} == {"particle"} else "FieldData"
     where = "CellData" if along == {"bond"} else where
     order = [d for d in ("time", *sorted(along), "axis") if d in dims]
     whole = values.transpose(*order)

@@ -213,8 +213,8 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
             values = np.asarray(found[variable.name])
             sizes = dict(zip(variable.dims, values.shape, strict=False))
             if values.dtype.kind == "f" and sizes.get("particle") == len(moment.body):
-                # NaN may stand at frame points.
-                allowed = np.isnan(values) & variable.is_recordable(values, moment.body)
+                # NaN may stand at frame points, and beyond the outline.
+                allowed = np.isnan(values) & variable.is_recordable(values, moment.inside)
                 found[variable.name] = np.where(allowed, 0.0, values)
         return found
 

@@ -149,7 +149,7 @@ def measures_what_it_declares(subject: Subject) -> None:
     diagnostic, scene, own = subject.component, subject.scene, subject.component.own_dimension
     sizes = {"particle": scene.raster.count, "axis": 2, "leader_group": len(scene.leading)}
     sizes |= {"load": len(scene.experiment.loads)}
-    sizes["obstacle"] = len(scene.barriers)
+    sizes |= {"obstacle": len(scene.barriers), "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     variables = diagnostic.variables()
     measured = [np.asarray(value) for value in diagnostic.measure(moment_of(scene, 0))]
