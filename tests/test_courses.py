@@ -178,13 +178,22 @@ def test_kernels_follow_courses_to_the_bit(name, request):
     assert same(one, other)
 
 
-def test_kernels_follow_courses_in_single_precision():
-    parts = CHANGING["both"] | {"rule": {"type": "mean-displacement"}}
+@pytest.mark.parametrize("name", ["both", "memory"])
+def test_kernels_follow_courses_in_single_precision(name, request):
+    """As nearly as it goes: kernels and numpy round differently there. One is compiled, the other
+    interpreted."""
+    parts = CHANGING[name]
+    if name == "both":
+        request.getfixturevalue("interpreted")
     one, other = (
         pbdkit.run(sheet(engine=engine, precision="float32", **parts), progress=False)
         for engine in ("numpy", "compiled")
     )
-    assert same(one, other)
+    np.testing.assert_allclose(other.position, one.position, rtol=0.0, atol=1e-6)
+    double = pbdkit.run(sheet(**parts), progress=False)
+    np.testing.assert_allclose(other.position, double.position, rtol=0.0, atol=1e-5)
+    if "broken_step" in one:
+        np.testing.assert_array_equal(other.broken_step, one.broken_step)
 
 
 @pytest.mark.parametrize("name", sorted(set(CHANGING) - set(COMPILED)))

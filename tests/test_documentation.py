@@ -127,6 +127,18 @@ def assert_served_until_interrupted(line):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
+def test_tables_are_in_one_piece(page):
+    """Rows that follow no head and no other row are shown as raw text, and cells beyond the head
+    not at all."""
+    text = re.sub(r"^(```+).*?^\1$", "", page.read_text(), flags=re.M | re.S)
+    for table in re.findall(r"(?:^\|.*\n?)+", text, re.M):
+        head, rule, *rows = [*table.splitlines(), ""]
+        assert re.fullmatch(r"\|( *:?-+:? *\|)+ *", rule), head
+        for row in [head, *filter(None, rows)]:
+            assert len(re.findall(r"(?<!\\)\|", row)) == rule.count("|"), row
+
+
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=lambda p: p.name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         if not target.startswith("http"):

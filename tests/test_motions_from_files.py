@@ -98,6 +98,20 @@ def test_what_is_linear_is_interpolated_exactly(tmp_path, points, select):
     assert np.array_equal(pbdkit.rerun(ds, progress=False).u, ds.u)
 
 
+def test_a_measured_motion_starts_where_the_particle_then_is(tmp_path):
+    """As every other motion; the displacement is that of the place at rest all the same."""
+    path = written(tmp_path, "{type: measured, file: data.csv}", measured(SCATTER))
+    given = pbdkit.load(path).model_dump(by_alias=True, mode="json")
+    (late,) = given["leaders"]
+    first = {"select": late["select"], "motion": {"type": "displace", "displacement": [0.3, 0.1]}}
+    given["leaders"] = [first | {"until": 2}, late | {"from": 4}]
+    ds = pbdkit.run(given, progress=False)
+    led = ds.kind.values[-1] == 0
+    u, exact = ds.u.values[:, led], np.stack(plane(*ds.reference.values[led].T), axis=1)
+    assert not np.allclose(u[2], u[3])
+    np.testing.assert_allclose(u[-1], u[3] + exact, atol=1e-15)
+
+
 def test_many_points_travel_in_the_result(tmp_path):
     """An attribute of some megabytes."""
     points = np.random.default_rng(0).uniform(-1.0, 6.0, (30_000, 2)).round(12)

@@ -115,10 +115,16 @@ def is_whole(right: Any) -> bool:
 def test_a_signal_leaves_a_run_to_go_on_with(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, name: str, code: int
 ) -> None:
-    right = whole(call)
-    with monkeypatch.context() as patch:
-        before_keeping(patch, 3, lambda: os.kill(os.getpid(), getattr(signal, name)))
-        found = call("run", "e.json", "-o", str(OUT))
+    right, number = whole(call), getattr(signal, name)
+    inherited = signal.getsignal(number)
+    if inherited is signal.SIG_IGN:  # as under nohup, where the program ignores it, too
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        with monkeypatch.context() as patch:
+            before_keeping(patch, 3, lambda: os.kill(os.getpid(), number))
+            found = call("run", "e.json", "-o", str(OUT))
+    finally:
+        signal.signal(number, inherited)
     assert found.code == code
     assert "pbdkit resume out.nc" in found.err
     assert call("resume", str(OUT)).code == 0

@@ -19,8 +19,9 @@ ON_EDGE = 1e-7
 
 
 class Measured(Motion):
-    """Moves each particle by the displacement measured where it lies at rest: linear on the
-    Delaunay triangles of the points, or along the line on which they lie; within `ramp` steps.
+    """Moves each particle by the displacement measured where it lies at rest, from where it then
+    is: linear on the Delaunay triangles of the points, or along the line on which they lie; within
+    `ramp` steps.
     `outside` says what of particles beyond the points: they are refused, or take the value of the
     nearest point.
 
