@@ -165,6 +165,22 @@ def test_who_goes_back_and_does_something_forgets_what_came_after(tmp_path):
     assert found["memory"] == {"steps": [3, 4], "values": [0.0, 0.25]}
 
 
+def test_a_turn_at_the_step_that_one_goes_back_to_is_forgotten(tmp_path):
+    """It holds from the step after that one on, and was made after it."""
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(5)
+    do(session, do="turn", name="solver.relaxation", value=0.5)
+    session.advance(5)
+    do(session, do="rewind", step=5)
+    do(session, do="turn", name="solver.memory", value=0.25)
+    session.advance(3)
+    found = session.script.written(session.step)["solver"]
+    assert found["relaxation"] == 1.0
+    assert found["memory"] == {"steps": [5, 6], "values": [0.0, 0.25]}
+    do(session, do="save")
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
 def test_steps_that_cannot_be_made_forget_the_states_after_them(tmp_path, monkeypatch):
     session, said = session_of("paper/a", tmp_path)
     for _ in range(10):

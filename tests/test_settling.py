@@ -232,6 +232,49 @@ def test_it_does_not_end_before_a_bond_that_breaks_on_the_way_to_equilibrium():
     assert steps_of(holds) == steps_of(whole)
 
 
+SWINGING = {"memory": 0.8, "relaxation": 0.5}
+
+
+def test_it_does_not_end_while_a_bond_may_break_farther_than_the_equilibrium():
+    """What memory carries the body on by counts, at both ends of the bond."""
+    pulled = {"select": NECK["leaders"][1]["select"],
+              "motion": {"type": "displace", "displacement": [1.0, 0.0]}}  # fmt: skip
+    parts = NECK | {"leaders": [NECK["leaders"][0], pulled], "solver": SWINGING}
+
+    def torn(threshold, **more):
+        fracture = {"type": "threshold", "thresholds": [threshold], "fictitious": "reference"}
+        return run(sheet(**parts, tolerance=0.1, fracture=fracture, **more))
+
+    whole, rest = torn(9.0), run(sheet(**parts, tolerance=1e-10))
+    neck = float(rest.position[-1, 1, 0] - rest.position[-1, 0, 0])
+    last = torn(9.0, record={"at": [steps_of(whole) - 1]}).position.diff("time")[-1]
+    carried = float(np.abs(last).max()) * 0.8 / (1.0 - 0.8)
+    distance = certificate(whole)["distance"]
+    assert 0.2 * distance < carried < 0.3 * distance
+    # The octagon around a circle reaches 1.09 times as far.
+    for beyond, waits in ((1.5, True), (1.9, True), (2.3, False)):
+        ds = torn(neck + beyond * distance)
+        assert (ds.broken_step == -1).all()
+        assert (steps_of(ds) > steps_of(whole)) == waits
+    early = torn(neck + 1.9 * distance, steps=steps_of(whole))
+    assert "a bond may break on the last" in early.attrs["stop_reason"]
+
+
+@pytest.mark.parametrize(("memory", "lag"), [(0.8, 0), (-0.4, 0), (0.0, 1)])
+def test_what_carries_the_body_on_is_part_of_the_distance(memory, lag):
+    """|b| / (1 - |b|) times the last step for memory b, once it for a frame that lags: beside the
+    true distance, which is that of the correction to rounding here."""
+    solver = {"memory": memory, "relaxation": 0.5, "engine": "numpy"}
+    given_ = sheet(solver=solver, frame="lag" if lag else "mean", tolerance=0.05)
+    ds = run(given_)
+    assert ds.attrs["status"] == "settled"
+    rest, _ = stepped_on(given_, ds)
+    before = run(given_ | {"record": {"at": [steps_of(ds) - 1]}}).position.diff("time")[-1]
+    carried = (abs(memory) / (1.0 - abs(memory)) + lag) * float(np.abs(before).max())
+    assert carried > 0.005 * error_of(ds, rest)
+    assert certificate(ds)["distance"] == pytest.approx(error_of(ds, rest) + carried, rel=1e-6)
+
+
 def test_nonlinear_rules_settle_where_leaders_hold_them():
     rule, solver = {"type": "distance-weighted"}, {"relaxation": 0.5}
     given_ = sheet(rule=rule, solver=solver, leaders=[HOLD_LEFT, pull_right(0.6, 0.2)])

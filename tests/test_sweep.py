@@ -404,6 +404,19 @@ def test_bonds_and_what_is_measured_at_every_step_are_joined(small):
         np.testing.assert_array_equal(member.broken_bonds, alone.broken_bonds)
 
 
+def test_what_only_some_members_have_is_theirs_alone(small):
+    """Though it is the same in all that have it."""
+    none, torn = {"type": "none"}, {"type": "threshold", "thresholds": [1.05]}
+    small["diagnostics"] = []
+    found = swept(small, vary={"fracture": [none, torn]})
+    assert found.shell.dims == ("fracture", "bond")
+    assert (found.shell[0] == found.shell.attrs["fill_value"]).all()
+    assert (found.shell[1] == 1).all()
+    assert found.site.dims == ("particle", "index")
+    found = swept(small | {"fracture": torn}, vary={"fracture.placement": [1.0, 0.9]})
+    assert found.shell.dims == ("bond",)
+
+
 def test_under_fire(tmp_path):
     found = under_fire(tmp_path, members=40, kills=1, workers=2)
     assert found == {"exit": 0, "killed": 1, "right": 40, "wrong": 0, "run again": 0}

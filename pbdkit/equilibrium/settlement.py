@@ -163,7 +163,7 @@ class Settling:
             return f"{at} {outlook.obstacle or 'nothing bounds the distance from equilibrium'}"
         if distance > self._tolerance:
             return f"{at} within {distance:.2g} of equilibrium, not within {self._tolerance:.2g}"
-        ahead = 2.0 * outlook.certificate.distance  # at both ends of a bond
+        ahead = 2.0 * distance  # at both ends of a bond
         if self._fracturing and self._fracturing.may_break(outlook.u, state, ahead):
             return f"{at} a bond may break on the last {distance:.2g} to equilibrium"
         return ""
