@@ -21,7 +21,7 @@ from pbdkit.results.carried import carried
 from pbdkit.results.carried import experiment_of as experiment_of
 from pbdkit.results.progress import Watch, progress_bar
 from pbdkit.results.sink import MemorySink
-from pbdkit.runs.course import Run, record
+from pbdkit.runs.course import FAILED, Run, record
 from pbdkit.runs.tuning import tuned
 from pbdkit.scene.scene import build_scene
 
@@ -56,8 +56,9 @@ def run(experiment: Given, *, components: Components = (), progress: bool = True
 
     `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
     ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
-    DivergedError, with what was recorded before, when the run leaves the finite numbers. Warns,
-    with pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
+    DivergedError, with what was recorded before, when the run leaves the finite numbers, has no
+    equilibrium, or comes apart on the way to one (status "separated"). Warns, with
+    pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
     diverge, and a last state that is inside out.
     """
     return _run(as_experiment(experiment, components), progress)
@@ -71,7 +72,7 @@ def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
         _warn(run.warnings)
         report = record(run, sink)
     dataset = sink.dataset()
-    if report.outcome.status in ("diverged", "unconverged"):
+    if report.outcome.status in FAILED:
         raise DivergedError(report.outcome.stop_reason, dataset)
     _warn(report.warnings)
     return dataset
@@ -135,7 +136,7 @@ def resume(
             return open(path)
         _warn(found.run.warnings)
         report = found.record()
-    if report.outcome.status in ("diverged", "unconverged"):
+    if report.outcome.status in FAILED:
         raise DivergedError(report.outcome.stop_reason)
     _warn(report.warnings)
     return open(found.sink.written)

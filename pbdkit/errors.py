@@ -70,10 +70,10 @@ class PluginError(PbdkitError):
 
 
 class DivergedError(PbdkitError):
-    """A run left all bounds.
+    """A run left all bounds, did not converge to an equilibrium, or came apart on the way to one.
 
-    `dataset` holds what was recorded before, status "diverged"; it is None where the run was
-    writing to a file, which then holds the same.
+    `dataset` holds what was recorded before, status "diverged", "unconverged" or "separated"; it is
+    None where the run was writing to a file, which then holds the same.
     """
 
     exit_status = 4

@@ -86,9 +86,9 @@ def test_an_increment_taken_up_again_comes_out_the_same_to_the_bit(monkeypatch):
     by_kernel(monkeypatch)
     scene = scene_of(fracture=DAMAGE)
     whole, kept = initial_state(scene), None
-    for n, moment in enumerate(increments.increments(scene, whole, Watch())):
+    for n, reached in enumerate(increments.increments(scene, whole, Watch())):
         if n == 0:
-            kept, since = whole.copy(), moment
+            kept, since = whole.copy(), reached.moment
     for _ in increments.increments(scene, kept, Watch(), since):
         pass
     assert (kept.bond_values[-1] > 0.0).any()

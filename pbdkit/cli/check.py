@@ -95,7 +95,9 @@ def _what(loaded: Experiment, scene: Scene, found: Forecast) -> Iterator[Row]:
             shrinks = f"shrinking by a factor of {found.decay:.4g} a step"
             yield "oscillates", f"slowest period {found.period:.4g} steps, {shrinks}"
     else:
-        yield "solver", "goes straight to the equilibrium, to where steps would lead"
+        count = loaded.record_count - 1
+        each = f" of each of {count} recorded steps" if count > 1 else ""
+        yield "solver", f"goes straight to the equilibrium{each}, to where steps would lead"
     time = "" if found.seconds is None else f"{_seconds(found.seconds)} of stepping, "
     memory = f"{found.memory_mib:.3g} MiB of memory, {found.output_mib:.3g} MiB of output"
     yield "takes", f"{time}{memory} (estimates)"
@@ -184,7 +186,7 @@ def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
     from pbdkit.interfaces import RenewsParticles
 
     experiment = scene.experiment
-    records = experiment.recording.count(experiment.steps)
+    records = experiment.record_count
     yield "records", f"{records} states in {experiment.steps} steps, that of time 0 included"
     yield "particles", f"{found.particles}, of which {found.followers} follow in step 1"
     yield "bonds", f"{found.bonds}"

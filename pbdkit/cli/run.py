@@ -20,7 +20,7 @@ from pbdkit.cli.options import (
     set_option,
 )
 from pbdkit.cli.stopping import Stop, asked_to_stop
-from pbdkit.errors import NotSharedError, PbdkitWarning
+from pbdkit.errors import ExperimentError, NotSharedError, PbdkitWarning
 
 if TYPE_CHECKING:
     from pbdkit.results.netcdf_sink import NetcdfSink
@@ -157,6 +157,15 @@ def _told_what_is_kept(path: Path, file: NetcdfSink) -> Iterator[None]:
     try:
         yield
     except NotSharedError:
+        raise
+    except ExperimentError:
+        if file.kept:
+            click.echo(
+                f"what was recorded until then is kept, and `pbdkit plot {path}` draws it; to "
+                "resume would be refused in the same way: change the experiment, and run it with "
+                "--force",
+                err=True,
+            )
         raise
     except BaseException:
         if file.kept:

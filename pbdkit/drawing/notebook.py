@@ -62,7 +62,7 @@ def identity_html(found: Identity) -> str:
 
 def _known(scene: Scene) -> tuple[list[tuple[str, str]], list[str]]:
     experiment, count = scene.experiment, scene.raster.count
-    records = experiment.recording.count(experiment.steps)
+    records = experiment.record_count
     rows = [
         ("lattice", f"{experiment.lattice.type}, body {experiment.body.type}"),
         ("rule", f"{experiment.rule.type}, frame {experiment.frame.type}"),

@@ -25,9 +25,8 @@ from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.moves import Moves
-from pbdkit.equilibrium.system import PUSH, System
+from pbdkit.equilibrium.system import PUSH, NoEquilibriumError, System
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
-from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.frame import Indices
 from pbdkit.results.progress import Watch
 from pbdkit.scene.obstacles import outlines_at
@@ -126,7 +125,7 @@ class ContactSystem(System):
             try:
                 x[some] = part.solve(r[some], None, rounding)
             except DriftingError:
-                raise ExperimentError(
+                raise NoEquilibriumError(
                     f"there is no equilibrium: neither leaders nor obstacles hold a part of "
                     f"{self._named(some)}, and it is pushed on for ever; {REMEDY}",
                     ("obstacles",),
@@ -188,8 +187,8 @@ class ContactSystem(System):
     def _floats(self) -> list[Indices]:
         return [some for some, part in self._parts if isinstance(part, Floating)]
 
-    def _not_unique(self, some: Indices) -> ExperimentError:
-        return ExperimentError(
+    def _not_unique(self, some: Indices) -> NoEquilibriumError:
+        return NoEquilibriumError(
             "there is no unique equilibrium: leaders and obstacles leave a part of "
             f"{self._named(some)} free to slide or turn; {REMEDY}",
             ("obstacles",),

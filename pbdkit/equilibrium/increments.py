@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,14 +15,16 @@ from pbdkit.equilibrium.contact_search import follow_contact
 from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.load_path import last_change, moments, spacings
 from pbdkit.equilibrium.newton import Finder
+from pbdkit.equilibrium.system import NoEquilibriumError
 from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import chosen_engine
 from pbdkit.stepping.cutting import cut_bonds
+from pbdkit.stepping.guard import Guard, most_of, size_of
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.stepping.prescription import last_event, place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 VALUES_A_CALL = 200_000_000
@@ -31,9 +34,33 @@ MOST_SETTLINGS = 2000
 TINY, SMALLEST = 1e-9, 2.0**-12
 """The last part of a way is taken with what is left of it; no part is smaller than the other share
 of its increment."""
+REMEDY = (
+    "To follow what comes after it take solver: {type: stepping, relaxation: auto, memory: auto} "
+    "from there; record: {increments: true} keeps the equilibria within steps"
+)
+"""What is to be done about a body that came apart."""
 MOST_ROUNDS, STEPS_A_ROUND = 40, 50
 """Of steps, where an equilibrium cannot be followed."""
-Way = Generator[float, None, Certificate]
+
+
+class Reached(NamedTuple):
+    """A moment on the way to the last equilibrium, and whether `state` is an equilibrium there.
+
+    The moment and the state that the increments work on decide all that follows. `state` is that
+    one or, under linear rules without fracture, a copy of it that has settled."""
+
+    moment: float
+    state: State
+    at_rest: bool
+    is_last: bool = False
+    """Whether nothing remains to be computed."""
+
+
+Way = Generator[Reached, None, Certificate]
+
+
+class SeparatedError(Exception):
+    """Bonds broke, and what remains has no equilibrium; the state is the last that had one."""
 
 
 def increments(
@@ -43,17 +70,19 @@ def increments(
     since: float = 0.0,
     finder: Finder | None = None,
     engine: Callable[[Scene], Engine] = chosen_engine,
+    stops: Sequence[int] = (),
 ) -> Way:
     """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
-    moment `since`, to the equilibrium of its last step. Gives out the moments reached: they and
-    the state decide all that follows.
+    moment `since`, to the equilibrium of its last step. Yields what is reached on the way; the
+    `stops` are steps before the last one whose equilibria are among it.
 
-    Until roles or loads change for the last time steps are made, so that leaders start, and parts
-    that nothing holds remain, where stepping has them. Where bonds can break, and for rules that
-    are not linear, leaders and loads come in increments instead, within steps too: settle, break
-    what is too long, settle again until nothing breaks.
-    Raises ExperimentError where there is no equilibrium, UnconvergedError, and StoppedError where
-    the watch says so: then the state is the last that had been reached.
+    Under a linear rule without fracture the equilibrium of a step is that of the same experiment
+    with as many steps: until roles or loads change for the last time before it steps are made, so
+    that leaders start, and parts that nothing holds remain, where stepping has them. Where bonds
+    can break, and for rules that are not linear, leaders and loads come in increments instead,
+    within steps too: settle, break what is too long, settle again until nothing breaks.
+    Raises ExperimentError where there is no equilibrium, UnconvergedError, SeparatedError, and
+    StoppedError where the watch says so: then the state is the last that had been reached.
     """
     asked, steps = scene.experiment.solver.sought, scene.experiment.steps
     for n, driven in enumerate(scene.driven):
@@ -69,10 +98,8 @@ def increments(
         finder = finder_of(scene, initial_state(scene) if since or state.step else state, watch)
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
-        return (yield from _load(scene, state, finder, moments(scene, count), since))
-    if (last := last_change(scene)) > state.step:
-        yield from _step_to(last, engine(scene), state, finder)
-    return _settle_at(scene, state, finder, steps)
+        return (yield from _load(scene, state, finder, moments(scene, count), since, stops))
+    return (yield from _of_linear(scene, state, finder, engine, [s for s in stops if s > since]))
 
 
 def settle(
@@ -95,7 +122,40 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
-def _step_to(last: int, engine: Engine, state: State, finder: Finder) -> Iterator[float]:
+def _of_linear(
+    scene: Scene,
+    state: State,
+    finder: Finder,
+    engine: Callable[[Scene], Engine],
+    stops: Sequence[int],
+) -> Way:
+    """The equilibria of some steps and of the last one; the state goes on by steps alone."""
+    steps, settled, stepper, last = scene.experiment.steps, None, None, last_event(scene)
+    for stop in [*stops, steps]:
+        if (change := last_change(scene, stop)) > state.step:
+            stepper = stepper or engine(scene)
+            yield from _step_to(change, stepper, state, finder)
+        if stop == steps:
+            return _settle_at(scene, state, finder, stop)
+        if settled is None or settled.step < last:
+            settled = state.copy()
+            try:
+                _settle_at(scene, settled, finder, stop)
+            except NoEquilibriumError as error:
+                raise NoEquilibriumError(
+                    f"{error} (at step {stop}; `record: {{at: [...]}}` names the steps whose "
+                    "equilibria are found, the last one always)",
+                    *error.args[1:],
+                ) from None
+            except UnconvergedError:
+                vars(state).update(vars(settled), step=stop)
+                raise
+        settled.step = stop
+        yield Reached(stop, settled, at_rest=True)
+    raise AssertionError
+
+
+def _step_to(last: int, engine: Engine, state: State, finder: Finder) -> Iterator[Reached]:
     """Steps, in calls short enough for interruptions to be heard."""
     watch, first = finder.watch, state.step
     watch.begin("stepping until roles and loads change no more")
@@ -104,7 +164,7 @@ def _step_to(last: int, engine: Engine, state: State, finder: Finder) -> Iterato
         reached = engine.advance(state, min(a_call, last - state.step))
         state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
         state.step = reached.step
-        yield state.step
+        yield Reached(state.step, state, at_rest=False)
         watch.look((state.step - first) / (last - first))
 
 
@@ -122,14 +182,24 @@ def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Cer
     return certificate
 
 
-def _load(scene: Scene, state: State, finder: Finder, every: list[float], since: float) -> Way:
+def _load(
+    scene: Scene,
+    state: State,
+    finder: Finder,
+    every: list[float],
+    since: float,
+    stops: Sequence[int],
+) -> Way:
     """In increments up to the last motion or change of roles or loads, breaking bonds on the
     way."""
     certificate: Certificate | None = None
+    last = every[-1]
+    every = sorted({*every, *(stop for stop in stops if stop < last)})
     planned = [moment for moment in every if moment > since] or every[-1:]
     quick = settler_of(scene, finder.tolerance, finder.watch) if finder.linear else None
+    farthest = size_of(scene) + finder.scale
     for moment in planned:
-        finder.watch.load = f"step {moment:.6g} of {planned[-1]:g}, "
+        finder.watch.load = f"step {moment:.6g} of {last:g}, "
         before = state.copy()
         step = math.floor(since) + 1
         try:
@@ -138,18 +208,89 @@ def _load(scene: Scene, state: State, finder: Finder, every: list[float], since:
                 # What gives way to a cut does so under the load at which it is made.
                 _settle_bonds_at(scene, state, finder, since, since, most, step)
             settled, changes = quick.settle(state, moment, most) if quick else (False, 0)
-            if not settled or moment == planned[-1]:  # which is certified
+            if not settled or moment == last:  # which is certified
                 left = max(1, most - changes)
                 certificate = _settle_bonds_at(scene, state, finder, since, moment, left)
+            _refuse_thrown_off(scene, state, farthest)
         except StoppedError:
             vars(state).update(vars(before))
             raise
+        except (NoEquilibriumError, UnconvergedError) as error:
+            failed = state.copy()
+            if not _is_worth_keeping(failed, moment, finder, error):
+                vars(state).update(vars(before))
+            torn = 0 if isinstance(error, NoEquilibriumError) else _torn(before)
+            if _torn(failed) > torn:
+                text = _parting(scene, before, failed, (since, moment), error)
+                raise SeparatedError(text) from None
+            raise
         since = moment
-        if moment < planned[-1]:
-            yield moment
+        if moment < last:
+            yield Reached(moment, state, at_rest=True)
+    # Nothing changes any more: recorded steps after that are the same equilibrium.
+    for stop in (stop for stop in stops if stop >= last):
+        state.step = stop
+        yield Reached(stop, state, at_rest=True, is_last=True)
     state.step = scene.experiment.steps
     assert certificate is not None
     return certificate
+
+
+def _torn(state: State) -> int:
+    """The number of bonds broken or cut since the start."""
+    return 0 if state.broken_step is None else int(np.count_nonzero(state.broken_step > 0))
+
+
+def _refuse_thrown_off(scene: Scene, state: State, farthest: float) -> None:
+    """Raises NoEquilibriumError where bonds broke and a particle has gone farther than the size of
+    the body and all prescribed displacements together: nothing holds it there."""
+    if _torn(state) and not (most := most_of(state)) <= farthest:
+        number = Guard(farthest, 0, 0, None).worst(scene, state)
+        raise NoEquilibriumError(
+            f"particle {number} would be displaced by {most:.6g}, farther than the body is long: "
+            "hardly anything holds it"
+        )
+
+
+def _is_worth_keeping(
+    state: State, moment: float, finder: Finder, error: NoEquilibriumError | UnconvergedError
+) -> bool:
+    """Whether the state at a moment, where an increment has failed, is an equilibrium but for the
+    tolerance: it has a certificate, and no bond breaks or changes in it."""
+    if not (isinstance(error, UnconvergedError) and finder.linear and moment == int(moment)):
+        return False
+    if not math.isfinite(error.certificate.distance):
+        return False
+    scene = finder.scene
+    fracturing = Fracturing.of(scene.at(moment))
+    return not (fracturing and _bonds_change(scene, fracturing, state.copy(), math.ceil(moment)))
+
+
+def _parting(
+    scene: Scene, before: State, failed: State, between: tuple[float, float], error: Exception
+) -> str:
+    """The message of a body that came apart between two moments: where, why, and the remedy."""
+    since, moment = between
+    assert before.broken_step is not None
+    assert failed.broken_step is not None
+    bonds, count = scene.bonds, _torn(failed) - _torn(before)
+    fresh = (failed.broken_step >= 0) & (before.broken_step < 0)
+    rows = np.flatnonzero(fresh.reshape(len(fresh), -1)[bonds.plane, bonds.place])
+    first = ""
+    if len(rows):
+        a, b = (bonds.ends[rows[0]] + 1).tolist()
+        plural = f" and {count - 1} more" if count > 1 else ""
+        first = f"the bond between particles {a} and {b}{plural} broke, and "
+    flat = before.u.reshape(len(before.u), -1)
+    step = max(1, math.ceil(since))
+    led = [flat[:, each.place] for each in scene.leading if each.group.leads(step)]
+    way = max((float(np.abs(u).max(initial=0.0)) for u in led), default=0.0)
+    leads = f", leaders displaced by up to {way:.6g}" if way else ""
+    cause = str(error).partition("; ")[0]
+    return (
+        f"the body came apart between step {since:.6g} and step {moment:.6g}: {first}{cause}; the "
+        f"last equilibrium is that of step {since:.6g}{leads}. {REMEDY}"
+    )
 
 
 def _settle_bonds_at(

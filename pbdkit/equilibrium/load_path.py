@@ -78,9 +78,9 @@ def spacings(scene: Scene) -> int:
     return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
 
 
-def last_change(scene: Scene) -> int:
-    """The last step before roles or loads change within the run; 0 where they never do."""
-    steps, changes = scene.experiment.steps, [0]
+def last_change(scene: Scene, steps: int) -> int:
+    """The last step before roles or loads change within so many steps; 0 where they never do."""
+    changes = [0]
     changes += [step - 1 for step in scene.loads.changes(steps)] if scene.loads else []
     for leading in scene.leading:
         first, last = leading.group.from_, leading.group.last(steps)

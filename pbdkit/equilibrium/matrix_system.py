@@ -18,9 +18,8 @@ from pbdkit.analysis.couplings import connected, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.stage import Stage
-from pbdkit.equilibrium.system import PUSH, System
+from pbdkit.equilibrium.system import PUSH, NoEquilibriumError, System
 from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part, TooSoftError
-from pbdkit.errors import ExperimentError
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -103,7 +102,7 @@ class MatrixSystem(System):
             for unknowns, part in stage.parts:
                 r = table[:, stage.axes].ravel()[unknowns]
                 if isinstance(part, Floating) and np.abs(r).max(initial=0.0) > 8 * rounding:
-                    raise ExperimentError(
+                    raise NoEquilibriumError(
                         "there is no unique equilibrium: leaders do not hold a part of "
                         f"{self._named(stage, unknowns)}; let one hold it, or take solver: "
                         "{type: stepping}",
@@ -138,7 +137,7 @@ class MatrixSystem(System):
                     soft = isinstance(error, TooSoftError) or self._is_fixed(stage.axes, some)
                     text = SOFT if soft else DRIFTS
                     named = self._named(stage, some)
-                    raise ExperimentError(text.format(named), ("leaders",)) from None
+                    raise NoEquilibriumError(text.format(named), ("leaders",)) from None
             found[:, stage.axes] = x.reshape(-1, len(stage.axes))
         return found
 

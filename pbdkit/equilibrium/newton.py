@@ -45,7 +45,7 @@ UNSTABLE = "what is found is not stable"
 class Finder:
     """Looks for equilibria of a scene, to within a length, by one of the solver's methods, shares
     being of the length `scale`; `compiles` is of the moves; `rows` are those of the scene;
-    `at_rest` the last system there."""
+    `at_rest` the last system there, and `rest` of what it is the system."""
 
     scene: Scene
     tolerance: float
@@ -55,6 +55,7 @@ class Finder:
     compiles: bool = True
     rows: Rows = ALL
     at_rest: list[System] = field(default_factory=list, repr=False, compare=False)
+    rest: list[Rest] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
     def moves(self) -> Moves:
@@ -94,6 +95,33 @@ class Finder:
                 return _Newton(self.at(moment), state, moment, before).run()
             except IndefiniteError:
                 raise UnconvergedError(UNSTABLE) from None
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What a system at rest depends on, so that a later search takes it up again: the scene with
+    its numbers, which groups lead, the bonds, and by which methods it was to be solved."""
+
+    scene: Scene
+    leads: tuple[bool, ...]
+    bonds: tuple[Floats, ...]
+    methods: str
+
+    @classmethod
+    def of(cls, finder: Finder, state: State, moment: float, methods: str) -> Rest:
+        """That of a state with the roles of a moment's step."""
+        leads = tuple(led.group.leads(math.ceil(moment)) for led in finder.scene.leading)
+        broken = () if state.broken_step is None else (state.broken_step >= 0,)
+        bonds = (*broken, *(value.copy() for value in state.bond_values))
+        return cls(finder.scene, leads, bonds, methods)
+
+    def serves(self, other: Rest) -> bool:
+        """Whether both have the same system."""
+        same = self.scene is other.scene and (self.leads, self.methods) == (
+            other.leads,
+            other.methods,
+        )
+        return same and all(map(np.array_equal, self.bonds, other.bonds))
 
 
 class Search(ABC):
@@ -197,7 +225,18 @@ class _Linear(Search):
         at_rest = replace(state, u=np.zeros_like(state.u))
         super().__init__(finder, state, moment, at_rest, "assembling")
         finder.at_rest[:] = [self._system]
+        finder.rest[:] = [Rest.of(finder, state, moment, self._system.methods)]
         self._owed: State | None = state.copy()
+
+    def _linearised(self, at: State, what: str) -> System:
+        """Factorised once for as long as roles, numbers and bonds stay."""
+        known = self._finder.at_rest
+        if known and self._finder.rest:
+            here = Rest.of(self._finder, at, self._moment, known[0].methods)
+            if self._finder.rest[0].serves(here):
+                self._linearisations, self._inner = 1, -known[0].iterations
+                return known[0]
+        return super()._linearised(at, what)
 
     def run(self) -> Certificate:
         """Corrects until the tolerance is reached."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from pbdkit.equilibrium.rows import ALL, Rows
+from pbdkit.errors import ExperimentError
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
@@ -49,6 +50,10 @@ PUSH = 1e-10
 
 class StuckError(Exception):
     """An iteration got nowhere."""
+
+
+class NoEquilibriumError(ExperimentError):
+    """A part of the body has no equilibrium, or none that is unique."""
 
 
 class IndefiniteError(StuckError):

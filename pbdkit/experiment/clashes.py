@@ -73,6 +73,9 @@ def _of_events(asked: Any) -> list[tuple[Key, bool, str]]:
     )
     return [
         ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),
+        ("record", asked.record.increments and not jumps,
+         "increments of load are those of an equilibrium; take solver: {type: equilibrium}, or "
+         "leave record.increments out"),
         ("cuts", late > asked.steps, f"step {late} is beyond the run's {asked.steps}"),
         ("solver", settles and (remembers or softens),
          f"'{(asked.rule if remembers else asked.fracture).type}' remembers, so that no distance "

@@ -104,26 +104,25 @@ class Experiment(Strict):
         return self
 
     @property
-    def recording(self) -> Record:
-        """What is recorded: of an equilibrium, the start and the end."""
-        if self.solver.makes_steps:
-            return self.record
-        return self.record.model_copy(update={"at": (0, self.steps)})
-
-    @property
     def stepping(self) -> Stepping:
         """How a step of it is made, whatever the solver."""
         return self.solver.stepping
 
     def records(self, step: int) -> bool:
         """Whether that step is recorded."""
-        return self.recording.keeps(step, self.steps)
+        return self.record.keeps(step, self.steps)
+
+    @property
+    def record_count(self) -> int:
+        """The number of recorded states, with an estimate of those at increments of load."""
+        between = self.solver.sought.increments if self.record.increments else 0
+        return self.record.count(self.steps) + between
 
     def next_wanted(self, step: int) -> int:
         """The next step after `step` of which something is recorded."""
         if any(d.every_step and not d.at_end for d in self.diagnostics):
             return step + 1
-        return self.recording.next_after(step, self.steps)
+        return self.record.next_after(step, self.steps)
 
     _source: Source = PrivateAttr(default_factory=Source)
     _registry: Registry = PrivateAttr()

@@ -23,7 +23,7 @@ from pbdkit.experiment.solvers import Stepping
 from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
-from pbdkit.runs.course import Run
+from pbdkit.runs.course import FAILED, Run
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import Floats, State
 
@@ -109,7 +109,7 @@ class RunObservation(Observation):
             if wanted and state.step > last:
                 last = state.step
                 yield state
-        if run.outcome is None or run.outcome.status in ("diverged", "unconverged"):
+        if run.outcome is None or run.outcome.status in FAILED:
             reason = run.outcome.stop_reason if run.outcome else "the run did not end"
             raise UnconvergedError(reason)
 

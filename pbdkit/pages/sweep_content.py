@@ -21,7 +21,7 @@ from pbdkit.pages.thinning import Thinning, thinned
 from pbdkit.results.carried import carried, scene_of
 from pbdkit.scene.scene import Scene
 from pbdkit.sweeps.grid import CASE, MESSAGE, STATUS, TEXT, type_alone
-from pbdkit.sweeps.worker import WHOLE
+from pbdkit.sweeps.worker import KEPT
 
 if TYPE_CHECKING:
     import xarray
@@ -60,7 +60,7 @@ class SweepContent:
         before they are packed."""
         each = self._members
         points = max(FEWEST_POINTS, POINTS // len(each))
-        good = [str(member[STATUS].item()) in WHOLE for member in each]
+        good = [str(member[STATUS].item()) in KEPT for member in each]
         if "position" not in each[0] or not any(good):
             note = "No lattices are shown: no member ended well, or `position` was not kept."
             plain = [{"curves": curves(member, points)} for member in each]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
+from pbdkit.equilibrium.certificate import Certificate
 from pbdkit.equilibrium.increments import Way
 from pbdkit.equilibrium.system import StuckError
 from pbdkit.errors import NotSharedError
@@ -52,12 +53,25 @@ class DividedStraight(Straight):
         scene, start = self.scene, self._start or initial_state(self.scene)
         try:
             finder = finder_of(scene, start, self.watch, rows=self._rows)
-            way = increments(scene, state, self.watch, self.moment, finder, self._stepper)
-            certificate = yield from way
+            own = finder, self._stepper, self._stops
+            way = increments(scene, state, self.watch, self.moment, *own)
+            certificate = yield from self._renewed(way)
         except StuckError:
             raise NotSharedError(STUCK, ("solver",)) from None
-        self._division.halo.renew(state)  # with what frame points show there
+        self._division.halo.renew(state)
         return certificate
+
+    def _renewed(self, way: Way) -> Way:
+        """The same with what frame points show at each equilibrium."""
+        while True:
+            try:
+                reached = next(way)
+            except StopIteration as end:
+                certificate: Certificate = end.value
+                return certificate
+            if reached.at_rest:
+                self._division.halo.renew(reached.state)
+            yield reached
 
     def _stepper(self, scene: Scene) -> Engine:
         return self._division.stepper(self._stepping)[0]

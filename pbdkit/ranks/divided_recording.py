@@ -43,8 +43,9 @@ class DividedRecorder(Recorder):
         if history is not None:
             self._joining.take(history)
 
-    def observe(self, state: State, *, last: bool = False) -> None:
-        """As one process does. What one refuses all of them do."""
+    def observe(self, state: State, *, last: bool = False, within: float | None = None) -> None:
+        """As one process does, which has no increments `within` steps. What one refuses all of them
+        do."""
         if state.step <= self.seen.step and not last:
             return
         recorded = last or self._scene.experiment.records(state.step)

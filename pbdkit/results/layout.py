@@ -19,7 +19,7 @@ from pbdkit.scene.raster import FOLLOWER, FRAME, LEADER
 
 CONVENTIONS = "CF-1.11"
 SCHEMA_VERSION = "2"
-STATUSES = ("complete", "settled", "diverged", "unconverged", "interrupted")
+STATUSES = ("complete", "settled", "diverged", "unconverged", "separated", "interrupted")
 ATTRIBUTES = (
     "Conventions", "schema_version", "title", "pbdkit_version", "experiment", "plugins",
     "prediction", "status", "stop_reason", "created",
@@ -28,6 +28,8 @@ INDICES = "ijk"
 """The names of a site's indices, one for each axis of the lattice."""
 OF_BODY, OF_FRAME = np.int8(0), np.int8(1)
 """The roles of particles: leaders and followers are body, at every step."""
+TIMES = ("time", "step")
+"""Coordinates that count steps: fractions of them too where increments of load are recorded."""
 STEP, ENDS = "step", "their numbers, the lower one first"
 Values = dict[str, Any]
 """What goes into a dataset, by the name of the variable."""
@@ -237,7 +239,9 @@ def _schema_of(column: Column) -> dict[str, Any]:
         attributes["units"] = {"enum": [column.units, quantity.unit]}
     parts = {"dims": {"const": list(column.dims)}, "attrs": _object(attributes, sorted(attributes))}
     if column.dtype != "str":
-        parts["dtype"] = {"const": np.dtype(column.dtype).name}
+        name = np.dtype(column.dtype).name
+        fractions = {"enum": [name, "float64"]}
+        parts["dtype"] = fractions if column.name in TIMES else {"const": name}
     described = {"description": f"{column.long_name}; written {column.when.value}"}
     return described | _object(parts, ["dims", "attrs", "dtype"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cached_property
@@ -35,17 +36,28 @@ from pbdkit.stepping.state import Floats, State, describe_bonds
 
 
 class StateMoment(Moment):
-    """A state as a table; bonds that broke later than asked for count as they were before."""
+    """A state as a table; bonds that broke later than asked for count as they were before.
 
-    def __init__(self, state: State, tables: Tables, no_later_than: int | None = None) -> None:
-        self.step = state.step
-        self._no_later_than = state.step if no_later_than is None else no_later_than
-        self._state, self._tables = state, tables.at(state.step)
+    An equilibrium `within` a step, at an increment of load, has the roles of that step, and the
+    numbers and loads of that moment.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        tables: Tables,
+        no_later_than: int | None = None,
+        within: float | None = None,
+    ) -> None:
+        self._now: float = state.step if within is None else within
+        self.step, self._within = math.ceil(self._now), within
+        self._no_later_than = self.step if no_later_than is None else no_later_than
+        self._state, self._tables = state, tables.at(self._now)
         self._scene, self._raster = tables.scene, tables.scene.raster
 
     def of(self, state: State, tables: Tables) -> StateMoment:
         """The same moment of another state."""
-        return StateMoment(state, tables, self._no_later_than)
+        return StateMoment(state, tables, self._no_later_than, self._within)
 
     @property
     def body(self) -> NDArray[np.bool_]:
@@ -136,7 +148,7 @@ class StateMoment(Moment):
         """As they act in this step."""
         loads = self._scene.loads
         return tuple(
-            LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self.step))
+            LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self._now))
             for each in (loads.each if loads else ())
         )
 
@@ -144,7 +156,7 @@ class StateMoment(Moment):
         """Found anew each time."""
         if not self._scene.barriers:
             return ()
-        found = Contact(self._scene).touching(self._state)
+        found = Contact(self._scene).touching(self._state, self._now)
         return tuple(TouchingRows(read_only(rows), read_only(n)) for rows, n in found)
 
     def broken_bonds(self) -> int:

@@ -36,10 +36,10 @@ class Outcome:
 
 @dataclass
 class Seen:
-    """The last steps of which anything was taken, and of which a record was made."""
+    """The last moments, in steps, of which anything was taken, and of which a record was made."""
 
-    step: int = -1
-    recorded: int = -1
+    step: float = -1
+    recorded: float = -1
 
 
 class Recorder:
@@ -56,8 +56,8 @@ class Recorder:
     def begin(self, history: Iterable[Values] | None = None) -> None:
         """Hands over the columns and everything that is known before the first step, or instead of
         it the `history` of a run that is gone on with."""
-        steps, recording = self._scene.experiment.steps, self._scene.experiment.recording
-        planned = {"time": recording.count(steps), "step": steps + 1}
+        count = self._scene.experiment.record_count
+        planned = {"time": count, "step": max(count, self._scene.experiment.steps + 1)}
         self.sink.begin(self._columns, self._measured.sizes, planned)
         for values in map(self._twins.beside, self._known()) if history is None else history:
             self.sink.put(values)
@@ -92,37 +92,41 @@ class Recorder:
         yield self._measured.coordinates
 
     @np.errstate(all="ignore")
-    def observe(self, state: State, *, last: bool = False) -> None:
+    def observe(self, state: State, *, last: bool = False, within: float | None = None) -> None:
         """Takes what is wanted of this step; positions too of the `last` of a run that stops before
         its end, which may have come before without that; else a step that was seen is left out.
-        Raises FloatingPointError where a recorded value has left the finite numbers; nothing of
-        that step is kept."""
-        if state.step > self.seen.step or last:
-            self._put(state, self._taken(state, last))
+        An equilibrium `within` a step is recorded with that moment as its time. Raises
+        FloatingPointError where a recorded value has left the finite numbers; nothing of that step
+        is kept."""
+        if (state.step if within is None else within) > self.seen.step or last:
+            self._put(state, self._taken(state, last, within))
 
     def _put(self, state: State, values: Values) -> None:
         if values:
             self.sink.put(self._twins.beside(values))
-        self.seen = Seen(state.step, state.step if "time" in values else self.seen.recorded)
+        now = values.get("time", state.step)
+        self.seen = Seen(now, now if "time" in values else self.seen.recorded)
 
-    def _taken(self, state: State, last: bool) -> Values:
+    def _taken(self, state: State, last: bool, within: float | None = None) -> Values:
         """What is wanted of a step."""
-        moment, experiment = StateMoment(state, self._tables), self._scene.experiment
+        moment = StateMoment(state, self._tables, within=within)
         values: Values = {}
-        late = last and state.step > self.seen.recorded
-        recorded = late or (not last and experiment.records(state.step))
+        experiment, now = self._scene.experiment, state.step if within is None else within
+        late = last and now > self.seen.recorded
+        planned = within is not None or experiment.records(state.step)
+        recorded = late or (not last and planned)
         if recorded:
             position = moment.position()
             if not np.isfinite(position).all():
                 before = self._scene.raster.before
                 row = int(np.flatnonzero(~np.isfinite(position).all(axis=1))[0])
                 raise FloatingPointError(f"particle {before + row + 1} at step {state.step}")
-            values = {"time": state.step, "position": position, "kind": moment.kind()}
+            values = {"time": now, "position": position, "kind": moment.kind()}
             values |= self._measured.remembered(moment, first=self.seen.recorded < 0)
             values |= self._diagnosed(When.RECORD, moment)
         stepped = recorded or experiment.solver.makes_steps
         if self._measured.every_step and stepped and not last:
-            values |= {"step": state.step} | self._diagnosed(When.STEP, moment)
+            values |= {"step": now} | self._diagnosed(When.STEP, moment)
         return values
 
     def _diagnosed(self, when: When, moment: StateMoment) -> Values:
@@ -132,8 +136,12 @@ class Recorder:
         """Hands over what is known at the end, and the attributes, with what was predicted before
         the first step; `warnings` says what the user should know of the last state."""
         # Where a run diverged, what broke since the last record is no result.
-        diverged = outcome.status == "diverged"
-        moment = StateMoment(state, self._tables, self.seen.recorded if diverged else state.step)
+        diverged, recorded = outcome.status == "diverged", self.seen.recorded
+        if state.step < recorded < state.step + 1:
+            moment = StateMoment(state, self._tables, within=recorded)
+        else:
+            known = int(recorded) if diverged else state.step
+            moment = StateMoment(state, self._tables, known)
         if not diverged and (warning := self._inside_out(state)):
             self.warnings = (warning,)
         if self._scene.has_fracture:
@@ -177,6 +185,9 @@ def columns_of(scene: Scene) -> list[Column]:
     some = chain(*compress(layout.optional_columns(), wanted))
     all_of_them = [*layout.base_columns(scene.axes), *some, *measured.columns()]
     columns = measured.physical.columns(all_of_them)
-    if scene.experiment.record.dtype == "float64":
-        return columns
-    return [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]
+    record = scene.experiment.record
+    if record.dtype == "float32":
+        columns = [replace(c, dtype="f4") if c.grows and c.dtype == "f8" else c for c in columns]
+    if record.increments:
+        columns = [replace(c, dtype="f8") if c.name in layout.TIMES else c for c in columns]
+    return columns

@@ -49,7 +49,7 @@ class Tables:
     def add_reference(self, u: Floats) -> Floats:
         """X + u, (particle, axis), in place; X is kept where it is wanted more than twice."""
         experiment = self.scene.experiment
-        if experiment.recording.count(experiment.steps) > 2:
+        if experiment.record_count > 2:
             u += self.reference
             return u
         for rows in self.scene.raster.chunks():

@@ -51,8 +51,10 @@ def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) 
     try:
         past = [seen.step, seen.recorded, parts.get("kept", -1), guard["good_step"]]
         coming = [guard["next_look"], pace.next_look if pace else now, steps]
-        whole = all(isinstance(step, int) for step in (now, *past, *coming))
-        in_order = min(past) >= -1 and max(past) <= now <= min(coming)
+        whole = all(isinstance(step, int) for step in (now, *past[2:], *coming))
+        # An equilibrium may be recorded within a step, and that of steps that are yet to be made.
+        latest = max(now, parts.get("moment", 0.0))
+        in_order = min(past) >= -1 and max(past) <= latest and now <= min(coming)
         in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
         return whole and in_order and (now < guard["next_look"] or now == steps)
     except (KeyError, TypeError, AttributeError):

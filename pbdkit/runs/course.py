@@ -32,6 +32,8 @@ DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
     Equilibrium: Straight,
 }
 """What carries out what an experiment asks for under `solver`."""
+FAILED = ("diverged", "unconverged", "separated")
+"""How runs end that do not come to their last step or to rest."""
 LARGEST = 50_000
 """Of larger bodies nothing is measured ahead of the run."""
 
@@ -164,12 +166,14 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
                 return report(run.driver.stopped)
             try:
                 with _located(scene):
-                    recorder.observe(state, last=run.driver.ending)
+                    within = run.driver.within
+                    recorder.observe(state, last=run.driver.ending, within=within)
             except FloatingPointError as error:
                 run.driver.rejection = error
                 continue
             # At its end there is nothing to go on to: what follows from the last state is its end.
-            ends = run.driver.ending or state.step >= scene.experiment.steps
+            ends = run.driver.ending or run.driver.is_over
+            ends = ends or state.step >= scene.experiment.steps
             if keeping and not ends and keeping.due():
                 rate = (state.step - first) / (time.perf_counter() - begun)
                 keeping.keep(standing_of(run.driver, recorder, rate))

@@ -28,18 +28,21 @@ class Driver(ABC):
     """Takes one scene from a state to its end, once.
 
     `state` is where it stands, `choice` what steps it. `ending` says of a state just given out that
-    it is the last of a run that ends before its last step, to be kept whatever the plan; `stopped`
-    is how such a run ends that was asked to stop.
+    it is the last of a run that ends before its last step, to be kept whatever the plan, `is_over`
+    that nothing remains to be computed; `stopped` is how such a run ends that was asked to stop.
     """
 
     choice: Choice
 
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         self.scene, self.state, self.watch = scene, state, watch
-        self.ending = False
+        self.ending = self.is_over = False
         self.stopped: Outcome | None = None
         self.chosen: tuple[str, ...] = ()
         """The parameters of the solver that were `auto`, and are numbers now."""
+        self.within: float | None = None
+        """The moment within a step of which the state just given out is an equilibrium to be
+        recorded; None elsewhere."""
         self.rejection: FloatingPointError | None = None
         """Why whoever looked at the last state could not use it; its next move is up to the
         driver."""
@@ -147,7 +150,7 @@ class Stepwise(Driver):
         stops = [experiment.next_wanted(state.step), self.guard.next_look]
         stops += [self.settling.pace.next_look] if self.settling else []
         reached = min(*stops, state.step + self._patience)
-        planned = experiment.recording.keeps(reached, reached + 1)  # by longer runs, too
+        planned = experiment.record.keeps(reached, reached + 1)  # by longer runs, too
         notes = reached == self.guard.next_look or planned
         begun, steps = perf_counter(), reached - state.step
         self.state = self._engine.advance(state, steps)
@@ -209,42 +212,57 @@ class Straight(Driver):
         self.state, self.moment = standing["state"], float(standing["moment"])
 
     def states(self) -> States:
-        """Interrupted, it gives out how far it had come."""
+        """Interrupted, or without an equilibrium, it gives out how far it had come."""
         # Loaded by those who look for an equilibrium, and by nobody else.
         from pbdkit.equilibrium.certificate import UnconvergedError
+        from pbdkit.equilibrium.increments import SeparatedError
 
-        state, steps = self.state, self.scene.experiment.steps
+        state = self.state
         yield state
         try:
             certificate = yield from self._on_the_way(state)
-            outcome = Outcome("complete", str(certificate), steps, certificate.as_dict())
+            outcome = Outcome("complete", str(certificate), state.step, certificate.as_dict())
         except UnconvergedError as error:
             found = error.certificate
-            outcome = Outcome("unconverged", f"{error}: {found}", steps, found.as_dict())
+            outcome = Outcome("unconverged", f"{error}: {found}", state.step, found.as_dict())
+        except SeparatedError as error:
+            outcome = Outcome("separated", str(error), state.step)
+        except FloatingPointError as error:
+            return Outcome("unconverged", f"{error} left all bounds", state.step)
         except StoppedError:
             reason = f"stopped on the way to equilibrium, after step {state.step}"
-            self.stopped = Outcome("interrupted", reason, state.step)
-            self.ending = True
-            yield state
-            return self.stopped
-        state.step = steps
+            outcome = self.stopped = Outcome("interrupted", reason, state.step)
+        self.ending = outcome.status != "complete"
         yield state
         if self.rejection:
-            return Outcome("unconverged", f"{self.rejection} left all bounds", steps)
+            return Outcome("unconverged", f"{self.rejection} left all bounds", state.step)
         return outcome
 
     def _way(self, state: State) -> Way:
-        """The moments reached on the way of a state to equilibrium."""
+        """What is reached on the way of a state to equilibrium."""
         from pbdkit.equilibrium.increments import increments
 
-        return increments(self.scene, state, self.watch, self.moment)
+        return increments(self.scene, state, self.watch, self.moment, stops=self._stops)
+
+    @property
+    def _stops(self) -> list[int]:
+        """The recorded steps between the first and the last one."""
+        experiment = self.scene.experiment
+        return list(experiment.record.steps_before(experiment.steps))
 
     def _on_the_way(self, state: State) -> Generator[State, None, Certificate]:
-        way = self._way(state)
+        """Raises FloatingPointError where a state cannot be recorded."""
+        way, increments = self._way(state), self.scene.experiment.record.increments
         while True:
             try:
-                self.moment = next(way)
+                reached = next(way)
             except StopIteration as end:
                 certificate: Certificate = end.value
                 return certificate
-            yield state
+            self.moment, self.is_over = reached.moment, reached.is_last
+            within = increments and reached.at_rest and reached.moment != reached.state.step
+            self.within = reached.moment if within else None
+            yield reached.state
+            self.within = None
+            if self.rejection:
+                raise self.rejection

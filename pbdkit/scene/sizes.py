@@ -109,7 +109,8 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     may break."""
     fracture, rule = experiment.fracture, experiment.rule
     recorded = np.dtype(experiment.record.dtype).itemsize
-    records, steps = experiment.recording.count(experiment.steps), experiment.steps + 1
+    records = experiment.record_count
+    steps = experiment.steps + 1 if experiment.solver.makes_steps else records
     each_bond = 4 + 2 * 4 + 1 + 12 * experiment.parts_bonds
     once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 2
     once += experiment.shows_bonds * planes * each_bond

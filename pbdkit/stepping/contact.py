@@ -69,11 +69,12 @@ class Contact:
                     inside, *_ = self._inside(near, still, outline)
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
 
-    def touching(self, state: State) -> Touching:
-        """The rows of the followers on each obstacle's outline, as the state has them, and the
-        normals there, (row, axis): within what rounding allows, and 1e-9 of a lattice constant."""
+    def touching(self, state: State, moment: float) -> Touching:
+        """The rows of the followers on each obstacle's outline, as the state has them at a moment,
+        and the normals there, (row, axis): within what rounding allows, and 1e-9 of a lattice
+        constant."""
         scene, raster = self._scene, self._scene.raster
-        rows = np.flatnonzero(kinds_at(raster, scene.leading, state.step) == FOLLOWER)
+        rows = np.flatnonzero(kinds_at(raster, scene.leading, math.ceil(moment)) == FOLLOWER)
         places = Places(raster.shape, raster.place_of(rows))
         at = [np.asarray(a) for a in raster.reference_planes(places)]
         digits = 16.0 * float(np.finfo(state.u.dtype).eps) * self.reach
@@ -81,7 +82,7 @@ class Contact:
         x, y = (a + b for a, b in zip(at, u, strict=True))
         slack = SLACK * math.hypot(*self._vectors[0]) + digits
         found: Touching = [(rows[:0], np.zeros((0, 2)))] * len(scene.barriers)
-        for n, outline in outlines_at(scene.barriers, state.step):
+        for n, outline in outlines_at(scene.barriers, moment):
             gap, nx, ny, _ = outline.facing(x, y)
             on = np.abs(gap) <= slack
             found[n] = rows[on], np.stack([nx[on], ny[on]], axis=1)

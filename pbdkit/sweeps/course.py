@@ -24,7 +24,7 @@ from pbdkit.sweeps.joining import joined
 from pbdkit.sweeps.member import Asked, Member
 from pbdkit.sweeps.outlook import Outlook
 from pbdkit.sweeps.store import Store
-from pbdkit.sweeps.worker import INTERRUPTED, WHOLE, Report
+from pbdkit.sweeps.worker import INTERRUPTED, KEPT, Report
 
 if TYPE_CHECKING:
     import xarray
@@ -49,7 +49,7 @@ class Summary:
         """The members that ended without values, with status and message."""
         ended = [member for member in self.members if member.job.key in self.ends]
         every = [(member, *self.ends[member.job.key]) for member in ended]
-        return [entry for entry in every if entry[1] not in WHOLE]
+        return [entry for entry in every if entry[1] not in KEPT]
 
 
 def carry_out(
@@ -93,7 +93,7 @@ def _heard(
     for report in reports:
         if report is not None and report.status == INTERRUPTED:
             continue
-        run, failed = run + bool(report), failed + bool(report and report.status not in WHOLE)
+        run, failed = run + bool(report), failed + bool(report and report.status not in KEPT)
         told = f"{members - todo + run} of {members} members"
         show(told + (f", {failed} failed" if failed else ""), run / todo)
         yield report

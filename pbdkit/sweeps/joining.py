@@ -15,7 +15,7 @@ from pbdkit.scene.memory import machine_memory
 from pbdkit.sweeps.content import Variable, unpacked
 from pbdkit.sweeps.grid import MESSAGE, STATUS, Dimension
 from pbdkit.sweeps.member import Member
-from pbdkit.sweeps.worker import WHOLE, Report
+from pbdkit.sweeps.worker import KEPT, Report
 
 if TYPE_CHECKING:
     import xarray
@@ -41,7 +41,7 @@ def joined(grid: list[Dimension], members: Iterable[Member], report_of: Reports)
     for member in members:
         report = report_of(member.job.key)
         status[member.place], message[member.place] = report.status, report.message
-        if report.status in WHOLE:
+        if report.status in KEPT:
             frame.look(unpacked(report.content))
             whole.append(member)
     arrays = frame.arrays(shape, dims)

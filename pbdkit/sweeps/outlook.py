@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
 
 import numpy as np
 import xxhash
@@ -54,13 +53,14 @@ class Outlook:
         self._seen: set[bytes] = set()
         self._columns: dict[str, Column] = {}
         self._sizes: dict[str, int] = {}
-        self._times: set[tuple[Any, ...]] = set()
+        self._times: set[tuple[int, tuple[int, ...] | None, int, int]] = set()
 
     def look(self, experiment: Experiment, words: str) -> None:
         """At one more, which messages call so. Raises ExperimentError and PluginError where it has
         no scene, and where a variable that is to be kept is none of its dataset."""
-        steps, recording = experiment.steps, experiment.recording
-        self._times.add((steps, recording.at, recording.every))
+        steps, asked = experiment.steps, experiment.record
+        between = experiment.record_count - asked.count(steps)
+        self._times.add((steps, asked.at, asked.every, between))
         data = experiment.model_dump(mode="json", by_alias=True)
         shape = xxhash.xxh3_128_digest(json.dumps([data.get(part) for part in SHAPING]).encode())
         if shape in self._seen:
@@ -107,8 +107,8 @@ class Outlook:
         if isinstance(times, tuple):
             return len(set(times))
         return max(
-            steps // every + 2 if at is None else len({0, steps, *at})
-            for steps, at, every in self._times
+            between + (steps // every + 2 if at is None else len({0, steps, *at}))
+            for steps, at, every, between in self._times
         )
 
 

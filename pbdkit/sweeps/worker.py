@@ -28,6 +28,9 @@ from pbdkit.sweeps.content import Variable, packed, variable_of
 from pbdkit.sweeps.member import Job
 
 WHOLE = ("complete", "settled")
+KEPT = (*WHOLE, "separated")
+"""The status of members whose results are kept: of a body that came apart under an equilibrium, all
+that was recorded before."""
 """The status of members whose values are in the dataset."""
 FAILED, INTERRUPTED, LOST = "failed", "interrupted", "lost"
 """The status of one that could not be run, and of those that the machine did not let end."""
@@ -142,7 +145,7 @@ def run_member(
             with threadpool_limits(1):
                 status, message = _ran(experiment, sink, stopping)
             lasting = status != INTERRUPTED
-            content = sink.content() if status in WHOLE else b""
+            content = sink.content() if status in KEPT else b""
         except ExperimentError as error:
             status, message, lasting = FAILED, str(error), True
         except PbdkitError as error:
