@@ -143,8 +143,8 @@ def _of_linear(
                 _settle_at(scene, settled, finder, stop)
             except NoEquilibriumError as error:
                 raise NoEquilibriumError(
-                    f"{error} (at step {stop}; `record: {{at: [...]}}` names the steps whose "
-                    "equilibria are found, the last one always)",
+                    f"at step {stop} {error}; or record that of the last step alone, `record: "
+                    f"{{at: [{steps}]}}`",
                     *error.args[1:],
                 ) from None
             except UnconvergedError:

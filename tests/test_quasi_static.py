@@ -1,0 +1,281 @@
+"""Quasi-static tests: an equilibrium at every recorded step, increments of load, separation."""
+
+import json
+from itertools import count
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium import newton
+from pbdkit.results.netcdf_sink import NetcdfSink
+from pbdkit.results.progress import Watch
+from pbdkit.runs.course import Run, record
+from pbdkit.runs.resumption import resumption
+from pbdkit.scene.scene import build_scene
+
+VELOCITY, STEPS = 0.02, 30
+HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+PULL = {"type": "velocity", "velocity": [VELOCITY, 0.0], "steps": STEPS}
+PULLED = {"select": {"edge": "right"}, "motion": PULL}
+BAR = {
+    "version": 1,
+    "name": "bar",
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "grid", "columns": 8, "rows": 4},
+    "neighbours": {"type": "coordination", "shells": 2},
+    "rule": {"type": "elastic", "poisson_ratio": 0.3},
+    "frame": {"type": "natural"},
+    "leaders": [HELD, PULLED],
+    "steps": STEPS,
+    "solver": {"type": "equilibrium"},
+    "diagnostics": [
+        {"type": "displacement"},
+        {"type": "reaction", "youngs_modulus": 1.0},
+        {"type": "track", "numbers": [9]},
+    ],
+}
+FRACTURE = {"fracture": {"type": "strain", "failure": 0.05}}
+RISES = {"steps": [0, 10], "values": [0.0, 0.5]}
+LOADED = {
+    "leaders": [HELD],
+    "steps": 10,
+    "loads": [
+        {"select": {"edge": "right"}, "force": [{"steps": [0, 10], "values": [0.0, 0.5]}, 0.0]}
+    ],
+}
+
+
+def ran(*parts):
+    given = BAR
+    for part in parts:
+        given = given | part
+    return pbdkit.run(given, progress=False)
+
+
+def came_apart(*parts):
+    with pytest.raises(pbdkit.DivergedError) as caught:
+        ran(*parts)
+    return caught.value.dataset
+
+
+def strains(ds, time):
+    """(bond,): at a recorded time."""
+    ends = ds.bond_ends.values - 1
+    x, rest = ds.position.values[time], ds.reference.values
+    now, then = (np.linalg.norm(at[ends[:, 1]] - at[ends[:, 0]], axis=1) for at in (x, rest))
+    return now / then - 1.0
+
+
+def refuse_overstretched(ds, failure):
+    """Every bond of every recorded state that is above its limit is broken."""
+    for n, moment in enumerate(ds.time.values):
+        broken = (ds.broken_step.values >= 0) & (ds.broken_step.values <= np.ceil(moment))
+        assert (strains(ds, n)[~broken] <= failure * (1 + 1e-9)).all(), moment
+
+
+def test_each_recorded_step_of_a_pull_is_its_equilibrium():
+    ds = ran()
+    steps = np.arange(STEPS + 1)
+    np.testing.assert_array_equal(ds.time, steps)
+    assert ds.time.dtype == ds.step.dtype == np.int64
+    led = ds.kind.isel(time=0).values == 0
+    right = led & (ds.reference.isel(axis=0) == 7.0)
+    np.testing.assert_allclose(
+        ds.u.values[:, right.values, 0], np.outer(VELOCITY * steps, np.ones(4)), rtol=1e-14
+    )
+    force = ds.reaction.values[:, 1, 0]
+    np.testing.assert_allclose(force, force[-1] * steps / STEPS, atol=1e-12)
+    np.testing.assert_allclose(
+        ds.track.values.squeeze(), ds.position.sel(particle=9).values, atol=1e-15
+    )
+
+
+SCENES = {
+    "pull": {},
+    "force from a step until another": LOADED
+    | {"loads": [{"select": {"edge": "right"}, "force": [0.01, 0.0], "from": 3, "until": 6}]},
+    "force that grows": LOADED,
+    "rule that changes": {
+        "rule": {"type": "elastic", "poisson_ratio": 0.3, "stiffness": 1.0},
+        "steps": 8,
+        "solver": {"type": "equilibrium"},
+        "leaders": [HELD, PULLED | {"from": 2, "until": 5}],
+    },
+    "course of a number": {
+        "rule": {"type": "mixed-coordinate", "K": {"steps": [0, 8], "values": [0.0, -0.02]}},
+        "frame": {"type": "mean"},
+        "diagnostics": [{"type": "displacement"}],
+        "steps": 8,
+    },
+    "springs": {"rule": {"type": "springs"}, "steps": 6},
+    "obstacle that moves": {
+        "leaders": [HELD],
+        "steps": 6,
+        "obstacles": [
+            {
+                "shape": {"type": "disc", "radius": 2.0, "centre": [4.0, 5.5]},
+                "motion": {"type": "velocity", "velocity": [0.0, -0.1], "steps": 5},
+            }
+        ],
+    },
+    "cut": {
+        "cuts": [{"from": [3.5, -0.5], "to": [3.5, 1.5], "at": 3}],
+        "steps": 6,
+        "solver": {"type": "equilibrium", "increments": 6},
+    },
+}
+
+
+@pytest.mark.parametrize("parts", SCENES.values(), ids=SCENES)
+def test_each_recorded_step_is_the_equilibrium_of_so_many_steps(parts):
+    """With the roles, loads, numbers, cuts and obstacles of that step."""
+    whole = ran(parts)
+    assert len(whole.time) == whole.time[-1] + 1
+    for step in range(1 + 2 * ("cuts" in parts), len(whole.time), 2):
+        alone = ran(parts, {"steps": step, "record": {"at": [step]}})
+        np.testing.assert_allclose(whole.u[step], alone.u[-1], rtol=0, atol=2e-7)
+        np.testing.assert_array_equal(whole.kind[step], alone.kind[-1])
+
+
+def test_what_is_recorded_changes_nothing():
+    whole, some = ran(), ran({"record": {"at": [7, 12]}})
+    np.testing.assert_array_equal(some.time, [0, 7, 12, STEPS])
+    np.testing.assert_array_equal(some.u, whole.u.sel(time=some.time))
+    assert some.attrs["certificate"] == whole.attrs["certificate"]
+
+
+def test_a_linear_body_is_factorised_once_for_as_long_as_roles_stay(monkeypatch):
+    made, linearised = [], newton.linearised
+    monkeypatch.setattr(
+        newton, "linearised", lambda *given: made.append(given[2]) or linearised(*given)
+    )
+    ran()
+    assert made == [1]
+    made.clear()
+    ran({"leaders": [HELD, PULLED | {"until": 12}]})
+    assert made == [1, 13]
+
+
+def test_increments_are_recorded_with_fractions_of_a_step_on_request():
+    parts = FRACTURE | {"steps": 4, "solver": {"type": "equilibrium", "increments": 8}}
+    course = {"leaders": [HELD, PULLED | {"from": 3}]}
+    plain, fine = (ran(parts, course, {"record": {"increments": i}}) for i in (False, True))
+    assert plain.time.dtype == np.int64
+    assert fine.time.dtype == fine.step.dtype == np.float64
+    np.testing.assert_array_equal(plain.time, range(5))
+    between = fine.time.values % 1.0 > 0.0
+    assert between.sum() >= 4
+    np.testing.assert_array_equal(fine.u.values[~between], plain.u.values)
+    np.testing.assert_allclose(
+        fine.reaction.values[:, 1, 0],
+        np.interp(fine.time, plain.time, plain.reaction.values[:, 1, 0]),
+        atol=1e-9,
+    )
+    # Within step 3 the group that leads from step 3 on leads.
+    leads = (fine.kind == 0).sum("particle").values
+    np.testing.assert_array_equal(leads, np.where(fine.time > 2.0, 8, 4))
+    narrow = ran(parts, {"record": {"increments": True, "dtype": "float32"}})
+    assert narrow.time.dtype == np.float64
+    assert narrow.position.dtype == np.float32
+
+
+def test_increments_of_steps_are_refused():
+    with pytest.raises(pbdkit.ExperimentError, match="increments of load are those of an equil"):
+        ran({"record": {"increments": True}, "solver": {"type": "stepping"}})
+
+
+def test_a_part_that_a_load_pulls_off_ends_the_run_at_the_last_equilibrium():
+    ds = came_apart(LOADED, FRACTURE)
+    assert ds.attrs["status"] == "separated"
+    assert "certificate" not in ds.attrs
+    reason = ds.attrs["stop_reason"]
+    assert "the bond between particles" in reason
+    assert "nothing holds a part of" in reason
+    assert f"the last equilibrium is that of step {ds.time.values[-1]}" in reason
+    assert "memory: auto" in reason
+    assert 1 < len(ds.time) < 11
+    np.testing.assert_allclose(
+        -ds.reaction.values[:, 0, 0], 0.05 * ds.time.values, atol=1e-9, err_msg="load"
+    )
+    refuse_overstretched(ds, 0.05)
+
+
+def test_what_a_separated_run_recorded_is_kept_in_its_file(call, tmp_path):
+    path, out = tmp_path / "bar.json", tmp_path / "bar.nc"
+    path.write_text(json.dumps(BAR | LOADED | FRACTURE))
+    ended = call("run", str(path), "-o", str(out))
+    assert ended.code == 4
+    assert "separated: the body came apart between step" in ended.err
+    assert "resume" not in ended.err
+    with pbdkit.open(out) as ds:
+        assert ds.attrs["status"] == "separated"
+        assert len(ds.time) > 1
+    refused = call("resume", str(out), "--steps", "20")
+    assert refused.code == 2
+    assert "is separated" in refused.err
+
+
+def test_a_refusal_on_the_way_is_no_run_to_resume(call, tmp_path, monkeypatch):
+    """Resumed, it would be refused again."""
+    monkeypatch.setattr(NetcdfSink, "due", lambda self: True)
+    push = {"select": {"edge": "right"}, "force": [0.01, 0.0], "from": 5, "until": 8}
+    parts = {"leaders": [HELD | {"until": 4}], "loads": [push], "steps": 9}
+    path, out = tmp_path / "bar.json", tmp_path / "bar.nc"
+    diagnostics = [{"type": "displacement"}]
+    path.write_text(json.dumps(BAR | parts | {"diagnostics": diagnostics}))
+    ended = call("run", str(path), "-o", str(out))
+    assert ended.code == 2
+    assert "nothing holds a part of" in ended.err
+    assert "would be refused in the same way" in ended.err
+    assert "goes on from what was kept" not in ended.err
+
+
+def test_a_body_torn_into_two_held_halves_has_a_curve_to_the_end():
+    """Its equilibria go on: the halves are held, and bear nothing."""
+    ds = ran(FRACTURE, {"steps": STEPS})
+    force = ds.reaction.values[:, 1, 0]
+    assert ds.attrs["status"] == "complete"
+    peak = int(force.argmax())
+    assert 10 < peak < STEPS
+    np.testing.assert_allclose(force[: peak + 1], force[1] * np.arange(peak + 1), rtol=1e-6)
+    assert abs(force[-1]) < 1e-3 * force[peak]
+    refuse_overstretched(ds, 0.05)
+
+
+@pytest.mark.parametrize("increments", [False, True])
+def test_a_quasi_static_test_in_parts_is_the_whole(increments, tmp_path):
+    """Stopped anywhere, it goes on to the same file; steps after the last event too."""
+    given = BAR | FRACTURE | {"steps": STEPS + 5, "record": {"increments": increments}}
+    given |= {"solver": {"type": "equilibrium", "increments": 60}}
+    whole = ran(given)
+    path, scene = tmp_path / "bar.nc", build_scene(pbdkit.Experiment(**given))
+
+    def watch():
+        looks = count()
+        return Watch(lambda: next(looks) > 12)
+
+    report = record(Run(scene, watch=watch()), NetcdfSink(path))
+    resumed = 0
+    while report.outcome.status == "interrupted":
+        report, resumed = resumption(path, watch()).record(), resumed + 1
+    assert resumed > 1
+    with pbdkit.open(path) as ds:
+        np.testing.assert_array_equal(ds.time, whole.time)
+        np.testing.assert_array_equal(ds.u, whole.u)
+        np.testing.assert_array_equal(ds.track, whole.track)
+        assert ds.attrs["certificate"] == whole.attrs["certificate"]
+
+
+def test_members_of_a_sweep_that_came_apart_are_kept(call, tmp_path):
+    path = tmp_path / "sweep.yaml"
+    (tmp_path / "bar.json").write_text(json.dumps(BAR | LOADED | FRACTURE))
+    path.write_text(
+        "version: 1\nexperiment: bar.json\nvary: {fracture.failure: [0.05, 0.06]}\n"
+        "keep: {variables: [reaction]}\n"
+    )
+    ended = call("sweep", str(path), "-o", str(tmp_path / "out"))
+    assert ended.code == 0, ended.err
+    with pbdkit.open(tmp_path / "out" / "sweep.nc") as ds:
+        assert set(ds.status.values.tolist()) == {"separated"}
+        assert (ds.reaction.max(("time", "leader_group", "axis")).values >= 0.0).all()
