@@ -265,7 +265,8 @@ def _left_kernel(matrix: Any) -> Floats:
     largest = float(abs(matrix).max()) if size else 0.0
     if not largest > 0.0:
         return np.eye(size)
-    nothing = NOTHING * float(abs(matrix).sum(axis=1).max())
+    # A = 1 - (step operator): the terms that cancel are of size 1, however little they leave.
+    nothing = NOTHING * max(1.0, float(abs(matrix).sum(axis=1).max()))
     if size <= DENSE:
         left, values, _ = np.linalg.svd(dense(matrix))
         found: Floats = left[:, values <= nothing]
