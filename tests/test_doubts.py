@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import pytest
@@ -101,3 +102,64 @@ def test_no_shipped_experiment_is_doubted_so(name: str) -> None:
     if name.startswith(("paper", "modelling")):
         warnings = build_scene(pbdkit.load(name)).warnings
         assert not [w for w in warnings if "radians" in w or ".nearest: " in w]
+
+
+def cloth(soft: float, *, turned: bool = False) -> dict[str, Any]:
+    """Fibres 1/soft as stiff as their shear, along the diagonals or, `turned`, along the axes."""
+    if turned:
+        ratios = {"poisson_ratio": 0.0, "modulus_ratio": 1.0, "shear_ratio": soft}
+    else:
+        across = (0.5 - soft) / (0.5 + soft)
+        modulus = (0.5 + soft) * (1.0 - across**2)
+        ratios = {"poisson_ratio": across, "modulus_ratio": 1.0, "shear_ratio": 0.5 / modulus}
+    return {"type": "orthotropic"} | ratios
+
+
+def pulled_cloth(columns: int, rows: int, soft: float) -> dict[str, Any]:
+    return {
+        "name": "cloth",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "grid", "columns": columns + 1, "rows": rows + 1},
+        "neighbours": {"type": "chebyshev"},
+        "rule": cloth(soft),
+        "frame": {"type": "natural"},
+        "leaders": [
+            {"select": {"edge": "left"}, "motion": HOLD},
+            {
+                "select": {"edge": "right"},
+                "motion": {"type": "displace", "displacement": [0.01 * columns, 0.0]},
+            },
+        ],
+        "steps": 1,
+        "solver": {"type": "equilibrium", "tolerance": 1e-6},
+        "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0}],
+    }
+
+
+def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None:
+    """What is foretold is the order of what comes out, against a lattice four times as fine."""
+
+    def force(rows: int) -> float:
+        ds = pbdkit.run(pulled_cloth(3 * rows, rows, 0.005), progress=False)
+        return float(ds.reaction.values[-1, 1, 0]) / rows
+
+    with pytest.warns(pbdkit.PbdkitWarning, match="cells lock") as caught:
+        coarse, fine = force(12), force(48)
+    told = re.search(r"too stiff by some (\S+) %; turn the body onto", str(caught[0].message))
+    assert told
+    assert 0.6 < (coarse / fine - 1.0) / (float(told[1]) / 100.0) < 1.7
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        cloth(0.005, turned=True),
+        cloth(0.2),
+        {"type": "elastic", "poisson_ratio": 0.499},
+        {"type": "elastic", "poisson_ratio": 0.48, "plane": "strain"},
+        {"type": "elastic", "poisson_ratio": -0.9},
+        {"type": "orthotropic", "poisson_ratio": 0.3, "modulus_ratio": 0.05, "shear_ratio": 0.4},
+    ],
+)
+def test_other_materials_are_not_said_to_lock(rule: dict[str, Any]) -> None:
+    assert not [text for text in warnings_of(rule=rule) if "lock" in text]

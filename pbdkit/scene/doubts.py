@@ -10,12 +10,14 @@ import numpy as np
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
+from pbdkit.interfaces import MixesCells
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.neighbourhood import Neighbourhood, flatness
 from pbdkit.scene.raster import FOLLOWER, Raster
 from pbdkit.scene.selecting import Selecting
+from pbdkit.scene.setting import body_box
 from pbdkit.scene.sites import has_narrow_slot
 
 MANY = 1000
@@ -26,6 +28,11 @@ FAR, SHOWN = 2.0, 5
 """So many spacings from the body a point is warned of, and so many of them are named."""
 ANGLE, ROUNDING, DECIMALS = math.pi / 12, 1e-3, 2
 """Of this multiples are written as radians, to that many digits; degrees are written with fewer."""
+
+LOCKING, NOTICED = 0.07, 0.05
+"""A body of n cells across is too stiff by about this share of the shear stiffness over the least
+stiffness of its cells, over n, where that is of a stretch along one axis with a squeeze along the
+other; from what share on it is warned of."""
 
 
 def doubts_of(
@@ -57,6 +64,29 @@ def doubts_of(
             "take {type: natural}"
         )
     return doubts
+
+
+def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:
+    """A line on materials that hardly stretch along the diagonals of the lattice: shear and the sum
+    of both stretches are stiff, their difference is soft, and cells, which resist hourglassing by
+    their shear stiffness, cannot bend without the former."""
+    rule = experiment.rule
+    if not isinstance(rule, MixesCells) or (c := rule.elasticity()) is None:
+        return
+    values, vectors = np.linalg.eigh([[c.xx, c.xy], [c.xy, c.yy]])
+    if vectors[0, 0] * vectors[1, 0] > -0.25:  # no stretch with a squeeze
+        return
+    sides = [math.hypot(*vector) for vector in raster.lattice.cell().vectors]
+    ends = zip(*body_box(raster), sides, strict=True)
+    across = max(1.0, min((high - low) / side for low, high, side in ends))
+    error = LOCKING * float(c.shear / values[0]) / across
+    if error > NOTICED:
+        yield (
+            f"rule: '{rule.type}' hardly stretches along the diagonals of the lattice with these "
+            f"ratios, so that cells lock: with {across:.3g} of them across the body it may be too "
+            f"stiff by some {100 * error:.2g} %; turn the body onto the lattice, so that the stiff "
+            "directions of the material lie along its axes, or refine it"
+        )
 
 
 def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:

@@ -16,7 +16,13 @@ from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
-from pbdkit.scene.doubts import angles_in_radians, doubts_of, far_from_the_body, without_effect
+from pbdkit.scene.doubts import (
+    angles_in_radians,
+    doubts_of,
+    far_from_the_body,
+    locking,
+    without_effect,
+)
 from pbdkit.scene.field_constants import with_fields
 from pbdkit.scene.frame_points import Frame, build_frame
 from pbdkit.scene.ground import Ground
@@ -137,7 +143,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     warnings = [*ground.warnings, *doubts_of(experiment, neighbourhood, raster, layers)]
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
-    warnings += angles_in_radians(experiment)
+    warnings += [*angles_in_radians(experiment), *locking(experiment, raster)]
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
