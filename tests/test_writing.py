@@ -1,11 +1,13 @@
 """Results are written beside the stepping, in order, and what goes wrong there is not lost."""
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.results.destination import Destination
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.results.progress import Watch
@@ -151,6 +153,17 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
     (kept,) = (p for p in tmp_path.iterdir() if p != path)
     with pbdkit.open(kept) as ds:
         assert ds.attrs["status"] == "complete"
+
+
+def test_what_another_run_writes_is_no_leftover_where_nothing_is_locked(tmp_path, monkeypatch):
+    """The name of its result begins with this one's."""
+    monkeypatch.setattr("pbdkit.results.destination.lock", lambda file: True)
+    with Destination(tmp_path / "x.nc.2", replace=False).temporary() as live:
+        left = Destination(tmp_path / "x.nc", replace=False).temporary()
+        left.close()
+        with Destination(tmp_path / "x.nc", replace=False).temporary():
+            assert Path(live.name).exists()
+            assert not Path(left.name).exists()
 
 
 def test_compression_changes_the_file_and_not_the_values(tmp_path):

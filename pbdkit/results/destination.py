@@ -20,6 +20,8 @@ PARTIAL = "-partial"
 """Added to the name of a result that may not, where its name is taken."""
 TEMPORARY = ".partial"
 """How the names of files end that are no results yet."""
+RANDOM_BYTES = 8
+"""In such a name, as hexadecimal digits, between that of the result and the end."""
 
 
 class Destination:
@@ -36,12 +38,14 @@ class Destination:
         """A new file beside it, under a name that no other machine takes, locked. What killed runs
         left behind under such names is removed. Raises OSError."""
         begin = f".{self.path.name[:100]}."
-        for left in self._folder.glob(f"{escape(begin)}*{TEMPORARY}"):
+        random = "[0-9a-f]" * 2 * RANDOM_BYTES
+        for left in self._folder.glob(f"{escape(begin)}{random}{TEMPORARY}"):
             with suppress(OSError), io.FileIO(left, "r+b") as file:
                 if lock(file):
                     left.unlink()
         while True:
-            file = io.FileIO(self._folder / f"{begin}{secrets.token_hex(8)}{TEMPORARY}", "x+b")
+            name = f"{begin}{secrets.token_hex(RANDOM_BYTES)}{TEMPORARY}"
+            file = io.FileIO(self._folder / name, "x+b")
             if lock(file) and os.fstat(file.fileno()).st_nlink:
                 return file
             file.close()  # another run took it for one that was left behind

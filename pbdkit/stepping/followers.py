@@ -103,9 +103,13 @@ class SlotFollowers(Followers):
         return out
 
     def energy(self, m: Floats, state: State) -> float:
-        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
+        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force,
+        without the forces that broken bonds exert where nothing is displaced."""
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
-            return self._work(m, self.forces(m, state))
+            forces = self.forces(m, state)
+            if self._scene.has_fracture:
+                forces = forces - self.forces(np.zeros_like(m), state)
+            return self._work(m, forces)
         seen, out = self._seen(m, state), np.zeros_like(m[0])
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
             (value,) = around.sums(evaluator.energy, seen, state)
