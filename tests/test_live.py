@@ -324,6 +324,56 @@ def test_what_cannot_be_is_refused_with_nothing_done(command, told, tmp_path):
     assert session.script.written(1) == fresh.script.written(1)
 
 
+REFUSED = [
+    {"do": "turn", "name": "rule.K", "value": 1.0},
+    {"do": "turn", "name": "solver.relaxation", "value": -1.0},
+    {"do": "turn", "name": "solver.relaxation", "value": 0.75},
+    {"do": "drag", "by": [0.3, 0.2]},
+    {"do": "cut", "from": [3.5, -3.0], "to": [3.5, 3.0]},
+    {"do": "release"},
+]
+
+
+@pytest.mark.parametrize("command", REFUSED)
+@pytest.mark.parametrize("back", [False, True])
+def test_what_is_refused_undoes_nothing_else(command, back, tmp_path, monkeypatch):
+    """Neither what was done at this step before, nor what came after it."""
+    session, _ = session_of("paper/a", tmp_path)
+    session.advance(4)
+    followers = np.flatnonzero(session.frame().kinds == FOLLOWER)
+    do(session, do="turn", name="solver.memory", value=0.25)
+    do(session, do="grab", row=int(followers[len(followers) // 2]))
+    if command["do"] != "drag":
+        do(session, do="drag", by=[0.1, 0.2])
+    session.advance(4)
+    if back:
+        do(session, do="rewind", step=4)
+        do(session, do="grab", row=int(followers[len(followers) // 2]))
+        if command["do"] == "release":  # nothing would have been led yet
+            return
+    else:
+        do(session, do="turn", name="solver.relaxation", value=0.5)
+    written, state, kept = session.script.written(10), session.state.copy(), session.history.steps
+    actual, broken = session.stage.set, [True]
+
+    def refusing(given):
+        if broken and command != REFUSED[0]:
+            broken.pop()
+            raise pbdkit.ExperimentError("this scene cannot be")
+        return actual(given)
+
+    monkeypatch.setattr(session.stage, "set", refusing)
+    with pytest.raises(pbdkit.ExperimentError):
+        do(session, **command)
+    assert session.script.written(10) == written
+    assert (session.end, session.history.steps) == (8, kept)
+    assert_same(session.state, state)
+    monkeypatch.undo()
+    do(session, do="rewind", step=8)
+    do(session, do="save")
+    assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
 def test_numbers_from_which_others_are_drawn_are_not_turned(tmp_path):
     session, _ = session_of("modelling/ageing", tmp_path)
     assert "fracture.failure" in session.script.numbers

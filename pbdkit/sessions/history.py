@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from copy import copy
 
 from pbdkit.stepping.state import State
 
@@ -32,6 +33,12 @@ class History:
         while not self._fits():
             self._apart *= 2
             self._thin()
+
+    def copy(self) -> History:
+        """The same states, kept on their own."""
+        found = copy(self)
+        found._states = [*self._states]
+        return found
 
     def before(self, step: int) -> State:
         """A copy of the last state kept that is not after a step."""

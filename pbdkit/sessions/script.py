@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pbdkit.errors import ExperimentError, PbdkitError
@@ -66,6 +67,15 @@ class Script:
         parts = parts_of(experiment)
         groups = [Led(_said(group)) for group in parts.get("leaders", ())]
         return cls(experiment, parts, numbers_of(experiment, parts), groups)
+
+    def copy(self) -> Script:
+        """The same, for what is done to one of the two is not done to the other."""
+        numbers = {name: replace(n, turns=[*n.turns]) for name, n in self.numbers.items()}
+        return replace(self, numbers=numbers, groups=deepcopy(self.groups), cuts=[*self.cuts])
+
+    def restore(self, kept: Script) -> None:
+        """Says what a copy says that is not needed any more."""
+        self.numbers, self.groups, self.cuts = kept.numbers, kept.groups, kept.cuts
 
     def grab(self, group: int, step: int) -> int:
         """Lets the hand lead a group after that step; returns the place of the group that it

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -137,9 +138,8 @@ class Session:
         """Lets go: who led before stays there, others follow again."""
         held, self.held = self.held, None
         if held and held.group is not None and held.frees:
-            self._edit()
-            self.script.let_go(held.group, self.step)
-            self._changed()
+            with self._editing():
+                self.script.let_go(held.group, self.step)
 
     def rest(self) -> None:
         """Steps no more, and lets go of what is held."""
@@ -148,9 +148,8 @@ class Session:
 
     def turn(self, name: str, value: float) -> None:
         """Another value of a number, from the next step on."""
-        self._edit()
-        self.script.turn(name, self.step, value)
-        self._changed()
+        with self._editing():
+            self.script.turn(name, self.step, value)
 
     def cut(self, line: tuple[Way, Way]) -> None:
         """Cuts along a line across the body as it stands, before the next step."""
@@ -183,23 +182,25 @@ class Session:
         return self.script.experiment.of_parts(self.script.playing(self.step))
 
     def _cut(self, segments: list[Segment]) -> None:
-        self._edit()
         if self.stage.choice.engine == "compiled" and not self.stage.scene.has_fracture:
             self.says({"is": "note", "text": "A kernel is made for cuts: some seconds."})
-        self.script.cut(segments, self.step)
-        self._changed()
+        with self._editing():
+            self.script.cut(segments, self.step)
 
     def _take(self, held: Held) -> None:
-        self._edit()
-        step, leading = self.step, self.stage.scene.leading
-        groups = [
-            n for n, of in enumerate(leading) if of.group.leads(step + 1) and held.row in of.rows
-        ]
-        if groups:
-            held.group = self.script.grab(groups[0], step)
-        else:
-            held.group, held.frees = self.script.pick(held.row + 1, step), True
-        self._changed()
+        step, self.held = self.step, None  # nothing is, where it cannot be led
+        with self._editing():
+            leading = self.stage.scene.leading
+            groups = [
+                n
+                for n, of in enumerate(leading)
+                if of.group.leads(step + 1) and held.row in of.rows
+            ]
+            if groups:
+                held.group = self.script.grab(groups[0], step)
+            else:
+                held.group, held.frees = self.script.pick(held.row + 1, step), True
+        self.held = held
         hand = self.script.groups[held.group].hand
         assert hand
         held.start = hand.at(step - self.script.groups[held.group].begins + 1)
@@ -211,11 +212,27 @@ class Session:
         target = self.held.start[0] + self.held.by[0], self.held.start[1] + self.held.by[1]
         first = begin - led.begins + 1
         if led.hand and led.hand.at(first) != target:
-            self._edit()
+            self._forget_later()
             led.hand.lead(first, end - led.begins + 1, target)
 
-    def _edit(self) -> None:
-        """Before something is done: what came after this step is forgotten."""
+    @contextmanager
+    def _editing(self) -> Iterator[None]:
+        """Lets something be done to the script after what came after this step is forgotten. Where
+        it cannot be done all is as before, what came after too."""
+        script, history = self.script.copy(), self.history.copy()
+        state, end = self.state, self.end
+        try:
+            self._forget_later()
+            yield
+            self._changed()
+        except PbdkitError:
+            self.script.restore(script)
+            self.history, self.state, self.end = history, state, end
+            self._changed()
+            raise
+
+    def _forget_later(self) -> None:
+        """What came after this step."""
         if self.step < self.end:
             self.end = self.step
             self.script.cut_back(self.step)
@@ -223,15 +240,9 @@ class Session:
             self._changed()
 
     def _changed(self) -> None:
-        """The script says something else; where it cannot, what was done at this step is undone."""
+        """The script says something else. Raises PbdkitError where it cannot."""
         self.stage.changed()
-        try:
-            self.state = self.stage.set(self.state)
-        except PbdkitError:
-            self.held = None
-            self.script.cut_back(self.step)
-            self._replay(self.step)
-            raise
+        self.state = self.stage.set(self.state)
 
     def _undo(self, step: int, text: str) -> None:
         self.running, self.owed, self.held = False, 0, None
