@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -11,6 +10,8 @@ import pytest
 import pbdkit
 from pbdkit.fitting.calling import problem_of
 from pbdkit.fitting.specification import described_fit
+from pbdkit.fitting.tracks import TracksObservation
+from pbdkit.runs.course import Run
 
 WIDTH, HEIGHT, STEPS = 8.0, 4.0, 16
 MODULUS, THICKNESS, NOISE = 1000.0, 2.0, 1e-4
@@ -233,16 +234,8 @@ def on_rollers(**more):
     return bar(leaders=leaders, steps=10, solver={"type": "equilibrium"}) | more
 
 
-def refused_unless_recorded(step):
-    """Whatever steps an equilibrium gives, others are refused."""
-    if pbdkit.Experiment(**on_rollers(record={"at": [step]})).records(step):
-        return nullcontext()
-    told = rf"need the state of step {step}, .* take solver: {{type: stepping}}"
-    return pytest.raises(pbdkit.ExperimentError, match=told)
-
-
 @pytest.mark.parametrize("times", [[10.0], [0.0, 10.0], [5.0, 7.5, 10.0]])
-def test_an_equilibrium_is_compared_where_the_run_gives_it(times, tmp_path):
+def test_each_step_that_tracks_need_is_an_equilibrium(times, tmp_path):
     """By closed form, with ν = .25."""
     places = np.array([[3.0, 0.0], [3.0, HEIGHT], [6.5, 0.5]])
     u = np.c_[places[:, 0], -0.25 * (places[:, 1] - HEIGHT / 2)]
@@ -254,10 +247,36 @@ def test_an_equilibrium_is_compared_where_the_run_gives_it(times, tmp_path):
         "unknown": {"rule.poisson_ratio": [0.0, 0.49]},
         "measured": {"type": "tracks", "file": str(tmp_path / "tracks.csv"), "noise": 1e-5},
     }
-    with refused_unless_recorded(5) if 5.0 in times else nullcontext():
-        found = pbdkit.fit(fit)
-        assert found.values["rule.poisson_ratio"].value == pytest.approx(0.25, abs=1e-5)
-        assert found.ratio < 0.01
+    found = pbdkit.fit(fit)
+    assert found.values["rule.poisson_ratio"].value == pytest.approx(0.25, abs=1e-5)
+    assert found.ratio < 0.01
+
+
+def test_a_state_that_does_not_come_is_no_displacement_of_0(tmp_path, monkeypatch):
+    write(tmp_path / "rows.csv", ["time", "x", "y", "ux", "uy"], [[7.5, 1.0, 1.0, 0.0, 0.0]])
+    problem = posed(bar(), {"type": "tracks", "file": str(tmp_path / "rows.csv"), "noise": 1.0})
+    every = TracksObservation._recorded
+    monkeypatch.setattr(
+        TracksObservation,
+        "_recorded",
+        lambda self, run: (each for each in every(self, run) if each[0] != 8),
+    )
+    with pytest.raises(pbdkit.ExperimentError, match=r"gives no state at time 7\.5"):
+        problem.at(problem.start())
+
+
+def test_curves_have_the_equilibria_within_steps(tmp_path):
+    """Of bonds that may break, which are loaded in increments."""
+    write(tmp_path / "rows.csv", ["displacement", "force"], [[0.02, 0.0], [0.05, 0.0]])
+    given = {"type": "curve", "file": str(tmp_path / "rows.csv"), "group": 1, "noise": 1.0}
+    made = on_rollers(
+        solver={"type": "equilibrium", "increments": 20}, steps=10,
+        fracture={"type": "strain", "failure": 0.5}, record={"increments": True},
+    )  # fmt: skip
+    (observation,) = posed(made, given).observations
+    places, forces = observation.curve(Run(observation.scene))
+    np.testing.assert_allclose(places, np.linspace(0.0, 0.01 * WIDTH, 21), atol=1e-9)
+    np.testing.assert_allclose(forces, HEIGHT * places / WIDTH, rtol=1e-6, atol=1e-9)
 
 
 def test_rows_beyond_the_end_of_a_curve_are_named(measured, tmp_path):

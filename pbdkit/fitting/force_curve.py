@@ -113,13 +113,12 @@ class CurveObservation(RunObservation):
         return np.interp(self.along, come, force)
 
     def curve(self, run: Run) -> tuple[Floats, Floats]:
-        """At each recorded step, until the group stops or turns, the place (step,) and the force
+        """At each recorded moment, until the group stops or turns, the place (step,) and the force
         over Young's modulus and thickness (step,). After a run has settled its force stays."""
         tables, places, forces = Tables(run.scene), [], []
-        for state in self._recorded(run):
-            moment = StateMoment(state, tables)
-            places.append(state.step if self.at_times else self._gone(state))
-            forces.append(np.dot(self.way, reactions(moment)[self.group]))
+        for moment, state in self._recorded(run):
+            places.append(moment if self.at_times else self._gone(state))
+            forces.append(np.dot(self.way, reactions(StateMoment(state, tables))[self.group]))
         if self.at_times and places[-1] < self.experiment.steps:
             places.append(self.experiment.steps)
             forces.append(forces[-1])

@@ -100,15 +100,17 @@ class RunObservation(Observation):
         when = np.zeros(0) if broken is None else np.asarray(broken, float)
         return found, when, run.state.step
 
-    def _recorded(self, run: Run) -> Iterator[State]:
-        """The states of a run at the steps that it records, each step once, and that at which it
+    def _recorded(self, run: Run) -> Iterator[tuple[float, State]]:
+        """The states that a run records and the moment of each, in steps, and that at which it
         ends. Raises UnconvergedError where it ends without a result."""
-        last = -1
+        last = -1.0
         for state in run:
-            wanted = run.driver.ending or run.scene.experiment.records(state.step)
-            if wanted and state.step > last:
-                last = state.step
-                yield state
+            within = run.driver.within
+            moment = state.step if within is None else within
+            wanted = within is not None or run.scene.experiment.records(state.step)
+            if (wanted or run.driver.ending) and moment > last:
+                last = moment
+                yield moment, state
         if run.outcome is None or run.outcome.status in FAILED:
             reason = run.outcome.stop_reason if run.outcome else "the run did not end"
             raise UnconvergedError(reason)
