@@ -173,7 +173,9 @@ class Shown:
     particles is as it is."""
 
     OWN = ("displacement", "previous_displacement", "reference")
-    OF_PARTICLES = ("body", "sum_over_neighbours", "gradient", "on_particles", "remembered")
+    OF_PARTICLES = (
+        "body", "inside", "sum_over_neighbours", "gradient", "on_particles", "remembered",
+    )  # fmt: skip
 
     def __init__(self, inner: Any, order: Any = None, tables: Any = None) -> None:
         self._inner, self._tables = inner, tables
