@@ -61,6 +61,7 @@ if TYPE_CHECKING:
         LeaderRows as LeaderRows,
         LoadRows as LoadRows,
         Loadable as Loadable,
+        MixesCells as MixesCells,
         Moment as Moment,
         Nearness as Nearness,
         NeighbourMetric as NeighbourMetric,
@@ -80,6 +81,8 @@ if TYPE_CHECKING:
         StartsCracked as StartsCracked,
         Stiffness as Stiffness,
         StoresEnergy as StoresEnergy,
+        TearsCells as TearsCells,
+        Torn as Torn,
         TurnsParticles as TurnsParticles,
         Variable as Variable,
         Vector as Vector,
@@ -103,9 +106,9 @@ _HOME = {
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
         "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel FrameMap "
         "FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows LoadRows "
-        "Loadable Moment Nearness NeighbourMetric Offset Pair Particles Quantity Remembered "
+        "Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles Quantity Remembered "
         "Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot Softens SpaceVector "
-        "StartsCracked Stiffness StoresEnergy TurnsParticles Variable Vector dot length "
+        "StartsCracked Stiffness StoresEnergy TearsCells Torn TurnsParticles Variable Vector dot length "
         "squared_length where"
     ),
     "pbdkit.pages.report": "report",

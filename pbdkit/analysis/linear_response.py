@@ -122,15 +122,17 @@ def _alike(scene: Scene, state: State, sublattice: int, place: Indices) -> tuple
     around = Surroundings(scene, Places(scene.raster.shape, some), sublattice)
     neighbours = around.neighbours(state)
     code = np.zeros(len(some), np.int64)
-    if scene.cells:
-        kinds = [to.w.left for to in neighbours] + [w.left for to in neighbours for w in to.more]
-        left = np.array([np.broadcast_to(shares, some.shape) for shares in kinds])
-        cut = (left[: len(neighbours)] != 1.0).any(axis=0)
-        code[cut] = 1 + np.unique(left[:, cut], axis=1, return_inverse=True)[1].ravel()
+    numbers = [to.w.left - 1.0 for to in neighbours if scene.cells]
+    numbers += [w.left for to in neighbours for w in to.more]
+    numbers += [value for to in neighbours if to.torn for value in to.torn]
+    if numbers:
+        table = np.array([np.broadcast_to(value, some.shape) for value in numbers])
+        odd = (table != 0.0).any(axis=0)
+        code[odd] = 1 + np.unique(table[:, odd], axis=1, return_inverse=True)[1].ravel()
     differing = [mask for to in neighbours for mask in (to.present, to.broken) if mask is not None]
     for mask in differing:
         code = 2 * code + mask
-    # More than fits a number, leaving 20 bits for the cut cells around a particle.
+    # More than fits a number, leaving 20 bits for the cut and torn cells around a particle.
     if len(differing) > 42:
         return np.arange(len(place)), place
     _, found, kind[others] = np.unique(code, return_index=True, return_inverse=True)
@@ -151,13 +153,19 @@ def _plain(scene: Scene, state: State, sublattice: int) -> Present:
     whole = scene.cells.weight == 1.0 if scene.cells else there
     for slot in around.slots[sublattice]:
         here &= block.seen_through(slot).of(there)
-        if state.broken_step is not None:
+        if state.broken_step is not None and not scene.tears:
             plane, at_this_end = around.home[slot]
             home = block if at_this_end else block.seen_through(slot)
             here &= home.within(state.broken_step[plane]) < 0
         for side in around.tiling.beside[slot] if scene.cells else ():
             first = block.seen_through(side.first) if side.first else block
             here &= first.of(whole[side.kind])
+    if scene.tears:
+        assert state.broken_step is not None
+        for cell in around.cells_around[sublattice].cells:
+            for bond in cell:
+                home = block.seen_through(bond.home) if bond.home else block
+                here &= home.within(state.broken_step[bond.plane]) < 0
     return plain
 
 

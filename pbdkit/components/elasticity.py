@@ -6,9 +6,18 @@ import math
 from abc import abstractmethod
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pbdkit.components.cell_stiffness import bond_weights, mean_move, pulled
+from pbdkit.components.cell_stiffness import (
+    bond_springs,
+    bond_weights,
+    mean_move,
+    pulled,
+    springs_in,
+    torn_pull,
+)
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
@@ -20,6 +29,8 @@ from pbdkit.interfaces import (
     Setting,
     Slot,
     Stiffness,
+    TearsCells,
+    Torn,
     Vector,
 )
 from pbdkit.interfaces.units import LENGTH
@@ -30,7 +41,7 @@ Factor = Annotated[
 ]
 
 
-class CellElastic(MixesCells, HasStiffBonds, Loadable, FollowerRule):
+class CellElastic(MixesCells, TearsCells, HasStiffBonds, Loadable, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -76,13 +87,27 @@ class CellElastic(MixesCells, HasStiffBonds, Loadable, FollowerRule):
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """xx, xy, yx, yy: the weight of the cell to the left is [[xx, xy], [yx, yy]], of that
-        to the right the transpose; a cell on both sides counts half on each."""
-        return bond_weights(slot, self.material()[1], setting.cells)
+        to the right the transpose; a cell on both sides counts half on each. `spring` is what
+        remains along the bond where the cell is torn, over its squared length."""
+        material, cells = self.material()[1], setting.cells
+        springs = {"spring": bond_springs(slot, material, cells)}
+        return bond_weights(slot, material, cells) | springs
 
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
         """The same of cells of that stiffness."""
         modulus = self.stiffness * self.material()[0]
-        return bond_weights(slot, Stiffness(*(value / modulus for value in c)), setting.cells)
+        whole = bond_weights(slot, Stiffness(*(value / modulus for value in c)), setting.cells)
+        return whole | {"spring": 0.0}
+
+    def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
+        """`spring` alone."""
+        weights = self.weights(slot, setting)
+        return dict.fromkeys(weights, 0.0) | {"spring": weights["spring"]}
+
+    def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
+        """The most that a stiffness exceeds."""
+        modulus, material = self.material()
+        return springs_in(c / (self.stiffness * modulus), material, setting.cells)
 
     def stiffness_along(self, slot: Slot, setting: Setting) -> float:
         """Stiffness · modulus · r·W r / |r|²."""
@@ -94,6 +119,13 @@ class CellElastic(MixesCells, HasStiffBonds, Loadable, FollowerRule):
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """W d, and entries of W, of which the sum is symmetric."""
         return pulled(d, w)
+
+    @staticmethod
+    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+        """The same with what torn cells pull in place of W d; the entries of W stay, so that moves
+        are no larger for a given force, whatever is broken."""
+        _, xx, xy, yy = pulled(d, w)
+        return torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Vector:
@@ -228,6 +260,12 @@ class StrainGradient(AppliesTwice, IsotropicElastic):
         """c W d, and entries of W."""
         pull, xx, xy, yy = pulled(d, w)
         return p.c * pull, xx, xy, yy
+
+    @staticmethod
+    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+        """The same with what torn cells pull in place of W d."""
+        _, xx, xy, yy = pulled(d, w)
+        return p.c * torn_pull(d, r, w, t), xx, xy, yy
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Any:

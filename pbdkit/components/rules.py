@@ -18,6 +18,8 @@ from pbdkit.interfaces import (
     Slot,
     Stiffness,
     StoresEnergy,
+    TearsCells,
+    Torn,
     Vector,
     dot,
     length,
@@ -129,7 +131,7 @@ EDGE_OF_SQUARE, DIAGONAL_OF_SQUARE, OF_TRIANGLE = 0.75, 0.375, math.sqrt(0.75)
 """Stiffnesses of the springs over Young's modulus and thickness: isotropic with ν = 1/3."""
 
 
-class Springs(HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
+class Springs(TearsCells, HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
     """Each neighbour proposes the place at its rest distance, on the line to where the particle
     stands: x_k + l₀ (x_j - x_k)/|x_j - x_k|; the particle goes to the weighted mean.
 
@@ -168,10 +170,15 @@ class Springs(HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:
         """(k e n, k) with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
-        stiffness, v = w.half * (w.left + w.right), r + d
-        distance = length(v)
-        elongation = dot(d, r + v) / (distance + w.rest)
-        return (stiffness * elongation / where(distance > 0.0, distance, 1.0)) * v, stiffness
+        stiffness = w.half * (w.left + w.right)
+        return spring_pull(d, r, stiffness, w.rest), stiffness
+
+    @staticmethod
+    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+        """((1 - D) k e n, k): the stiffness k stays, so that moves are no larger for a given force,
+        whatever is broken."""
+        left, right = w.left * (1.0 - t.bond_left), w.right * (1.0 - t.bond_right)
+        return spring_pull(d, r, w.half * (left + right), w.rest), w.half * (w.left + w.right)
 
     @staticmethod
     def apply(total: Any, here: Here, p: Any) -> Any:
@@ -195,3 +202,11 @@ class Springs(HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
         v = r + d
         elongation = dot(d, r + v) / (length(v) + w.rest)
         return w.half * (w.left + w.right) * elongation * elongation / 4
+
+
+def spring_pull(d: Any, r: Any, stiffness: Any, rest: Any) -> Any:
+    """k e n with the elongation e = |r + d| - |r| along n = (r + d)/|r + d|."""
+    v = r + d
+    distance = length(v)
+    elongation = dot(d, r + v) / (distance + rest)
+    return (stiffness * elongation / where(distance > 0.0, distance, 1.0)) * v

@@ -33,6 +33,8 @@ from pbdkit.interfaces.rule import (
     SharesParticles,
     Stiffness,
     StoresEnergy,
+    TearsCells,
+    Torn,
     TurnsParticles,
 )
 from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Quantity
@@ -65,6 +67,6 @@ __all__ = [
     "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles",
     "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles", "Setting",
     "SharesParticles", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
+    "StoresEnergy", "TearsCells", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
     "squared_length", "where",
 ]  # fmt: skip

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.lattice import Cell
 from pbdkit.interfaces.neighbour_metric import Slot
@@ -79,7 +82,7 @@ class FollowerRule(TakesFields):
     has no neighbour stays. A fictitious neighbour counts as present.
 
     What only some rules can do is a class that they take on besides: `Calibrated`, `Loadable`,
-    `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
+    `TearsCells`, `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
     `TurnsParticles`, `AppliesTwice`.
     """
 
@@ -176,6 +179,31 @@ class StoresEnergy(Calibrated):
         thickness, elementwise."""
 
 
+class Torn(NamedTuple):
+    """Damage beside a bond, 0 where nothing is damaged and 1 where a bond is broken: the largest of
+    any bond of the cell to the left and to the right of it, and its own in each of the two."""
+
+    left: Any
+    right: Any
+    bond_left: Any
+    bond_right: Any
+
+
+class TearsCells(Calibrated):
+    """A calibrated rule that works cell by cell, and computes itself what cells with broken and
+    softened bonds exert: forces that balance and that no rigid motion causes.
+
+    Where bonds can break, a bond that is lost keeps its difference d; no fictitious point takes its
+    place, and models must not place one that would pull.
+    """
+
+    @staticmethod
+    @abstractmethod
+    def torn(d: Any, r: Any, w: Any, t: Torn, p: Any) -> tuple[Any, ...]:
+        """The contributions of one neighbour, as `gather` returns them, with the damage t beside
+        the bond; those of `gather`, to the last bit, where t is zero."""
+
+
 class MixesCells(Calibrated):
     """A calibrated rule that works cell by cell, of whatever material each cell is: its numbers may
     then differ from cell to cell."""
@@ -184,6 +212,17 @@ class MixesCells(Calibrated):
     def cell_weights(self, slot: Slot, setting: Setting, c: Stiffness) -> dict[str, float]:
         """The weights of a slot, as `weights`, were the cells of stiffness c over the modulus of
         the rule: linear in c."""
+
+    def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
+        """The part of `weights` that remains where cells are torn, the other weights 0; by default
+        there is none. It is not linear in a cell's stiffness: cells of another have `spring_share`
+        of it."""
+        return dict.fromkeys(self.weights(slot, setting), 0.0)
+
+    def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
+        """(cell,): how many times the `spring_weights` cells have, for their stiffness c over
+        Young's modulus, (cell, 3, 3) in the components xx, yy, xy."""
+        return np.zeros(len(c))
 
 
 class RenewsParticles(Remembers):

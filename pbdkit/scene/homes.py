@@ -16,6 +16,7 @@ from typing import Any
 from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import (
+    Calibrated,
     FollowerRule,
     FractureModel,
     HasStiffBonds,
@@ -86,6 +87,8 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         further = {s: of_material(fracture, rule, setting, s) for s in slots}
         limits = {s: _named("Constants", fracture.constants(s), **further[s]) for s in slots}
         _refuse_other_names(limits, "constants")
+        if isinstance(rule, Calibrated) and fracture.can_break:
+            _refuse_pulling(fracture, rule, slots, of_fracture)
         names = (*limits[slots[0]]._fields, *(n.name for n in bond_numbers(experiment)))
         if twice := {name for name in names if names.count(name) > 1}:
             raise PluginError(
@@ -95,6 +98,20 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
     own = tuple(number.name for number in particle_numbers(experiment))
     kinds = _kind("Constants", names), _kind("Own", own)
     return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
+
+
+def _refuse_pulling(
+    fracture: FractureModel, rule: FollowerRule, slots: list[Slot], parameters: Any
+) -> None:
+    """A force that a lost bond goes on to exert on one end alone balances no other."""
+    u = 0.1 * slots[0].rest
+    lost = [fracture.fictitious(u, slot.rest, parameters) for slot in slots]
+    if any(component != 0.0 for one in lost for component in one):
+        raise ExperimentError(
+            f"'{fracture.type}' places fictitious points that pull at the ends of lost bonds, which "
+            f"under the calibrated rule '{rule.type}' would be forces that nothing balances; take "
+            "placement: 1 and fictitious: cell, or a rule of the paper"
+        )
 
 
 def named_weights(values: Any, rule: FollowerRule) -> Any:

@@ -14,6 +14,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import Cell, Components, Lattice, NeighbourMetric, Offset, Slot
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Tiling
+from pbdkit.scene.cell_bonds import CellsAround, cells_around
 from pbdkit.scene.cells import tiling_of
 
 FLATTEST = 1e-3
@@ -46,6 +47,12 @@ class Neighbourhood:
     def tiling(self) -> Tiling:
         """The cells of the lattice, and which of them lie beside the slots."""
         return tiling_of(self.cell, self.slots)
+
+    @cached_property
+    def cells_around(self) -> tuple[CellsAround, ...]:
+        """By sublattice the cells around a particle with their bonds; none where neighbours are not
+        the corners of cells."""
+        return cells_around(self.tiling, self.slots, [plane.slot for plane in self.planes])
 
     @cached_property
     def every(self) -> tuple[Slot, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting
+from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting, TearsCells
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
@@ -93,6 +93,12 @@ class Scene:
     def has_fracture(self) -> bool:
         """Whether bonds can come to be broken, torn or cut, so that their state is kept."""
         return self.experiment.parts_bonds
+
+    @property
+    def tears(self) -> bool:
+        """Whether cells can be torn: bonds can break, and the rule computes what torn cells
+        exert."""
+        return self.has_fracture and isinstance(self.experiment.rule, TearsCells)
 
     @property
     def lag(self) -> int:

@@ -26,6 +26,7 @@ from pbdkit.interfaces import (
     Slot,
     Softens,
     StoresEnergy,
+    Torn,
     where,
 )
 from pbdkit.interfaces.component import as_values, as_vector, as_verdict
@@ -46,7 +47,9 @@ class Neighbour:
     it is `present` and where the bond is `broken` (None: everywhere, nowhere); with fracture the
     constants c of the bond, what is remembered of it included. `more` are weights besides w, of
     cells that are of a stiffness of their own: what they contribute is added. For rules that see
-    it, `shared` is what is remembered of the particle and of the neighbour."""
+    it, `shared` is what is remembered of the particle and of the neighbour. `torn` is the damage
+    beside the bond, for rules that tear cells, where there is any; such rules see the difference
+    as it is."""
 
     r: Components
     w: Any
@@ -55,6 +58,7 @@ class Neighbour:
     c: Any = None
     more: tuple[Any, ...] = ()
     shared: tuple[Any, ...] = ()
+    torn: Torn | None = None
 
 
 class Evaluator:
@@ -65,6 +69,7 @@ class Evaluator:
         self.rule: FollowerRule = scene.experiment.rule
         self._model = scene.experiment.fracture
         self._p, self._q = scene.constants.rule, scene.constants.fracture
+        self.tears = scene.tears
         self._of_bond = bond_numbers(scene.experiment)
         self._of_particle = particle_numbers(scene.experiment)
 
@@ -77,13 +82,29 @@ class Evaluator:
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
         rule: Any = self.rule  # some are given more than others
+        if self.tears:
+            parts = (self._in_cells(d, to.r, w, to.torn) for w in (to.w, *to.more))
+            return summed((as_values(part, "gather"), None) for part in parts)
         seen = self.seen(d, u, to)
         parts = (rule.gather(seen, to.r, w, self._p, *to.shared) for w in (to.w, *to.more))
         return summed((as_values(part, "gather"), None) for part in parts)
 
+    def _in_cells(self, d: Components, r: Components, w: Any, torn: Torn | None) -> Any:
+        """What a neighbour contributes under a rule that tears cells, with some weights."""
+        rule: Any = self.rule
+        if torn is None:
+            return rule.gather(d, r, w, self._p)
+        return rule.torn(d, r, w, torn, self._p)
+
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
         assert isinstance(self.rule, StoresEnergy)
+        if self.tears:
+            w, t = to.w, to.torn
+            if t is not None:
+                left, right = w.left * (1.0 - t.bond_left), w.right * (1.0 - t.bond_right)
+                w = w._replace(left=left, right=right)
+            return (self.rule.energy(d, to.r, w, self._p),)
         return (self.rule.energy(self.seen(d, u, to), to.r, to.w, self._p),)
 
     def seen(self, d: Components, u: Components, to: Neighbour) -> Components:
@@ -98,6 +119,13 @@ class Evaluator:
             with blaming(model, "to soften a bond"):
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
+
+    def damage(self, r: Components, c: Any) -> Any:
+        """The share of its pull that a bond with the constants c has lost, which has not broken."""
+        model: Any = self._model
+        ahead, nothing = (vector([x, *[0.0] * (len(r) - 1)]) for x in (1.0, 0.0))
+        with blaming(model, "to soften a bond"):
+            return 1.0 - as_vector(model.seen(ahead, nothing, r, c, self._q), "seen", ahead)[0]
 
     def move(self, total: Contributions, here: Here, load: Components | None = None) -> Any:
         """From where the particle stands to its target, under a load if there is any."""

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Components, Here, Slot, Softens
+from pbdkit.interfaces import Components, Here, Slot, Softens, Torn
 from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
+from pbdkit.scene.cell_bonds import CellBond
 from pbdkit.scene.places import Where
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Contributions, Mask, Neighbour, summed
+from pbdkit.stepping.evaluator import Contributions, Evaluator, Mask, Neighbour, summed
 from pbdkit.stepping.state import State, shown
 
 BLOCK_CELLS = 16384
@@ -29,7 +30,8 @@ class Surroundings:
     where particles of the body have a neighbour, `movable` (None: everywhere)."""
 
     def __init__(self, scene: Scene, where: Where, sublattice: int) -> None:
-        self._scene, self.where = scene, where
+        self._scene, self.where, self._sublattice = scene, where, sublattice
+        self._evaluator = Evaluator(scene)
         self.slots = scene.neighbourhood.slots[sublattice]
         self._present = presence(scene.raster, where, self.slots)
         self._weights = [self._weights_of(slot) for slot in self.slots]
@@ -55,6 +57,12 @@ class Surroundings:
     def neighbours(self, state: State) -> list[Neighbour]:
         """The neighbours through each slot, as they are in a state."""
         parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
+        if self._scene.tears:
+            torn = self._torn(state)
+            return [
+                Neighbour(slot.rest, w, present, more=more, torn=torn and torn[slot])
+                for slot, w, present, more in parts
+            ]
         return [
             Neighbour(
                 slot.rest, w, present, *self._bond(slot, state), more, self._shared(slot, state)
@@ -113,6 +121,43 @@ class Surroundings:
             return ()
         ends = self.where, self.where.seen_through(slot)
         return tuple(self._remembered(end, state) for end in ends)
+
+    def _torn(self, state: State) -> dict[Slot, Torn] | None:
+        """The damage beside each slot; None where nothing is damaged."""
+        around = self._scene.neighbourhood.cells_around[self._sublattice]
+        damage = {
+            (bond.plane, bond.home): self._damage(bond, state)
+            for cell in around.cells
+            for bond in cell
+        }
+        if not any(np.any(one) for one in damage.values()):
+            return None
+        largest = [
+            reduce(np.maximum, (damage[bond.plane, bond.home] for bond in cell))
+            for cell in around.cells
+        ]
+        found = {}
+        for slot in self.slots:
+            plane, at_this_end = self._scene.neighbourhood.home[slot]
+            own = damage[plane, None if at_this_end else slot]
+            left, right = (largest[n] for n in around.beside[slot])
+            found[slot] = Torn(left, right, own, own)
+        return found
+
+    def _damage(self, bond: CellBond, state: State) -> NDArray[np.floating[Any]]:
+        """The share of their pull that bonds have lost: 1 where they are broken."""
+        scene, home = self._scene, self.where
+        if bond.home:
+            home = home.seen_through(bond.home)
+        assert state.broken_step is not None
+        broken = home.within(state.broken_step[bond.plane]) >= 0
+        softened: Any = 0.0
+        if isinstance(scene.experiment.fracture, Softens):
+            own = shown([home.within(value[bond.plane]) for value in state.bond_values])
+            limits = scene.constants.limits_at(bond.slot, bond.plane, home)
+            c = scene.constants.of_bond(*limits, *own)
+            softened = self._evaluator.damage(bond.slot.rest, c)
+        return np.where(broken, 1.0, softened).astype(scene.experiment.stepping.precision)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
         """Where the bond along a slot is broken, and its constants where they reach the rule."""
