@@ -43,11 +43,18 @@ SHEETS = {
     "by place": {"lattice": LATTICES["oblique"], "rule": RULES["mixed-coordinate-y"]},
     "torn": TEARS,
     "torn, no frame": TEARS | {"frame": {"type": "none"}},
-    "torn, matrices of a frame": TEARS
-    | {
+    "torn, matrices of a frame": {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": ELASTIC,
         "frame": Turning(),
+        "fracture": TORN | {"thresholds": [1.2], "placement": 1.0},
+    },
+    "torn cells": {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": ELASTIC,
+        "frame": {"type": "natural"},
+        "fracture": {"type": "strain", "failure": 0.15},
+        "initial": {"type": "noise", "amplitude": 0.1},
     },
     "strength by bond, cut cells": CUT["square"]
     | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},

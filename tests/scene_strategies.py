@@ -275,5 +275,24 @@ def calibrated_experiments(draw):
     else:
         experiment["frame"] = {"type": draw(one_of(["natural", "natural", "mean", "none"]))}
         if draw(st.booleans()):
-            experiment["fracture"] = draw(thresholds(lattice, near))
+            experiment["fracture"] = draw(of_calibrated_bonds(lattice, near))
+        if draw(one_of([False, False, True])):
+            ends = draw(st.tuples(vectors, vectors))
+            at = draw(st.integers(0, 3))
+            cut = {"from": [4 * x for x in ends[0]], "to": [4 * x for x in ends[1]], "at": at}
+            experiment["cuts"] = (
+                [cut] if cut["from"] != cut["to"] and at <= experiment["steps"] else []
+            )
     return experiment
+
+
+@st.composite
+def of_calibrated_bonds(draw, lattice, near):
+    """Fracture whose lost bonds exert nothing."""
+    spares, limit = draw(st.booleans()), draw(st.floats(0.02, 0.4))
+    kind = draw(one_of(["threshold", "strain", "damage"]))
+    if kind == "threshold":
+        return draw(thresholds(lattice, near)) | {"placement": 1.0, "fictitious": "cell"}
+    limits = {"failure": limit} if kind == "strain" else {"onset": limit / 2, "failure": 2 * limit}
+    scatter = {"scatter": draw(one_of([0.0, 0.3]))}
+    return {"type": kind, "frame_bonds": spares} | limits | scatter

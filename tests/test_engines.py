@@ -177,7 +177,7 @@ COMPILED = {
         "neighbours": {"type": "chebyshev", "shells": 1},
         "rule": ELASTIC,
         "frame": Turning(),
-        "fracture": TORN,
+        "fracture": TORN | {"placement": 1.0},
     },
     "strength by bond in cut cells": CUT["square"]
     | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},

@@ -10,6 +10,7 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting, TearsCells
+from pbdkit.interfaces.lattice import Index
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
 from pbdkit.scene.cell_materials import weighed
@@ -99,6 +100,19 @@ class Scene:
         """Whether cells can be torn: bonds can break, and the rule computes what torn cells
         exert."""
         return self.has_fracture and isinstance(self.experiment.rule, TearsCells)
+
+    @cached_property
+    def home_reach(self) -> tuple[Index, Index]:
+        """How many repeat cells before and after a particle's own, along each axis, the bonds are
+        kept on which its move depends: its own, or where cells can be torn all of the cells around
+        it."""
+        if not self.tears:
+            return self.neighbourhood.home_reach
+        cells = (cell for of in self.neighbourhood.cells_around for cell in of.cells)
+        homes = {bond.home for cell in cells for bond in cell}
+        steps = np.array([home.cell if home else (0,) * self.axes for home in homes])
+        low, high = np.minimum(steps.min(axis=0), 0), np.maximum(steps.max(axis=0), 0)
+        return tuple((-low).tolist()), tuple(high.tolist())
 
     @property
     def lag(self) -> int:

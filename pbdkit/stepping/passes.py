@@ -111,9 +111,11 @@ class Skew:
         if self.scene.inner:  # and its frame points follow
             far = reach + apart
             return AxisSkew(reach, far, far, reach, reach, apart)
-        if self.scene.has_fracture and isinstance(fracture, RenewsBonds):
-            back, ahead = (home[axis] for home in around.home_reach)
-            return AxisSkew(reach, back, ahead, ahead, back, apart)
+        first = isinstance(fracture, RenewsBonds) or (self.scene.tears and fracture.can_break)
+        if self.scene.has_fracture and first:
+            below, above = (home[axis] for home in around.home_reach)
+            back, ahead = (home[axis] for home in self.scene.home_reach)
+            return AxisSkew(reach, back, ahead, above, below, apart)
         return AxisSkew(reach, 0, 0, 0, 0, apart)
 
     @property

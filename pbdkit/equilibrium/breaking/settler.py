@@ -57,6 +57,8 @@ class Settler:
         size = np.array(scene.raster.shape[1:])
         box = np.stack([np.zeros_like(size), size], axis=1).ravel().astype(np.int64)
         self._constant = constant_arrays(plan) | {"box": box}
+        if plan.tears:  # every follower is taken as torn, and marks are written but not read
+            self._constant["torn"] = np.zeros(scene.raster.shape, np.uint8)
         self._roles: tuple[bool, ...] = ()
         self._of_roles: Arrays = {}
         self._work = 1

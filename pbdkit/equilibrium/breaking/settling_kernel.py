@@ -77,7 +77,8 @@ def _bonds(plan: Plan, pattern: str) -> list[str]:
 
 
 def _write_mark(plan: Plan) -> Function:
-    """The function that marks followers whose bonds are not as they were known; then they are."""
+    """The function that marks followers whose bonds, or those of the cells around them, are not as
+    they were known; then they are."""
     out = Function(plan.shared, "mark")
     differs = _bonds(plan, " or flat_bond#[home] != flat_known#[home]")
     out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")
@@ -86,7 +87,11 @@ def _write_mark(plan: Plan) -> Function:
     out.add(2, f"if flat_broken[home] != flat_known_broken[home]{''.join(differs)}:")
     out.add(3, "flat_known_broken[home] = flat_broken[home]")
     out.add(3, *_bonds(plan, "flat_known#[home] = flat_bond#[home]"))
-    out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + way):")
+    if plan.tears:
+        out.add(3, "for m in range(mark_steps.shape[1]):")
+        out.add(4, "end = ends[n, 0] * cells + e + mark_steps[n, m]")
+    else:
+        out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + way):")
     out.add(4, "if 0 <= end < equation.size and equation[end] >= 0:")
     out.add(5, "stale[equation[end]] = 1")
     return out

@@ -19,6 +19,7 @@ from pbdkit.scene.places import Block, slot_step
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.bands import frame_order
 from pbdkit.stepping.compiled.plan import Plan
+from pbdkit.stepping.compiled.tearing import tearing_arrays
 from pbdkit.stepping.state import Floats, State
 
 Arrays = dict[str, Any]
@@ -46,6 +47,8 @@ def constant_arrays(plan: Plan) -> Arrays:
             arrays["mixed"] = np.stack(mixed, axis=-1).astype(real)
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
+    if scene.tears:
+        arrays |= tearing_arrays(scene)
     if frame := scene.frame:
         arrays |= _of_frame(frame, frame_order(plan), real)
     return arrays

@@ -10,6 +10,7 @@ from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
 from pbdkit.stepping.compiled.particle import parameters
 from pbdkit.stepping.compiled.plan import Function, Plan, values
+from pbdkit.stepping.compiled.tearing import marking_lines
 
 
 def write_bond_pass(plan: Plan) -> Function:
@@ -34,6 +35,8 @@ def write_bond_pass(plan: Plan) -> Function:
     out.add(0, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
     out.add(0, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(plan.bonds)))
     out.add(0, *(f"x{m} = {plan.row(f'limit{m}', 'n')}" for m in range(plan.limits)))
+    if plan.tears:
+        out.add(0, f"bond_base, base = {plan.flat('n')}, {plan.flat('ends[n, 0]')}")
     _write_judging(out, plan)
     return out
 
@@ -78,12 +81,16 @@ def _write_judging(out: Function, plan: Plan) -> None:
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
     own = judging(plan, "n@[j] - h@[j]")
-    # One loop that looks, and vectorises; another one writes, where there is anything to write.
+    # Loops that look, and vectorise; the last one writes, where there is anything to write. What is
+    # far from breaking is told by lengths alone, which takes half the time.
     out.add(0, "some = 0", "for j in range(j1 - j0):")
-    out.add(1, *own.look, f"fresh = (since[j] < 0) & {can} & ({own.breaks}{own.differ})")
-    out.add(1, "some = some | (1 if fresh else 0)")
+    out.add(1, *own.look, f"some = some | (1 if {own.breaks}{own.differ} else 0)")
+    out.add(0, "if some:", "    some = 0", "    for j in range(j1 - j0):")
+    out.add(2, *own.look, f"fresh = (since[j] < 0) & {can} & ({own.breaks}{own.differ})")
+    out.add(2, "some = some | (1 if fresh else 0)")
     out.add(0, "if some:", "    for j in range(j1 - j0):")
-    out.add(2, f"if (since[j] < 0) & {can}:", *("    " + line for line in own.write))
+    write = [*own.write, *marking_lines(plan, "bond_base + j", "base + j")]
+    out.add(2, f"if (since[j] < 0) & {can}:", *("    " + line for line in write))
 
 
 def write_events(plan: Plan) -> Function:

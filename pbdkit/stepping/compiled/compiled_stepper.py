@@ -30,6 +30,7 @@ from pbdkit.stepping.compiled.pair_loop import PairFollowers
 from pbdkit.stepping.compiled.plan import Plan
 from pbdkit.stepping.compiled.reach import Reach
 from pbdkit.stepping.compiled.stretches import find_runs
+from pbdkit.stepping.compiled.tearing import renew_torn_marks, torn_marks
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.guidance import Guidance
@@ -84,6 +85,8 @@ class CompiledStepper(Engine):
         self._arrays |= {f"was{m}": np.zeros(scene.raster.shape, own[m].dtype) for m in plan.kept}
         if plan.judged:
             self._arrays["lost"] = np.zeros(start.u.shape[1:], bits_for(scene))
+        if plan.tears:
+            self._arrays["torn"] = np.zeros(start.u.shape[1:], np.uint8)
         shared = (*plan.shared, *self._named(start, [[]]))
         source, self._names = write_kernel(replace(plan, shared=shared), groups)
         # No step is made, so that what does not compile is known before the first.
@@ -106,12 +109,16 @@ class CompiledStepper(Engine):
         if self._pairs is None and state is self._last:
             if self._plan.judged:
                 renew_lost_bits(self._arrays["lost"], self._scene, state, rows)
+            if self._plan.tears:
+                renew_torn_marks(self._arrays["torn"], self._scene, state, rows)
             self._reach.take_in(state, rows)
 
     def _begin(self, state: State) -> None:
         self._moves[...] = 0.0
         if self._plan.judged:
             self._arrays["lost"] = lost_bits(self._scene, state)
+        if self._plan.tears:
+            self._arrays["torn"] = torn_marks(self._scene, state)
         self._reach.begin(state)
 
     def _some_steps(self, state: State, end: int) -> State:

@@ -129,7 +129,7 @@ def _write_run(
 def _write_bands(out: Function, plan: Plan, judging: Function, sweep: Function) -> None:
     """Band by band, so that what the pass over bonds has read and written is still near when it is
     swept."""
-    back, ahead = (along[0] for along in plan.scene.neighbourhood.home_reach)
+    back, ahead = (along[0] for along in plan.scene.home_reach)
     out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
     out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
     out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")

@@ -25,7 +25,7 @@ import numba
 import numpy as np
 from numba.core.registry import cpu_target
 
-from pbdkit.interfaces import Here, length
+from pbdkit.interfaces import Here, Torn, length
 from pbdkit.interfaces.vector import KINDS
 from pbdkit.stepping.compiled.functions import compiled, source_key
 
@@ -167,5 +167,7 @@ def words(made: Callable[[Function], Any]) -> dict[str, Any]:
     kinds = {kind.__name__: kind for kind in KINDS.values()}
     numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}
     return (
-        kinds | numbers | {"Here": Here, "length": made(length), "namedtuple": namedtuple, "np": np}
+        kinds
+        | numbers
+        | {"Here": Here, "Torn": Torn, "length": made(length), "namedtuple": namedtuple, "np": np}
     )

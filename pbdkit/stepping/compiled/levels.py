@@ -17,6 +17,7 @@ from pbdkit.interfaces import (
     RenewsBonds,
     RenewsParticles,
     Softens,
+    TearsCells,
 )
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
@@ -35,6 +36,7 @@ FUNCTIONS: dict[type[Any], tuple[str, ...]] = {
     FractureModel: ("breaks", "fictitious"),
     Softens: ("seen",),
     RenewsBonds: ("update",),
+    TearsCells: ("torn",),
 }
 """The elementwise functions of rules and fracture models, and of those with a capability."""
 

@@ -68,7 +68,7 @@ def difference(plan: Plan, level: Level, there: str) -> str:
 def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
     """d as the rule sees it at slot k: softened, or that of the fictitious point where the bond
     `breaks` or is lost `since` a step."""
-    if plan.model is None:
+    if plan.model is None or plan.tears:
         return []
     lines = [f"is_lost = {since} >= 0"]
     if plan.judged:
@@ -83,10 +83,12 @@ def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -
     return [*lines, f"d = {plan.vector('f.@ if is_lost else d.@')}"]
 
 
-def contributions(plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = ()) -> str:
+def contributions(
+    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = (), torn: bool = False
+) -> str:
     """What a neighbour contributes, by name; `there` is what is remembered of it, where the rule
-    sees that."""
-    return _gathered(plan, level, r, weights, there, "c")
+    sees that; with the damage t beside the bond where cells are `torn`."""
+    return _gathered(plan, level, r, weights, there, "c", torn)
 
 
 def more_contributions(
@@ -95,20 +97,20 @@ def more_contributions(
     """What cells of a stiffness of their own add to it, with these weights."""
     lines = list[str]()
     for w in weights:
-        lines.append(_gathered(plan, level, r, w, there, "e"))
+        lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
         lines += [f"c{n} = c{n} + {plan.rounded(f'e{n}')}" for n in range(len(level.totals))]
     return lines
 
 
 def _gathered(
-    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str], into: str
+    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str], into: str, torn: bool
 ) -> str:
     n = level.number
     names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
-    given = ["d", r, f"Weights{n}({weights})", "p"]
+    given = ["d", r, f"Weights{n}({weights})", *(["t"] if torn else []), "p"]
     if plan.shares:
         given += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
-    return f"{names}, = gather{n}({', '.join(given)})"
+    return f"{names}, = {'torn' if torn else 'gather'}{n}({', '.join(given)})"
 
 
 def _own(level: Level) -> str:
@@ -117,10 +119,15 @@ def _own(level: Level) -> str:
 
 
 def target_lines(
-    plan: Plan, level: Level, local: Sequence[str], totals: list[str], movable: str = ""
+    plan: Plan,
+    level: Level,
+    local: Sequence[str],
+    totals: list[str],
+    movable: str = "",
+    otherwise: str = "u.@",
 ) -> list[str]:
-    """Where the particle goes, and what it remembers, where it is `movable` (everywhere). `local`
-    are the components of X from site (0, 0)."""
+    """Where the particle goes, and what it remembers, where it is `movable` (everywhere), and what
+    stands there `otherwise`. `local` are the components of X from site (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
     sums = _pattern(level, totals, "Vector")
     lines = list[str]()
@@ -147,7 +154,7 @@ def target_lines(
         swing = [swung] if solver.memory != 0.0 else []
         if "memory" in solver.courses:
             swing = [f"{swung} if solver[1] != 0.0 else new_@"]
-        out = f"o@[j] = {_chosen('new_@', movable, 'u.@')}"
+        out = f"o@[j] = {_chosen('new_@', movable, otherwise)}"
         for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
             lines += plan.each(pattern)
     return lines + [

@@ -121,15 +121,22 @@ class Plan:
         return len(self.scene.cells.mixed) if self.scene.cells else 0
 
     @property
+    def tears(self) -> bool:
+        """Whether the rule computes what torn cells exert."""
+        return self.scene.tears
+
+    @property
     def bonds_first(self) -> bool:
         """Whether bonds are judged in a pass of their own, and not by the sweep at both ends."""
+        if self.model is None:
+            return False
         renews = isinstance(self.model, RenewsBonds)
-        return self.model is not None and (self.apart or renews or self.long)
+        return self.apart or renews or self.long or (self.tears and self.model.can_break)
 
     @property
     def judged(self) -> bool:
         """Whether the sweep judges the bonds."""
-        return self.model is not None and not self.bonds_first
+        return self.model is not None and not (self.bonds_first or self.tears)
 
     @property
     def real(self) -> str:

@@ -20,6 +20,7 @@ from pbdkit.stepping.compiled.particle import (
     write_row_loop,
 )
 from pbdkit.stepping.compiled.plan import Function, Plan, listed, values
+from pbdkit.stepping.compiled.tearing import CHUNK, RowDamage
 
 NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
 """Kinds of rows: those where no particle follows; where something may be missing; where all
@@ -57,6 +58,8 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
     out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
     if plan.judged:
         out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
+    if plan.tears:
+        out.add(0, f"marks = {plan.row('torn', s)}", "marked = 0")
     out.add(0, "for j in range(j1 - j0):")
     words = []
     for k, slot in enumerate(slots):
@@ -64,7 +67,10 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
         beside = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
         bond = f"b{k}_{{n}}[j]", f"x{k}_{{n}}[j]", f"f{k}[j]"
         words.append(Words(f"n{k}@[j]", own, beside, *bond))
-    write_whole(out, plan, level, s, words, "gone[j]")
+    write_whole(out, plan, level, s, words, "gone[j]", "marks[j]" if plan.tears else "")
+    if plan.tears:
+        out.add(1, "marked = marked | marks[j]")
+        _write_marked(out, plan, level, s, words)
     if events:
         out.add(0, "if changed:")
         out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
@@ -72,21 +78,47 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
 
 
 def write_whole(
-    out: Function, plan: Plan, level: Level, s: int, words: Sequence[Words], lost: str
+    out: Function,
+    plan: Plan,
+    level: Level,
+    s: int,
+    words: Sequence[Words],
+    lost: str,
+    mark: str = "",
+    damage: RowDamage | None = None,
 ) -> None:
     """The lines, in a loop, for a particle that has all its neighbours, with the words for each and
-    for its `lost` bonds."""
+    for its `lost` bonds. Where cells can be torn, particles with a `mark` stay as they are, or with
+    the damage around them the others."""
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
     for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
-        out.add(1, *_slot_lines(plan, level, k, slot, words[k]))
-    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals))
+        out.add(1, *_slot_lines(plan, level, k, slot, words[k], damage))
+    chosen: tuple[str, ...] = ()
+    if mark:
+        chosen = f"{mark} {'!=' if damage else '=='} 0", "o@[j]"
+    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals, *chosen))
     if plan.judged:
         out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
 
 
-def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, words: Words) -> list[str]:
+def _write_marked(out: Function, plan: Plan, level: Level, s: int, words: Sequence[Words]) -> None:
+    """The loops over chunks of a row in which particles are marked."""
+    damage = RowDamage(plan, s)
+    out.add(0, "if marked:", *("    " + line for line in damage.rows))
+    out.add(1, f"for begin in range(0, j1 - j0, {CHUNK}):")
+    out.add(2, f"end, marked = min(begin + {CHUNK}, j1 - j0), 0", "for j in range(begin, end):")
+    out.add(3, "marked = marked | marks[j]")
+    out.add(2, "if not marked:", "    continue", *damage.chunk, "for j in range(begin, end):")
+    out.depth += 2
+    write_whole(out, plan, level, s, words, "", "marks[j]", damage)
+    out.depth -= 2
+
+
+def _slot_lines(
+    plan: Plan, level: Level, k: int, slot: Slot, words: Words, damage: RowDamage | None
+) -> list[str]:
     """The contributions of one neighbour."""
     bond = {
         Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
@@ -105,7 +137,8 @@ def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, words: Words) -> l
     return [
         difference(plan, level, words.there),
         *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", words.since),
-        contributions(plan, level, r, listed(weights.values()), words.shown),
+        *([damage.beside(slot)] if damage else []),
+        contributions(plan, level, r, listed(weights.values()), words.shown, damage is not None),
         *(
             f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
             for n in range(len(level.totals))
@@ -115,7 +148,7 @@ def _slot_lines(plan: Plan, level: Level, k: int, slot: Slot, words: Words) -> l
 
 def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
     """The rows of what is known of the bonds along a slot, where they are kept."""
-    if plan.model is None:
+    if plan.model is None or plan.tears:
         return []
     plane, at_home = plan.scene.neighbourhood.home[slot]
     rows = {f"b{k}_{n}": f"bond{n}" for n in range(plan.bonds)}

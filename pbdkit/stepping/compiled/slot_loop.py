@@ -25,6 +25,7 @@ from pbdkit.stepping.compiled.particle import (
     write_row_loop,
 )
 from pbdkit.stepping.compiled.plan import Function, Plan, values
+from pbdkit.stepping.compiled.tearing import damage_lines, torn_at_slot
 
 
 def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
@@ -48,6 +49,8 @@ def write_one(out: Function, plan: Plan, level: Level) -> None:
     out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
     if plan.judged:
         out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
+    if plan.tears:
+        out.add(1, *damage_lines(plan))
     out.add(1, *displacements(plan, level), "for k in range(counts[s]):")
     _write_slot(out, plan, level, level.totals, "near")
     out.add(1, f"moves = (flat_kind[at_j] == {FOLLOWER}) & (near > 0)")
@@ -93,9 +96,11 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
         for side in (0, 1):  # where cells are cut there are few slots
             out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
     shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
-    bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(plan.bonds)]
-    fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(plan.limits)]
-    since = _seen(out, plan, "broken", "bonds_away[s, k]") if plan.bonds_first else ""
+    bonds, limits_ = (0, 0) if plan.tears else (plan.bonds, plan.limits)
+    bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(bonds)]
+    fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(limits_)]
+    first = plan.bonds_first and not plan.tears
+    since = _seen(out, plan, "broken", "bonds_away[s, k]") if first else ""
     out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
     if _is_slot_after_slot(plan):
         out.add(1, "for j in range(width):")
@@ -109,7 +114,10 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     can = f"({kind} == {FOLLOWER})" if spares else "is_there"
     breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
     out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
-    out.add(2, contributions(plan, level, "r", values(level.seen.weights, named), shown))
+    if plan.tears:
+        out.add(2, *torn_at_slot(plan))
+    weights = values(level.seen.weights, named)
+    out.add(2, contributions(plan, level, "r", weights, shown, torn=plan.tears))
     if plan.mixed:
         _write_mixed(out, plan, level, shown)
     for n, t in enumerate(sums):

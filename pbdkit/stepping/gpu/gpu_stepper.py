@@ -13,6 +13,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.arguments import Arrays, changing_arrays, lost_bits
 from pbdkit.stepping.compiled.leading import foreseen, leading_arrays
 from pbdkit.stepping.compiled.levels import blamed, functions_of
+from pbdkit.stepping.compiled.tearing import torn_marks
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.gpu.arguments import flattened, without_doubles
 from pbdkit.stepping.gpu.kernel import (
@@ -87,6 +88,8 @@ class GpuStepper(Engine):
         held = changing_planes(self._plan, state)
         if self._plan.judged:
             held |= flattened({"lost": lost_bits(self._scene, state)})
+        if self._plan.tears:
+            held |= flattened({"torn": torn_marks(self._scene, state)})
         self._send(held)
 
     def _fetch(self, state: State) -> None:

@@ -23,6 +23,7 @@ from pbdkit.stepping.compiled.plan import Function, Plan
 from pbdkit.stepping.compiled.rows import GENERAL, PLAIN, WITH_CELLS, Words, write_whole
 from pbdkit.stepping.compiled.slot_loop import write_one
 from pbdkit.stepping.compiled.stretches import kinds_of
+from pbdkit.stepping.compiled.tearing import marking_lines
 
 THREAD = ("me", "threads")
 """What functions are given: the number of a thread, and of how many."""
@@ -69,6 +70,9 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
     if level.scene.experiment.rule.uses_reference:
         out.add(1, *_cells(plan))
     out.depth = 1
+    if plan.tears:  # marked particles are taken as those of which something may be missing
+        for n, (s, _) in enumerate(whole, 1):
+            out.add(0, f"if group == {n} and flat_torn[j]:", f"    group = {len(whole) + 1 + s}")
     for n, (s, kind) in enumerate(whole, 1):
         slots = plan.scene.neighbourhood.slots[s]
         words = [_words(plan, level, kind, s, k) for k in range(len(slots))]
@@ -96,6 +100,7 @@ def write_bonds(plan: Plan) -> Function:
     out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
     out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]").write)
+    out.add(3, *marking_lines(plan, "n * cells + j", "here"))
     return out
 
 

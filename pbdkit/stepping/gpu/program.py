@@ -42,6 +42,8 @@ def program_of(scene: Scene) -> Program:
     arrays |= {f"was{m}": np.zeros_like(start.particle_values[m]) for m in plan.kept}
     if plan.judged:
         arrays["lost"] = np.zeros(scene.raster.shape, bits_for(scene))
+    if plan.tears:
+        arrays["torn"] = np.zeros(scene.raster.shape, np.uint8)
     if scene.loads:
         arrays |= dict.fromkeys(plan.each("load_@"), np.zeros(scene.raster.shape, start.u.dtype))
     found = flattened(steady | arrays) | changing_planes(plan, start)

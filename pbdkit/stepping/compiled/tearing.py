@@ -1,0 +1,225 @@
+"""Writes how kernels find the damage of the cells around a particle, and which particles have any.
+
+Few particles do. A plane of marks tells which: the sweep takes all as if no bond could break, leaves
+the marked ones as they are, and then computes those in short chunks. A mark stays, and is set too
+early rather than too late: without damage both give the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import Slot, Softens
+from pbdkit.scene.cell_bonds import CellBond
+from pbdkit.scene.declarations import bond_numbers
+from pbdkit.scene.homes import Home
+from pbdkit.scene.places import Block, slot_step
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.compiled.plan import Plan, values
+from pbdkit.stepping.state import State
+
+CHUNK = 64
+"""Particles of a row among which one that is marked makes all be computed as torn."""
+Marks = NDArray[np.uint8]
+
+
+def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str) -> str:
+    """The share of its pull that a bond of plane n has lost, from the words for the step at which
+    it broke and, with `{n}` for their numbers, for what is remembered of it and its limits."""
+    softened = plan.number(0.0)
+    if isinstance(plan.model, Softens):
+        homes = {Home.SLOT: f"end_limits[{n}, {{n}}]", Home.BOND: bond, Home.FIXED_BOND: limit}
+        c = f"Constants({values(plan.levels[-1].seen.bond, homes)})"
+        ahead, nothing = (plan.literal([x, *[0.0] * (len(plan.axes) - 1)]) for x in (1.0, 0.0))
+        r = plan.vector(f"end_rests[{n}, #]")
+        softened = f"{plan.number(1.0)} - seen({ahead}, {nothing}, {r}, {c}, q).x"
+    return f"({plan.number(1.0)} if {broken} >= 0 else {softened})"
+
+
+def _raised(name: str, other: str) -> str:
+    """The larger of two as a choice, which vectorises: `max` does not."""
+    return f"{name} = {name} if {name} > {other} else {other}"
+
+
+def _damage_at(plan: Plan, home: str, n: str) -> str:
+    """The same of the bond at a flat place."""
+    return damage_word(
+        plan, f"flat_broken[{home}]", n, f"flat_bond{{n}}[{home}]", f"flat_limit{{n}}[{home}]"
+    )
+
+
+def damage_lines(plan: Plan) -> list[str]:
+    """The damage of the cells around the particle at the flat place at_j of sublattice s."""
+    cells, bonds = _table_shape(plan.scene)
+    lines = []
+    for cell in range(cells):
+        for b in range(bonds):
+            lines.append(f"home = at_j + cell_bonds[s, {cell}, {b}]")
+            own = _damage_at(plan, "home", f"cell_planes[s, {cell}, {b}]")
+            lines += [f"own = {own}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {own}"]
+    return [*lines, f"around = ({', '.join(f'm{cell}' for cell in range(cells))},)"]
+
+
+def torn_at_slot(plan: Plan) -> list[str]:
+    """The damage t beside slot k of that particle."""
+    sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
+    return [
+        "home = at_j + bonds_away[s, k]",
+        f"own = {_damage_at(plan, 'home', 'slot_planes[s, k]')}",
+        f"t = Torn({', '.join(sides)}, own, own)",
+    ]
+
+
+class RowDamage:
+    """The damage of the cells and bonds around the particles of a row of sublattice s that have all
+    their neighbours. `rows` are the lines before all chunks of it; `chunk` those that compute the
+    damage for a chunk from `begin` to `end`, kind by kind in loops of their own: one loop with as
+    many arrays would not vectorise."""
+
+    def __init__(self, plan: Plan, s: int) -> None:
+        self._around = plan.scene.neighbourhood.cells_around[s]
+        self._home = plan.scene.neighbourhood.home
+        self.rows, self.chunk = list[str](), list[str]()
+        self._number: dict[tuple[int, Slot | None], int] = {}
+        for cell in self._around.cells:
+            for bond in cell:
+                self._add(plan, bond)
+        count, cells = len(self._number), self._around.cells
+        self.chunk.append("for e in range(end - begin):")
+        for n, cell in enumerate(cells):
+            first, *others = (self._number[bond.plane, bond.home] for bond in cell)
+            self.chunk.append(f"    m = damage[{first}, e]")
+            self.chunk += [f"    {_raised('m', f'damage[{other}, e]')}" for other in others]
+            self.chunk.append(f"    damage[{count + n}, e] = m")
+        empty = f"damage = np.empty(({count + len(cells)}, {CHUNK}), {plan.real})"
+        self.rows.append(empty)
+
+    def _add(self, plan: Plan, bond: CellBond) -> None:
+        if (bond.plane, bond.home) in self._number:
+            return
+        n = self._number[bond.plane, bond.home] = len(self._number)
+        step = bond.home.cell if bond.home else None
+        arrays = {f"y{n}": "broken"}
+        if isinstance(plan.model, Softens):
+            arrays |= {f"y{n}_b{m}": f"bond{m}" for m in range(plan.bonds)}
+            arrays |= {f"y{n}_x{m}": f"limit{m}" for m in range(plan.limits)}
+        for name, array in arrays.items():
+            self.rows.append(f"{name} = {plan.row(array, bond.plane, step)}")
+        words = f"y{n}[begin + e]", str(bond.plane), f"y{n}_b{{n}}[begin + e]"
+        own = damage_word(plan, *words, f"y{n}_x{{n}}[begin + e]")
+        self.chunk += ["for e in range(end - begin):", f"    damage[{n}, e] = {own}"]
+
+    def beside(self, slot: Slot) -> str:
+        """The damage t beside a slot of the particle j of the chunk."""
+        plane, at_this_end = self._home[slot]
+        own = self._number[plane, None if at_this_end else slot]
+        sides = (len(self._number) + cell for cell in self._around.beside[slot])
+        left, right, own_word = (f"damage[{n}, j - begin]" for n in (*sides, own))
+        return f"t = Torn({left}, {right}, {own_word}, {own_word})"
+
+
+def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
+    """Marks the particles around a bond of plane n that has any damage: its flat place among the
+    bonds, and that of its home among the particles."""
+    if not plan.tears:
+        return []
+    return [
+        f"if {_damage_at(plan, home, 'n')} > {plan.number(0.0)}:",
+        "    for e in range(mark_steps.shape[1]):",
+        f"        flat_torn[{there} + mark_steps[n, e]] = 1",
+    ]
+
+
+def tearing_arrays(scene: Scene) -> dict[str, Any]:
+    """The tables that these functions read: by sublattice and cell around a particle the way to
+    each bond and its plane; by sublattice and slot the plane of its bond and the cells beside it;
+    by plane the ways to the particles around a bond."""
+    around = scene.neighbourhood
+    cells, bonds = _table_shape(scene)
+    most, sublattices = max(map(len, around.slots)), len(around.slots)
+    ways, planes = np.zeros((2, sublattices, cells, bonds), np.int64)
+    slot_planes = np.zeros((sublattices, most), np.int64)
+    slot_cells = np.zeros((sublattices, most, 2), np.int64)
+    for s, of in enumerate(around.cells_around):
+        for n in range(cells):
+            own = of.cells[min(n, len(of.cells) - 1)]
+            for b in range(bonds):
+                bond = own[min(b, len(own) - 1)]
+                ways[s, n, b], planes[s, n, b] = _way(scene, s, bond), bond.plane
+        for k, slot in enumerate(around.slots[s]):
+            slot_planes[s, k], slot_cells[s, k] = around.home[slot][0], of.beside[slot]
+    return {
+        "cell_bonds": ways,
+        "cell_planes": planes,
+        "slot_planes": slot_planes,
+        "slot_cells": slot_cells,
+        "mark_steps": _mark_steps(scene),
+    }
+
+
+def _table_shape(scene: Scene) -> tuple[int, int]:
+    """The most cells around a particle, and the most bonds of one."""
+    around = scene.neighbourhood.cells_around
+    return (
+        max(len(of.cells) for of in around),
+        max(len(cell) for of in around for cell in of.cells),
+    )
+
+
+def _way(scene: Scene, s: int, bond: CellBond) -> int:
+    """From the flat place of a particle of sublattice s to that of a bond."""
+    shape, home = scene.raster.shape, bond.home
+    step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
+    return step + (bond.plane - sublattice) * math.prod(shape[1:])
+
+
+def _mark_steps(scene: Scene) -> NDArray[np.int64]:
+    """(plane, step): from the flat place of a bond's home to those of all corners of the cells
+    beside it; some twice, so that all planes have as many."""
+    around, shape = scene.neighbourhood, scene.raster.shape
+    found = []
+    for plane in around.planes:
+        home = around.cells_around[plane.slot.source]
+        ends: set[Slot | None] = {None}
+        for cell in {*home.beside[plane.slot]}:
+            ends |= {slot for slot, beside in home.beside.items() if cell in beside}
+        found.append(sorted(slot_step(shape, slot) if slot else 0 for slot in ends))
+    most = max(map(len, found))
+    return np.array([steps + steps[:1] * (most - len(steps)) for steps in found], np.int64)
+
+
+def torn_marks(scene: Scene, state: State) -> Marks:
+    """1 at particles around which a bond is broken or softened."""
+    marks = np.zeros(scene.raster.shape, np.uint8)
+    renew_torn_marks(marks, scene, state, slice(0, marks.shape[1]))
+    return marks
+
+
+def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> None:
+    """Writes those of the particles that have bonds in some rows of cells around them."""
+    assert state.broken_step is not None
+    around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
+    margin, *beside = around.reach_in_cells  # beyond it nobody is
+    first, last = max(rows.start - margin, margin), min(rows.stop + margin, height - margin)
+    stop = tuple(size - n for size, n in zip(across, beside, strict=True))
+    softened = isinstance(scene.experiment.fracture, Softens)
+    for s, of in enumerate(around.cells_around):
+        block = Block(s, (first, *beside), (max(first, last), *stop))
+        found = np.zeros(block.of(marks).shape, bool)
+        for bond in {bond for cell in of.cells for bond in cell}:
+            home = block.seen_through(bond.home) if bond.home else block
+            found |= home.within(state.broken_step[bond.plane]) >= 0
+            if softened:
+                for value, initial in _changed(scene, state):
+                    found |= home.within(value[bond.plane]) != initial
+        block.of(marks)[...] = found
+
+
+def _changed(scene: Scene, state: State) -> list[tuple[NDArray[Any], Any]]:
+    """The numbers that are remembered of bonds and change, with where they start."""
+    numbers = zip(bond_numbers(scene.experiment), state.bond_values, strict=True)
+    return [(value, number.initial) for number, value in numbers if number.changes]
