@@ -104,12 +104,12 @@ _HOME = {
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
-        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel FrameMap "
-        "FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows LoadRows "
-        "Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles Quantity Remembered "
-        "Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot Softens SpaceVector "
-        "StartsCracked Stiffness StoresEnergy TearsCells Torn TurnsParticles Variable Vector dot length "
-        "squared_length where"
+        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel "
+        "FrameMap FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows "
+        "LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles "
+        "Quantity Remembered Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot "
+        "Softens SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn TurnsParticles "
+        "Variable Vector dot length squared_length where"
     ),
     "pbdkit.pages.report": "report",
     "pbdkit.registry.discovery": "hookimpl",

@@ -62,12 +62,12 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
     x, y = slot.rest
     if cells.regular == 3:
         share = min(2 / 3 * (c.xx + c.xy), 8 / 3 * c.shear)
-        return share * math.sqrt(0.75) / 2 / (x * x + y * y)
+        return float(share * math.sqrt(0.75) / 2 / (x * x + y * y))
     assert cells.rectangle
     along, across, diagonal = rectangle_springs(c, *cells.rectangle)
     if cells.is_diagonal(slot):
-        return diagonal / 2 / (x * x + y * y)
-    return along / (x * x) if x else across / (y * y)
+        return float(diagonal / 2 / (x * x + y * y))
+    return float(along / (x * x) if x else across / (y * y))
 
 
 @cache

@@ -62,11 +62,11 @@ INTERFACES: dict[str, type[Component]] = {
 __all__ = [
     "AREA", "ENERGY", "FORCE", "INTERFACES", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
     "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "Component", "Components",
-    "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy", "FrameSites",
-    "HasStiffBonds", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows", "Loadable",
-    "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair", "Particles",
-    "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles", "Setting",
-    "SharesParticles", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "TearsCells", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
-    "squared_length", "where",
+    "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy",
+    "FrameSites", "HasStiffBonds", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows",
+    "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair",
+    "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles",
+    "Setting", "SharesParticles", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
+    "StoresEnergy", "TearsCells", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector",
+    "dot", "length", "squared_length", "where",
 ]  # fmt: skip

@@ -82,8 +82,8 @@ class FollowerRule(TakesFields):
     has no neighbour stays. A fictitious neighbour counts as present.
 
     What only some rules can do is a class that they take on besides: `Calibrated`, `Loadable`,
-    `TearsCells`, `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
-    `TurnsParticles`, `AppliesTwice`.
+    `TearsCells`, `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`,
+    `SharesParticles`, `TurnsParticles`, `AppliesTwice`.
     """
 
     _elsewhere: ClassVar[Mapping[str, str]] = {
@@ -214,10 +214,9 @@ class MixesCells(Calibrated):
         the rule: linear in c."""
 
     def spring_weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
-        """The part of `weights` that remains where cells are torn, the other weights 0; by default
-        there is none. It is not linear in a cell's stiffness: cells of another have `spring_share`
-        of it."""
-        return dict.fromkeys(self.weights(slot, setting), 0.0)
+        """The weights that act in torn cells alone, the others 0; by default there are none. They
+        are not linear in the stiffness of a cell: cells of another have `spring_share` of them."""
+        return {}
 
     def spring_share(self, c: NDArray[np.float64], setting: Setting) -> NDArray[np.float64]:
         """(cell,): how many times the `spring_weights` cells have, for their stiffness c over

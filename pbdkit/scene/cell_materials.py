@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import MixesCells, Setting, Slot, Stiffness
+from pbdkit.interfaces import MixesCells, Setting, Slot, Stiffness, TearsCells
 from pbdkit.interfaces.polygons import Polygon
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
@@ -44,7 +44,9 @@ def weighed(
         return cells
     _refuse_unmixable(experiment)
     shape = (1 + max(p.kind for p in setting.cells.polygons), *raster.shape)
-    weight, mixed = np.ones(shape), {name: np.zeros(shape) for name in PLACES}
+    torn = experiment.parts_bonds and isinstance(rule, TearsCells) and isinstance(rule, MixesCells)
+    names = (*PLACES, SPRINGS) if torn else (*PLACES,)
+    weight, mixed = np.ones(shape), {name: np.zeros(shape) for name in names}
     phase = np.zeros(shape, np.int64) if regions_of(experiment) else None
     for polygon in setting.cells.polygons:
         if some := _Cells.of(experiment, raster, polygon):
@@ -55,6 +57,8 @@ def weighed(
                 phase[there] = some.phases()
             for name, at in PLACES.items():
                 mixed[name][there] = np.where(factor == 0.0, stiffness[(slice(None), *at)], 0.0)
+            if SPRINGS in mixed:
+                mixed[SPRINGS][there] = _springs(rule, setting, factor == 0.0, stiffness)
     share = cells.share if cells else None
     if share is not None:
         weight *= share
@@ -65,6 +69,13 @@ def weighed(
     weights = tuple(_weights(experiment, setting, slots, name) for name in used)
     planes = tuple(mixed[name] for name in used)
     return WeighedCells(setting.cells, share, weight, planes, weights, phase)
+
+
+def _springs(rule: Any, setting: Setting, mixed: Mask, stiffness: Floats) -> Floats:
+    """How many times the rule's springs cells have that are torn, 0 where they are not mixed."""
+    found = np.zeros(len(mixed))
+    found[mixed] = rule.spring_share(stiffness[mixed], setting)
+    return found
 
 
 def regions_of(experiment: Experiment) -> dict[str, Body]:
@@ -91,6 +102,8 @@ def _weights(
     """The rule's weights for cells that have one component of stiffness alone."""
     rule = experiment.rule
     assert isinstance(rule, MixesCells)
+    if name == SPRINGS:
+        return {s: named_weights(rule.spring_weights(s, setting), rule) for s in slots}
     one = Stiffness(**{n: float(n == name) for n in PLACES})
     return {s: named_weights(rule.cell_weights(s, setting, one), rule) for s in slots}
 
@@ -109,6 +122,10 @@ def stiffness_at(experiment: Experiment, values: Values) -> Floats:
     if STIFFNESS in values:
         found *= (values[STIFFNESS] / getattr(rule, STIFFNESS))[:, None, None]
     return found
+
+
+SPRINGS = "springs"
+"""The name of what remains of cells of a stiffness of their own where they are torn."""
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,14 @@ def _seen(shares: Floats, side: Side, where: Where, precision: str) -> Share:
     return share
 
 
+def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
+    """The cells whose corners are all of the body, each with a share of 1."""
+    share = np.zeros((1 + max(polygon.kind for polygon in tiling.polygons), *raster.shape))
+    for patch in patches(raster, tiling):
+        patch.corners[0].of(share[patch.polygon.kind])[...] = patch.whole
+    return WeighedCells(tiling, share, share)
+
+
 def _within(raster: Raster, polygon: Polygon) -> Block | None:
     """The block of first corners in the body whose other corners lie on the raster."""
     block = raster.body_block(polygon.source)

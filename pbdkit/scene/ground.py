@@ -6,8 +6,9 @@ from dataclasses import replace
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
+from pbdkit.interfaces import MixesCells
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.cells import WeighedCells
+from pbdkit.scene.cells import WeighedCells, whole_cells
 from pbdkit.scene.cut_cells import fill_with_cells, margin_of
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
 from pbdkit.scene.others import ALONE, Others
@@ -67,7 +68,12 @@ class Ground:
         if stretch:
             extent = Extent(stretch.rows, raster.first[0] - stretch.first)
             raster = replace(raster, before=stretch.before, extent=extent, others=self._others)
-        return raster, filling.on(raster, self.neighbourhood.tiling)
+        cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
+        # Without frame points a cell that misses a corner is none: what the other corners exert on
+        # each other would not balance.
+        if not (cells or self.layers) and isinstance(self.experiment.rule, MixesCells):
+            cells = whole_cells(raster, tiling) if tiling.beside else None
+        return raster, cells
 
     def nothing(self) -> ExperimentError:
         """Where the body has no particle."""

@@ -108,8 +108,8 @@ def _refuse_pulling(
     lost = [fracture.fictitious(u, slot.rest, parameters) for slot in slots]
     if any(component != 0.0 for one in lost for component in one):
         raise ExperimentError(
-            f"'{fracture.type}' places fictitious points that pull at the ends of lost bonds, which "
-            f"under the calibrated rule '{rule.type}' would be forces that nothing balances; take "
+            f"'{fracture.type}' places fictitious points that pull at the ends of lost bonds, and "
+            f"under the calibrated rule '{rule.type}' nothing would balance these forces; take "
             "placement: 1 and fictitious: cell, or a rule of the paper"
         )
 

@@ -60,7 +60,7 @@ class Surroundings:
         if self._scene.tears:
             torn = self._torn(state)
             return [
-                Neighbour(slot.rest, w, present, more=more, torn=torn and torn[slot])
+                Neighbour(slot.rest, w, present, more=more, torn=torn[slot] if torn else None)
                 for slot, w, present, more in parts
             ]
         return [

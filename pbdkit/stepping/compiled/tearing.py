@@ -1,8 +1,8 @@
 """Writes how kernels find the damage of the cells around a particle, and which particles have any.
 
-Few particles do. A plane of marks tells which: the sweep takes all as if no bond could break, leaves
-the marked ones as they are, and then computes those in short chunks. A mark stays, and is set too
-early rather than too late: without damage both give the same numbers.
+Few particles have any. A plane of marks records which: the sweep moves all others as if no bond
+could break, and then computes the marked ones in short chunks. A mark stays, and is set too early
+rather than too late: without damage both ways give the same numbers.
 """
 
 from __future__ import annotations
