@@ -25,6 +25,12 @@ class Cohesive(KnowsStiffness, Softening):
     """
 
     type: Literal["cohesive"] = "cohesive"
+    placement: Annotated[float, Field(ge=1.0, le=1.0)] = Field(
+        1.0, description="Lost bonds of a material exert nothing: 1."
+    )
+    fictitious_at: Literal["cell"] = Field(
+        "cell", alias="fictitious", description="As `placement`: `cell`."
+    )
     energy: Annotated[float, Field(gt=0.0, le=1e75)] = Field(
         description="G_c over Young's modulus: a length (lattice units).", examples=[0.05]
     )
