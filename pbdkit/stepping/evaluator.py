@@ -81,20 +81,16 @@ class Evaluator:
 
     def contribution(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """What a neighbour contributes, or what stands in for it."""
-        rule: Any = self.rule  # some are given more than others
-        if self.tears:
-            parts = (self._in_cells(d, to.r, w, to.torn) for w in (to.w, *to.more))
-            return summed((as_values(part, "gather"), None) for part in parts)
-        seen = self.seen(d, u, to)
-        parts = (rule.gather(seen, to.r, w, self._p, *to.shared) for w in (to.w, *to.more))
+        seen = d if self.tears else self.seen(d, u, to)
+        parts = (self._of_weights(seen, to, w) for w in (to.w, *to.more))
         return summed((as_values(part, "gather"), None) for part in parts)
 
-    def _in_cells(self, d: Components, r: Components, w: Any, torn: Torn | None) -> Any:
-        """What a neighbour contributes under a rule that tears cells, with some weights."""
-        rule: Any = self.rule
-        if torn is None:
-            return rule.gather(d, r, w, self._p)
-        return rule.torn(d, r, w, torn, self._p)
+    def _of_weights(self, d: Components, to: Neighbour, w: Any) -> Any:
+        """What the rule makes of a difference with some weights."""
+        rule: Any = self.rule  # some are given more than others
+        if to.torn is not None:
+            return rule.torn(d, to.r, w, to.torn, self._p)
+        return rule.gather(d, to.r, w, self._p, *to.shared)
 
     def energy(self, d: Components, u: Components, to: Neighbour) -> Contributions:
         """The half of the bond's energy that falls to this end."""
