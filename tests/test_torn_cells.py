@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
+from pbdkit.results.moment import StateMoment
+from pbdkit.results.tables import Tables
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.state import initial_state
@@ -244,3 +246,32 @@ def test_energy_of_softened_springs_is_the_work_that_stretched_them():
     assert energy == pytest.approx(work, rel=1e-5)
     state.bond_values[0][...] = 0.0
     assert energy == pytest.approx(SlotFollowers(scene).energy(state.u, state) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice["type"])
+@pytest.mark.parametrize("rule", [elastic(0.0), elastic(0.3), {"type": "springs"}], ids=str)
+def test_stress_of_softened_cells_is_what_they_carry(lattice, rule):
+    """All bonds have lost half of their pull: so has the stress."""
+    if rule["type"] == "springs" and lattice["type"] == "rectangular":
+        rule = ORTHOTROPIC
+    experiment = pbdkit.Experiment(
+        **CRACKED
+        | {
+            "lattice": lattice,
+            "neighbours": TRIANGLES if lattice["type"] == "hexagonal" else SQUARES,
+            "body": {"type": "rectangle", "width": 5.2, "height": 4.3},
+            "rule": rule,
+            "fracture": SOFTENING,
+            "initial": {"type": "affine", "gradient": [[1e-6, 3e-7], [2e-7, -4e-7]]},
+            "solver": {"type": "stepping"},
+            "diagnostics": [{"type": "stress", "youngs_modulus": 1.0}],
+        }
+    )
+    scene = build_scene(experiment)
+    state, tables = initial_state(scene), Tables(scene)
+    (diagnostic,) = experiment.diagnostics
+    whole = diagnostic.measure(StateMoment(state, tables))[:3]
+    state.bond_values[0][...] = 0.5
+    softened = diagnostic.measure(StateMoment(state, tables))[:3]
+    for half, full in zip(softened, whole, strict=True):
+        np.testing.assert_allclose(half, full / 2, rtol=1e-5, atol=1e-12)

@@ -91,7 +91,8 @@ class Stress(Diagnostic):
     """The stress of every body particle inside the outline in the material that the rule is
     calibrated to, in plane stress or plane strain as the rule; 0 where no cell is.
 
-    Young's modulus times the rule's stiffness times the strain. With `measure: small` it is the
+    Young's modulus times the rule's stiffness times the strain, less what softened bonds of the
+    cells around no longer carry. With `measure: small` it is the
     Cauchy stress of linear elasticity; with `green-lagrange`, for finite rotation (rule `springs`),
     the second Piola-Kirchhoff stress. The stress of von Mises counts σ_zz, which is 0 in plane
     stress and ν (σ_xx + σ_yy) in plane strain; principal values are those in the plane.
@@ -115,10 +116,20 @@ class Stress(Diagnostic):
         c, E = now.forces.stiffness, self.youngs_modulus
         e_xx, e_yy, e_xy = strain(now.cells.gradient(), self.measure_)
         xx, yy, xy = c.xx * e_xx + c.xy * e_yy, c.xy * e_xx + c.yy * e_yy, 2 * c.shear * e_xy
+        if (lost := now.cells.lost_stress()) is not None:
+            xx, yy, xy = self._less(now, lost, xx, yy, xy)
         xx, yy, xy = E * xx, E * yy, E * xy
         zz = now.forces.through_thickness * (xx + yy)
         apart = np.hypot(np.hypot(xx - yy, yy - zz), zz - xx) / math.sqrt(2.0)
         return _inside(now, xx, yy, xy, np.hypot(apart, ROOT_3 * xy), principal(xx, yy, xy))
+
+    def _less(self, now: Moment, lost: Floats, *stress: Floats) -> tuple[Floats, ...]:
+        """The stress without what softened bonds no longer carry, P = F S."""
+        if self.measure_ == "green-lagrange":
+            lost = np.linalg.solve(np.nan_to_num(now.cells.gradient()) + np.eye(2), lost)
+        xx, yy = lost[:, 0, 0], lost[:, 1, 1]
+        xy = (lost[:, 0, 1] + lost[:, 1, 0]) / 2
+        return tuple(value - part for value, part in zip(stress, (xx, yy, xy), strict=True))
 
 
 def strain(H: Floats, measure: Measure) -> tuple[Floats, Floats, Floats]:

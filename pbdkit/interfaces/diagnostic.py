@@ -109,6 +109,12 @@ class CellValues(ABC):
         outline (`Moment.inside`) it is carried on from the part of the body nearby.
         """
 
+    def lost_stress(self) -> Floats | None:
+        """The first Piola-Kirchhoff stress over Young's modulus that softened bonds no longer
+        carry, (particle, component, axis), as the mean over the cells that `gradient` counts; None
+        where nothing has softened."""
+        return None
+
 
 class ForceValues(ABC):
     """What the material that the rule is calibrated to makes of a state, over Young's modulus and

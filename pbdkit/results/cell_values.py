@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Vector
+from pbdkit.interfaces import Softens, Vector
 from pbdkit.interfaces.diagnostic import CellValues
 from pbdkit.interfaces.polygons import area_share, corner_share, signed_area
+from pbdkit.results.softened_stress import lost_stress
 from pbdkit.results.tables import Tables, read_only
 from pbdkit.scene.cells import Patch
 from pbdkit.stepping.state import State
@@ -134,14 +135,29 @@ class StateCells(CellValues):
     @cached_property
     def _gradient(self) -> Floats:
         weighed, u = self._scene.cells, self._state.u.astype(float, copy=False)
-        cells = [
-            (patch, (weighed.of(patch) if weighed else 1.0) * self._intact(patch))
-            for patch in self._scene.patches
-        ]
+        cells = self._weighed
         whole = self._tables.of_body(displacement_gradient(u, cells))
         if weighed is not None and weighed.phase is not None:
             whole = self._by_phase(weighed.phase, u, cells, whole)
         return read_only(whole.reshape(-1, 2, 2))
+
+    def lost_stress(self) -> Floats | None:
+        """Found anew whenever it is called: one diagnostic does."""
+        scene, state = self._scene, self._state
+        if not (scene.tears and isinstance(scene.experiment.fracture, Softens)):
+            return None
+        u = state.u.astype(float, copy=False)
+        planes = lost_stress(scene, state, u, self._weighed)
+        return self._tables.of_body(planes).reshape(-1, 2, 2)
+
+    @cached_property
+    def _weighed(self) -> list[tuple[Patch, Floats]]:
+        """The cells that count with their shares."""
+        weighed = self._scene.cells
+        return [
+            (patch, (weighed.of(patch) if weighed else 1.0) * self._intact(patch))
+            for patch in self._scene.patches
+        ]
 
     def _by_phase(
         self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
