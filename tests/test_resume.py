@@ -20,6 +20,7 @@ from pbdkit.results import netcdf_sink
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import Watch
+from pbdkit.results.sink import MemorySink
 from pbdkit.runs.course import Run, record
 from pbdkit.runs.resumption import resumption
 from pbdkit.scene.scene import build_scene
@@ -349,6 +350,25 @@ def test_an_interrupted_run_goes_on_to_more_steps(later: str, tmp_path: Path) ->
     assert found is not None
     assert found.record().first > 5
     assert_same(whole, part)
+
+
+def test_a_run_that_is_stopped_at_its_last_look_settles_all_the_same(tmp_path: Path) -> None:
+    given = BLOCK | {"record": {"every": 1}, "steps": 400}
+    steps = record(Run(scene_of(given)), MemorySink()).outcome.steps
+    given, whole = given | {"steps": steps}, tmp_path / "whole.nc"
+    record(Run(scene_of(given)), NetcdfSink(whole))
+    stops = []
+    for looks in count(steps + 2):
+        part = tmp_path / f"part-{looks}.nc"
+        report = record(Run(scene_of(given), watch=stopping_after(looks)), NetcdfSink(part))
+        if report.outcome.status != "interrupted":
+            break
+        stops.append(report.outcome.steps)
+        found = resumption(part, Watch())
+        assert found is not None
+        assert found.record().outcome.status == "settled"
+        assert_same(whole, part)
+    assert stops[-1] == steps
 
 
 @pytest.mark.filterwarnings("ignore:.* begins to act after the last step")

@@ -132,10 +132,9 @@ class Stepwise(Driver):
                 self.watch.look(step / steps, f"step {step} of {steps}")
                 self._advance()
                 yield from self._given_out()
-        except StoppedError:
-            if (step := self.state.step) < steps:
-                outcome = Outcome("interrupted", f"stopped after step {step}", step)
-                self.stopped = outcome
+        except StoppedError:  # after the last step, too, while it is looked at
+            step = self.state.step
+            self.stopped = outcome = Outcome("interrupted", f"stopped after step {step}", step)
         if self.stopped or self.kept < self.state.step:
             self.ending = True
             yield from self._given_out()
