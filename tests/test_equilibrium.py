@@ -10,6 +10,7 @@ from scene_strategies import experiments, samples
 
 import pbdkit
 from pbdkit.cli import program
+from pbdkit.equilibrium.load_path import changes
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
@@ -77,6 +78,7 @@ def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     try:
         relaxed = {"type": "stepping", "relaxation": 1.0}
         scene = build_scene(pbdkit.Experiment(**experiment | {"solver": relaxed, "steps": steps}))
+        assume(not changes(scene, steps))  # before which equilibria settle, and steps do not wait
         stepper, state = Stepper(scene), initial_state(scene)
         while not (rests := came_to_rest(state)) and state.step < steps:
             state = stepper.advance(state, 100)
@@ -91,28 +93,73 @@ def test_the_steps_of_random_scenes_lead_to_their_equilibrium(experiment):
     assert np.abs(found - u).max() <= reached
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(6, 5), (18, 17)])
-def test_a_released_body_keeps_what_stepping_keeps(columns, rows):
-    """No leader in the last step: the mean at the release remains (model.md, section 9)."""
-    parts = {"leaders": [pulled(2.0, 1.0, until=7)], "steps": 5_000, "record": {"every": 5_000}}
-    straight = run(sheet(columns, rows, **parts))
-    stepped = run(sheet(columns, rows, **parts, solver={"type": "stepping"}))
-    np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-9)
-    assert abs(straight.u[-1]).max() > 0.05
+LAST = {"every": 10_000}
+"""Records of the last step alone."""
+
+
+@pytest.mark.parametrize("until", [7, 600])
+def test_a_released_body_keeps_what_it_had_at_rest(until):
+    """No leader in the last step: the mean at the release remains, that of the settled body."""
+
+    def parts(until):
+        leaders = [LEFT | {"until": until}, pulled(2.0, 1.0, until=until)]
+        return {"leaders": leaders, "steps": 1_200, "record": LAST}
+
+    straight = run(sheet(6, 4, **parts(until)))
+    stepped = run(sheet(6, 4, **parts(600), solver={"type": "stepping"}))
+    np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-8)
+    assert abs(straight.u[-1]).max() > 0.5
 
 
 @pytest.mark.parametrize("lag", [0, 1])
-@pytest.mark.parametrize("columns", [6, 10])
-def test_late_leaders_start_where_stepping_has_them(columns, lag):
-    leaders = [pulled(1.0, 0.5, until=5), LEFT | {"from": 6}]
-    parts = {"leaders": leaders, "frame": {"type": "mean", "lag": lag}}
-    straight = run(sheet(columns, 5, **parts, steps=4_000))
-    stepped = run(
-        sheet(
-            columns, 5, **parts, steps=4_000, record={"every": 4_000}, solver={"type": "stepping"}
-        )
-    )
-    np.testing.assert_allclose(straight.u[-1], stepped.u[-1], rtol=0, atol=1e-8)
+def test_late_leaders_start_where_the_body_rests(lag):
+    """In whatever step, as after so many that steps rest there."""
+
+    def parts(begin):
+        held = {"select": {"nearest": [[2.0, 2.0]]}, "motion": {"type": "hold"}, "from": begin}
+        leaders = [LEFT | {"until": begin - 1}, pulled(1.0, 0.5), held]
+        frame = {"type": "mean", "lag": lag}
+        return {"leaders": leaders, "frame": frame, "steps": 1_500, "record": LAST}
+
+    straight = [run(sheet(6, 4, **parts(begin))) for begin in (2, 6, 600)]
+    stepped = run(sheet(6, 4, **parts(600), solver={"type": "stepping"}))
+    for ds in straight:
+        np.testing.assert_allclose(ds.u[-1], stepped.u[-1], rtol=0, atol=1e-7)
+    assert abs(stepped.u[-1]).max() > 0.5
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4, 0.49])
+@pytest.mark.parametrize("begin", [30, 300])
+def test_late_leaders_start_at_rest_where_steps_without_relaxation_diverge(nu, begin):
+    parts = {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": nu},
+        "frame": {"type": "natural"},
+    }
+    held = {"select": {"nearest": [[4.0, 3.0]]}, "motion": {"type": "hold"}, "from": begin}
+    ends = [LEFT, pulled(0.1, 0.03)]
+    ds = run(sheet(9, 6, leaders=[*ends, held], steps=begin + 1, record=LAST, **parts))
+    rest = run(sheet(9, 6, leaders=ends, steps=1, **parts))
+    np.testing.assert_allclose(ds.u[-1], rest.u[-1], rtol=0, atol=1e-10)
+
+
+def test_check_says_before_which_changes_the_body_settles(tmp_path):
+    leaders = [LEFT | {"until": 9}, pulled(1.0, 0.5), LEFT | {"from": 30}]
+    path = tmp_path / "late.yaml"
+    path.write_text(json.dumps(sheet(leaders=leaders, record=LAST)))
+    output = CliRunner().invoke(program, ["check", str(path)]).output
+    assert "before roles or loads change, after steps 9, 29" in output
+
+
+def test_what_is_pushed_before_a_leader_holds_it_is_refused_where_steps_diverge():
+    push = {"select": {"edge": "right"}, "force": [0.1, 0.0]}
+    parts = {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.45},
+        "frame": {"type": "natural"},
+    }
+    with pytest.raises(pbdkit.ExperimentError, match=r"at step 9 .*pushed on for ever"):
+        run(sheet(6, 5, leaders=[LEFT | {"from": 10}], loads=[push], record=LAST, **parts))
 
 
 def test_a_nonlinear_rule_is_linearised_anew_and_rests_where_it_stands():

@@ -98,6 +98,13 @@ def _what(loaded: Experiment, scene: Scene, found: Forecast) -> Iterator[Row]:
         count = loaded.record_count - 1
         each = f" of each of {count} recorded steps" if count > 1 else ""
         yield "solver", f"goes straight to the equilibrium{each}, to where steps would lead"
+        from pbdkit.equilibrium.load_path import changes
+
+        if settled := changes(scene, loaded.steps):
+            listed = ", ".join(map(str, settled[:SHOWN]))
+            more = f" and {len(settled) - SHOWN} more" if len(settled) > SHOWN else ""
+            steps = "step" if len(settled) == 1 else "steps"
+            yield "settles", f"before roles or loads change, after {steps} {listed}{more}"
     time = "" if found.seconds is None else f"{_seconds(found.seconds)} of stepping, "
     memory = f"{found.memory_mib:.3g} MiB of memory, {found.output_mib:.3g} MiB of output"
     yield "takes", f"{time}{memory} (estimates)"

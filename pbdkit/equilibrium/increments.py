@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import numpy as np
 
+from pbdkit.analysis.operator import step_operator
+from pbdkit.analysis.spectrum import TooDearError, excess, spectrum
 from pbdkit.equilibrium.breaking.choice import settler_of
 from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, broken_bonds
 from pbdkit.equilibrium.contact_search import follow_contact
 from pbdkit.equilibrium.finder import finder_of
-from pbdkit.equilibrium.load_path import last_change, moments, spacings
+from pbdkit.equilibrium.load_path import changes, moments, spacings
 from pbdkit.equilibrium.newton import Finder
 from pbdkit.equilibrium.system import NoEquilibriumError
 from pbdkit.errors import ExperimentError
@@ -23,12 +25,14 @@ from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.choice import chosen_engine
 from pbdkit.stepping.cutting import cut_bonds
 from pbdkit.stepping.guard import Guard, most_of, size_of
-from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.prescription import last_event, place, prescribe
 from pbdkit.stepping.state import State, initial_state
 
 VALUES_A_CALL = 200_000_000
 """An engine makes so many values' steps a call, some tenths of a second."""
+GROWING = 1e-6
+"""A mode grows where steps multiply it by so much more than 1."""
+RECORD_LAST = "; or record that of the last step alone, `record: {{at: [{}]}}`"
 MOST_SETTLINGS = 2000
 """So often bonds may change in an increment, one after the other or little by little."""
 TINY, SMALLEST = 1e-9, 2.0**-12
@@ -69,18 +73,17 @@ def increments(
     watch: Watch,
     since: float = 0.0,
     finder: Finder | None = None,
-    engine: Callable[[Scene], Engine] = chosen_engine,
     stops: Sequence[int] = (),
 ) -> Way:
     """Takes a scene, in place, from its initial state, or from one on the way, as it was at the
     moment `since`, to the equilibrium of its last step. Yields what is reached on the way; the
     `stops` are steps before the last one whose equilibria are among it.
 
-    Under a linear rule without fracture the equilibrium of a step is that of the same experiment
-    with as many steps: until roles or loads change for the last time before it steps are made, so
-    that leaders start, and parts that nothing holds remain, where stepping has them. Where bonds
-    can break, and for rules that are not linear, leaders and loads come in increments instead,
-    within steps too: settle, break what is too long, settle again until nothing breaks.
+    The body settles before each change of roles or loads: late leaders start, and parts that
+    nothing holds remain, where slow loading has them; what loads push on for ever until then goes
+    as far as steps take it. Where bonds can break, and for rules that
+    are not linear, leaders and loads come in increments, within steps too: settle, break what is
+    too long, settle again until nothing breaks.
     Raises ExperimentError where there is no equilibrium, UnconvergedError, SeparatedError, and
     StoppedError where the watch says so: then the state is the last that had been reached.
     """
@@ -99,7 +102,7 @@ def increments(
     if scene.has_fracture or not finder.linear:
         count = asked.increments if scene.experiment.fracture.can_break else spacings(scene)
         return (yield from _load(scene, state, finder, moments(scene, count), since, stops))
-    return (yield from _of_linear(scene, state, finder, engine, [s for s in stops if s > since]))
+    return (yield from _of_linear(scene, state, finder, [s for s in stops if s > since]))
 
 
 def settle(
@@ -122,31 +125,35 @@ def equilibrium_state(scene: Scene) -> tuple[State, Certificate]:
     return state, certificate
 
 
-def _of_linear(
-    scene: Scene,
-    state: State,
-    finder: Finder,
-    engine: Callable[[Scene], Engine],
-    stops: Sequence[int],
-) -> Way:
-    """The equilibria of some steps and of the last one; the state goes on by steps alone."""
-    steps, settled, stepper, last = scene.experiment.steps, None, None, last_event(scene)
+def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> Way:
+    """The equilibria of some steps and of the last one; the state goes on by those after which
+    roles or loads change."""
+    steps, settled, last = scene.experiment.steps, None, last_event(scene)
     for stop in [*stops, steps]:
-        if (change := last_change(scene, stop)) > state.step:
-            stepper = stepper or engine(scene)
-            yield from _step_to(change, stepper, state, finder)
+        for change in changes(scene, stop):
+            if change <= state.step:
+                continue
+            if settled and settled.step == change:
+                vars(state).update(vars(settled.copy()))
+                continue
+            before = state.copy()
+            try:
+                with _at_step(change):
+                    _settle_at(scene, state, finder, change)
+            except NoEquilibriumError:
+                vars(state).update(vars(before))
+                if not _steps_shrink(scene, change):
+                    raise
+                yield from _step_to(change, state, scene, finder)
+                continue
+            yield Reached(change, state, at_rest=True)
         if stop == steps:
             return _settle_at(scene, state, finder, stop)
         if settled is None or settled.step < last:
             settled = state.copy()
             try:
-                _settle_at(scene, settled, finder, stop)
-            except NoEquilibriumError as error:
-                raise NoEquilibriumError(
-                    f"at step {stop} {error}; or record that of the last step alone, `record: "
-                    f"{{at: [{steps}]}}`",
-                    *error.args[1:],
-                ) from None
+                with _at_step(stop, RECORD_LAST.format(steps)):
+                    _settle_at(scene, settled, finder, stop)
             except UnconvergedError:
                 vars(state).update(vars(settled), step=stop)
                 raise
@@ -155,17 +162,39 @@ def _of_linear(
     raise AssertionError
 
 
-def _step_to(last: int, engine: Engine, state: State, finder: Finder) -> Iterator[Reached]:
-    """Steps, in calls short enough for interruptions to be heard."""
-    watch, first = finder.watch, state.step
-    watch.begin("stepping until roles and loads change no more")
-    a_call = max(1, int(VALUES_A_CALL / finder.rows.most(state.u.size)))
+def _steps_shrink(scene: Scene, step: int) -> bool:
+    """Whether no mode grows by the steps with the roles of one, as far as its spectrum is known."""
+    if excess(scene) or scene.experiment.neighbours.nearness():
+        return True
+    operator = step_operator(scene.at(step), step=step)
+    try:
+        return spectrum(operator.augmented().matrix()).radius < 1.0 + GROWING
+    except TooDearError:
+        return True
+
+
+def _step_to(last: int, state: State, scene: Scene, finder: Finder) -> Iterator[Reached]:
+    """Steps, in calls short enough for interruptions to be heard: where nothing holds a part that
+    is pushed on, how far it goes counts."""
+    watch, first, engine = finder.watch, state.step, chosen_engine(scene)
+    watch.begin("stepping while loads push on what nothing holds")
+    a_call = max(1, int(VALUES_A_CALL / state.u.size))
     while state.step < last:
         reached = engine.advance(state, min(a_call, last - state.step))
         state.u, state.previous, state.starts = reached.u, reached.previous, reached.starts
         state.step = reached.step
         yield Reached(state.step, state, at_rest=False)
         watch.look((state.step - first) / (last - first))
+
+
+@contextmanager
+def _at_step(step: int, remedy: str = "") -> Iterator[None]:
+    """Add the step to the message of an equilibrium that does not exist."""
+    try:
+        yield
+    except NoEquilibriumError as error:
+        text = f"at step {step} {error}{remedy}"
+        raise NoEquilibriumError(text, *error.args[1:]) from None
 
 
 def _settle_at(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:

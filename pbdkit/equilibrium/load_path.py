@@ -78,11 +78,9 @@ def spacings(scene: Scene) -> int:
     return max(1, math.ceil(max(ways, default=0.0) / spacing_of(scene)))
 
 
-def last_change(scene: Scene, steps: int) -> int:
-    """The last step before roles or loads change within so many steps; 0 where they never do."""
-    changes = [0]
-    changes += [step - 1 for step in scene.loads.changes(steps)] if scene.loads else []
+def changes(scene: Scene, steps: int) -> list[int]:
+    """The steps after which roles or loads change, within so many."""
+    found = {step - 1 for step in scene.loads.changes(steps)} if scene.loads else set()
     for leading in scene.leading:
-        first, last = leading.group.from_, leading.group.last(steps)
-        changes += [step for step in (first - 1, last) if 0 <= step < steps]
-    return max(changes)
+        found |= {leading.group.from_ - 1, leading.group.last(steps)}
+    return sorted(step for step in found if 0 < step < steps)

@@ -63,8 +63,7 @@ class Solver(Component):
 
     @property
     def stepping(self) -> Stepping:
-        """How a step is made, where one is: the rule's own unless the experiment says more. Also of
-        an equilibrium: so steps are made until roles change for the last time."""
+        """How a step is made, where one is: the rule's own unless the experiment says more."""
         return _stepping()
 
     @property

@@ -16,8 +16,6 @@ from pbdkit.results.progress import Watch
 from pbdkit.runs.drivers import Straight
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import asks_for_grids
-from pbdkit.stepping.choice import choose
-from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state
 
 STUCK = "the iteration that several processes share gets nowhere; run it in one process"
@@ -34,7 +32,6 @@ class DividedStraight(Straight):
         start, anew = division.begun(scene)
         super().__init__(division.scene, start, DividedWatch(ranks, watch))
         self._start = None if anew else start.copy()
-        self._stepping = ranks.told(choose(scene))
         strip = strip_of(scene, division.part.subdomain, ranks.size)
         self._rows = DividedRows(ranks, division.halo, strip)
 
@@ -53,8 +50,7 @@ class DividedStraight(Straight):
         scene, start = self.scene, self._start or initial_state(self.scene)
         try:
             finder = finder_of(scene, start, self.watch, rows=self._rows)
-            own = finder, self._stepper, self._stops
-            way = increments(scene, state, self.watch, self.moment, *own)
+            way = increments(scene, state, self.watch, self.moment, finder, self._stops)
             certificate = yield from self._renewed(way)
         except StuckError:
             raise NotSharedError(STUCK, ("solver",)) from None
@@ -72,9 +68,6 @@ class DividedStraight(Straight):
             if reached.at_rest:
                 self._division.halo.renew(reached.state)
             yield reached
-
-    def _stepper(self, scene: Scene) -> Engine:
-        return self._division.stepper(self._stepping)[0]
 
 
 def _refuse(scene: Scene) -> None:
