@@ -134,7 +134,9 @@ class MatrixSystem(System):
                     own = None if back is None else back[some]
                     x[some] = part.solve(r[some], own, rounding)
                 except DriftingError as error:
-                    soft = isinstance(error, TooSoftError) or self._is_fixed(stage.axes, some)
+                    soft = isinstance(error, TooSoftError) or (
+                        part.is_soft and self._is_fixed(stage.axes, some)
+                    )
                     text = SOFT if soft else DRIFTS
                     named = self._named(stage, some)
                     raise NoEquilibriumError(text.format(named), ("leaders",)) from None

@@ -122,6 +122,12 @@ class Part(ABC):
         b = np.append(r, np.zeros(self._borders))
         return self._solver.solve(b, accuracy)[: self._size]
 
+    @property
+    def is_soft(self) -> bool:
+        """Whether some motion that costs something costs so little that others may that cost
+        nothing as it seems."""
+        return not self._spread < SOFT
+
     @cached_property
     def _spread(self) -> float:
         """How far A⁻¹ takes numbers of up to 1: the largest row sum of |A⁻¹| where the inverse is
