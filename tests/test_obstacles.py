@@ -9,6 +9,7 @@ import pytest
 import shapely
 from interpreted_kernels import interpreting
 from test_engines import assert_bitwise_equal
+from test_passes import small_passes
 
 import pbdkit
 from pbdkit.experiment.obstacles import Obstacle
@@ -109,7 +110,7 @@ def test_polygons_are_those_of_geometry(name: str) -> None:
         "clockwise": {"type": "polygon", "vertices": star[::-1].tolist()},
     }
     own = outline_of(Obstacle(shape=(bodies | SHAPES)[name]).shape)
-    gap, nx, ny, _ = own.facing(*places())
+    gap, nx, ny = own.facing(*places())
     body, at = shapely.Polygon(own.points), shapely.points(*places())
     np.testing.assert_allclose(np.abs(gap), shapely.distance(body.boundary, at), atol=1e-12)
     assert ((gap < 0) == shapely.contains(body, at)).all()
@@ -121,7 +122,7 @@ def test_polygons_are_those_of_geometry(name: str) -> None:
 @pytest.mark.parametrize("name", ["disc", "ring", "half-plane"])
 def test_round_and_flat_outlines_have_their_formulas(name: str) -> None:
     x, y = places()
-    gap, nx, ny, _ = outline(name).facing(x, y)
+    gap, nx, ny = outline(name).facing(x, y)
     to_disc, r = np.hypot(x - 7.0, y - 14.01) - 6.0, np.hypot(x - 7.0, y - 4.0)
     known = {"disc": to_disc, "ring": np.maximum(r - 20.0, 16.5 - r), "half-plane": y + 0.01}
     np.testing.assert_allclose(gap, known[name], atol=1e-12)
@@ -143,8 +144,60 @@ def test_followers_do_not_enter_and_leaders_are_not_touched() -> None:
     assert np.abs(ds.position.values[-1] - ds.reference.values).max() > 0.1
 
 
+def plane(point: Any, normal: Any, **parts: Any) -> dict[str, Any]:
+    """An obstacle."""
+    return {"shape": {"half_plane": {"point": point, "normal": normal}}} | parts
+
+
+def moving(velocity: Any, steps: int = 10) -> dict[str, Any]:
+    """The motion of an obstacle."""
+    return {"motion": {"type": "velocity", "velocity": velocity, "steps": steps}}
+
+
+GROOVE = {
+    "type": "polygon",
+    "vertices": [[13.0, -6.0], [16.5, 4.0], [12.0, 14.0], [30.0, 14.0], [30.0, -6.0]],
+}
+BETWEEN = [
+    plane([14.0, 8.0], [-1.0, -0.4], **moving([-0.03, -0.03])),
+    plane([14.0, 8.0], [-0.3, -1.0], **moving([-0.02, -0.05])),
+    {"shape": {"type": "disc", "radius": 2.0, "centre": [16.1, 0.3]}, **moving([-0.05, 0.02])},
+    {"shape": {"type": "disc", "radius": 3.0, "centre": [13.0, -3.1]}, **moving([0.01, 0.04])},
+    {"shape": SHAPES["ring"], "from": 8},
+]
+"""Obstacles that press particles against each other."""
+ROLLERS = [
+    {"select": {"edge": "left"}, "motion": {"type": "hold"}, "axes": ["x"]},
+    {"select": {"edge": "bottom"}, "motion": {"type": "hold"}, "axes": ["y"]},
+    {
+        "select": {"edge": "right"},
+        "motion": {"type": "velocity", "velocity": [0.03, 0.0], "steps": 9},
+        "axes": ["x"],
+        "until": 17,
+    },
+]
+ON_ROLLERS = [
+    plane([0.0, 8.1], [0.2, -1.0], **moving([0.0, -0.04])),
+    {"shape": {"type": "disc", "radius": 5.0, "centre": [14.0, 13.0]}, **moving([-0.05, -0.04])},
+    {"shape": {"type": "ring", "inner": 9.3, "outer": 14.0, "centre": [7.0, 4.0]}, "from": 5},
+    {"shape": GROOVE, **moving([-0.15, 0.0])},
+]
+
 CASES = {
     "elastic": block(),
+    "between obstacles": block(obstacles=BETWEEN),
+    "between obstacles, springs": block(obstacles=BETWEEN, rule={"type": "springs"}),
+    "in a groove": block(
+        obstacles=[{"shape": GROOVE, **moving([-0.45, 0.0], 13)}],
+        body={"type": "polygon", "vertices": [[0.0, 0.0], [12.0, 4.0], [0.0, 8.0]]},
+    ),
+    "on rollers": block(obstacles=ON_ROLLERS, leaders=ROLLERS),
+    "on rollers, memory": block(
+        obstacles=ON_ROLLERS[::-1],
+        leaders=ROLLERS,
+        rule={"type": "springs"},
+        solver={"type": "stepping", "relaxation": 0.9, "memory": 0.3},
+    ),
     "memory": block(**MEAN, solver={"type": "stepping", "relaxation": 0.9, "memory": 0.3}),
     "single precision": block(**MEAN, solver={"type": "stepping", "precision": "float32"}),
     "hexagonal, lag": block(**MEAN | {"frame": {"type": "first", "layers": 1, "lag": 1}},
@@ -162,6 +215,13 @@ def test_both_engines_agree_to_the_last_bit(case: str) -> None:
     with interpreting():
         state = assert_bitwise_equal(scene, CompiledStepper(scene))
     assert np.abs(state.u).max() > 0.05
+
+
+@pytest.mark.parametrize("case", ["between obstacles, springs", "on rollers"])
+def test_several_steps_in_a_pass_to_the_last_bit(case: str) -> None:
+    scene = build_scene(pbdkit.Experiment(**CASES[case]))
+    with small_passes():
+        assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2))
 
 
 def test_compiled_on_threads_to_the_last_bit() -> None:
@@ -188,8 +248,8 @@ def test_scenes_without_obstacles_have_kernels_without(monkeypatch: Any) -> None
             CompiledStepper(build_scene(pbdkit.Experiment(**block(obstacles=obstacles))))
     (bare, _), (held, _) = sources
     assert "wall" not in bare
-    assert "facing" not in bare
-    assert "facing" in held
+    assert "leave" not in bare
+    assert "leave" in held
 
 
 def test_who_rests_far_away_stays_exactly() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.components.fields import Modulus
-from pbdkit.components.forces import Thickness
+from pbdkit.components.forces import Thickness, contact_pushes, forces_on_particles
 from pbdkit.interfaces import Diagnostic, Moment, Variable
 from pbdkit.interfaces.diagnostic import Need
 from pbdkit.interfaces.units import FORCE, unset
@@ -18,8 +18,9 @@ class Contact(Diagnostic):
     """The force that each obstacle exerts on the body, and on every particle.
 
     On a follower that touches an obstacle, f = max(0, -F·n) n: what balances the force F of its
-    neighbours and of loads along the normal n out of the obstacle. In a corner between two
-    obstacles each takes its own part.
+    neighbours and of loads along the normal n out of the obstacle. On one that touches several, or
+    lies where two sides of one meet, the pushes along all normals balance F together. On a guided
+    particle they balance it along the axis along which it follows.
     """
 
     type: Literal["contact"] = "contact"
@@ -39,14 +40,10 @@ class Contact(Diagnostic):
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
         """E t times the parts along normals."""
-        forces, obstacles = np.array(now.forces.on_particles()), now.touching()
-        for load in now.loads():
-            forces[load.rows] += np.outer(load.share, load.force)
-        each, sums = 0.0 * forces, np.zeros((len(obstacles), 2))  # NaN at frame points
+        forces, touching = forces_on_particles(now), now.touching()
+        each, sums = 0.0 * forces, np.zeros((len(touching), 2))  # NaN at frame points
         size = self.youngs_modulus * self.thickness
-        for n, (rows, normals) in enumerate(obstacles):
-            pull = (forces[rows] * normals).sum(axis=1, keepdims=True)
-            pushes = size * np.maximum(0.0, -pull) * normals
-            each[rows] += pushes
-            sums[n] = pushes.sum(axis=0)
+        for n, pushes in enumerate(contact_pushes(now, touching, forces)):
+            np.add.at(each, touching[n].rows, size * pushes)
+            sums[n] = size * pushes.sum(axis=0)
         return sums, each

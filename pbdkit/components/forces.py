@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import combinations
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -11,7 +13,7 @@ from pydantic import Field, model_validator
 from pbdkit.components.diagnostics import refuse_numbers_beyond
 from pbdkit.components.fields import Modulus
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Diagnostic, Moment, Variable
+from pbdkit.interfaces import Diagnostic, Moment, TouchingRows, Variable
 from pbdkit.interfaces.diagnostic import Need
 from pbdkit.interfaces.units import ENERGY, FORCE, LENGTH, STRESS, FromUnits, Place, unset
 
@@ -59,7 +61,8 @@ class Reaction(Diagnostic):
 
     Minus the forces of the neighbours on its particles, and the loads on them; a particle of two
     groups counts half with each. A group that leads along some axes exerts nothing along the
-    others. Under the natural frame all groups together exert nothing, or minus the loads. Frame
+    others, and bears what obstacles that its particles touch exert along its own. Under the natural
+    frame all groups together exert nothing, or minus the loads and what obstacles exert. Frame
     points pull too: at the corners of held edges that is no force of the body, and a warning says
     so.
     """
@@ -189,12 +192,20 @@ class StressStrain(Diagnostic):
         return groups[self.against].rows, groups[self.group].rows
 
 
+FLAT = 1e-6
+"""Sine of an angle below which normals count as parallel, or as without a share along an axis."""
+AS_GOOD = 1e-9
+"""Relative difference of residuals below which pushes balance a force equally well."""
+
+
 def reactions(now: Moment) -> Floats:
     """What each leader group exerts over Young's modulus and thickness, (leader group, axis): along
     axes along which it leads."""
-    forces, groups = np.array(now.forces.on_particles()), now.leader_groups()
-    for load in now.loads():
-        forces[load.rows] += np.outer(load.share, load.force)
+    forces, groups = forces_on_particles(now), now.leader_groups()
+    touching = now.touching()
+    pushes = contact_pushes(now, touching, forces)
+    for each, own in zip(touching, pushes, strict=True):
+        np.add.at(forces, each.rows, own)
     times, found = np.zeros(forces.shape), np.zeros((len(groups), forces.shape[1]))
     leading = [(n, each.rows, list(each.axes)) for n, each in enumerate(groups) if each.leads]
     for _, rows, axes in leading:
@@ -203,3 +214,58 @@ def reactions(now: Moment) -> Floats:
         share = forces[rows] / np.maximum(times[rows], 1)
         found[n, axes] = 0.0 - share.sum(axis=0)[axes]
     return found
+
+
+def forces_on_particles(now: Moment) -> Floats:
+    """The forces of neighbours and loads over Young's modulus and thickness, (particle, axis)."""
+    forces = np.array(now.forces.on_particles())
+    for load in now.loads():
+        forces[load.rows] += np.outer(load.share, load.force)
+    return forces
+
+
+def contact_pushes(now: Moment, touching: tuple[TouchingRows, ...], forces: Floats) -> list[Floats]:
+    """What each obstacle exerts on the rows that touch it, (row, axis), where `forces` act on
+    particles: pushes along the normals that balance the forces best, along the axes along which a
+    particle follows."""
+    if not touching:
+        return []
+    rows = np.concatenate([each.rows for each in touching])
+    normals = np.concatenate([each.normals for each in touching])
+    follows = np.ones((len(rows), 2))
+    for group in now.leader_groups():
+        if group.leads:
+            follows[np.isin(rows, group.rows)[:, None] & np.isin([0, 1], group.axes)] = 0.0
+    needs, ways = -forces[rows] * follows, normals * follows
+    sizes = _single_pushes(needs, ways)
+    order, count = np.unique(rows, return_inverse=True, return_counts=True)[1:]
+    for n in np.flatnonzero(count > 1).tolist():
+        some = np.flatnonzero(order == n)
+        sizes[some] = _joint_pushes(needs[some[0]], ways[some])
+    ends = np.cumsum([len(each.rows) for each in touching])[:-1]
+    return np.split(sizes[:, None] * normals, ends)
+
+
+def _single_pushes(needs: Floats, ways: Floats) -> Floats:
+    """λ ≥ 0 of which λ · way comes nearest to each of some vectors."""
+    squares = (ways * ways).sum(axis=-1)
+    is_pushed = squares > FLAT * FLAT
+    sizes = np.maximum(0.0, (needs * ways).sum(axis=-1)) / np.where(is_pushed, squares, 1.0)
+    return np.where(is_pushed, sizes, 0.0)
+
+
+def _joint_pushes(need: Floats, ways: Floats) -> Floats:
+    """λ ≥ 0 of which Σ λ · way comes nearest to a vector; the mean of all with at most two that
+    are not 0 and that come as near as any, so that their order does not matter."""
+    singles = _single_pushes(need[None], ways)
+    found = [size * one for size, one in zip(singles, np.eye(len(ways)), strict=True)]
+    for a, b in combinations(range(len(ways)), 2):
+        pair = ways[[a, b]].T
+        if abs(np.linalg.det(pair)) > FLAT:
+            sizes = np.linalg.solve(pair, need)
+            if (sizes >= 0.0).all():
+                found.append(np.zeros(len(ways)))
+                found[-1][[a, b]] = sizes
+    left = np.array([math.hypot(*(sizes @ ways - need)) for sizes in found])
+    best = left <= left.min() + AS_GOOD * math.hypot(*need)
+    return np.asarray(np.array(found)[best].mean(axis=0))

@@ -82,6 +82,10 @@ class UnconvergedError(Exception):
         self.certificate = certificate
 
 
+class RoundingError(UnconvergedError):
+    """A state is as near to an equilibrium as rounding allows, and the tolerance is less."""
+
+
 """Where a search met a body that is not stable."""
 
 
@@ -95,11 +99,14 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
 
 def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     """The largest displacement that loads make when they change, linearised at rest; 0 where
-    nothing holds the body against them."""
+    nothing holds the body against them. Obstacles may stop all of it: then the largest move that
+    loads would make without them."""
     steps, moves, ways = scene.experiment.steps, Moves(scene), [0.0]
     rest = replace(rest, u=np.zeros(rest.u.shape))
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
     pushes = [moves.at(rest, moment) for moment in sorted(moments)]
+    if scene.barriers:
+        ways += [rows.largest(moves.free(rest, moment)) for moment in moments]
     if rows.any(any(push.any() for push in pushes)):
         with suppress(ExperimentError, StuckError), one_thread():
             system = linearised(scene, rest, steps, "auto", Watch(), rows=rows)

@@ -10,10 +10,13 @@ from pbdkit.equilibrium.certificate import UNKNOWN, Certificate, UnconvergedErro
 from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.newton import CONTRACTION, UNSTABLE, Finder, Search
 from pbdkit.equilibrium.system import IndefiniteError, one_thread
-from pbdkit.stepping.state import State
+from pbdkit.stepping.state import Floats, State
 
 MOST_SETS = 60
 """So often who is held by obstacles may change."""
+LEAST_PART = 2.0**-6
+"""Smallest part of a correction that is tried where the whole takes particles off obstacles that
+hold them."""
 
 
 def follow_contact(finder: Finder, state: State, moment: float) -> Certificate:
@@ -42,7 +45,7 @@ class _ContactSearch(Search):
             loose = system.is_loose(self._left, self._rounding())
             if not loose and not self._finder.tolerance < self._distance() < math.inf:
                 break
-            same, held = held is not None and bool((held == system.held).all()), system.held
+            same, held = held is not None and np.array_equal(held, system.held), system.held
             if loose:
                 went_loose = True
                 correction = system.solve_loose(self._left, spacing_of(self._finder.scene))
@@ -51,15 +54,26 @@ class _ContactSearch(Search):
             before, size = size, float(np.abs(correction).max(initial=0.0))
             if same and not loose and not size <= CONTRACTION * before:
                 break
-            self._shift(correction)
-            self._system = self._linearised(self._state, "finding the contact")
-            system = self._newest()
+            self._go(correction)
+            part, system = 1.0, self._newest()
+            while not loose and part > LEAST_PART and system.is_loose(self._left, self._rounding()):
+                part /= 2.0  # farther on what was held would come off again
+                self._go(-part * correction)
+                system = self._newest()
         if went_loose:
             system.refuse_floats()
+        # What is held stands on its outline, as after a step, and not beside it by what is left.
+        self._shift(system.of_held(self._left))
         certificate = self._certified()
         if not system.is_stable():
             raise UnconvergedError(UNSTABLE, certificate)
         return certificate
+
+    def _go(self, correction: Floats) -> None:
+        system = self._newest()
+        self._shift(correction)
+        self._shift(system.of_held(self._left))
+        self._system = self._linearised(self._state, "finding the contact")
 
     def _newest(self) -> ContactSystem:
         assert isinstance(self._system, ContactSystem)

@@ -1,14 +1,17 @@
 """The linear system of an equilibrium before obstacles: an active set.
 
-A step puts followers where y = u + move lies, and those who would enter an obstacle on its outline.
-With T = 1 for who is free and T = s (1 - n nᵀ) for who is held there (n the normal, s how a round
-outline spreads what moves along it; s = 1 before flat ones; times 1 - C n nᵀ / (n·C n) for who
-gives way more easily along some directions), its linearisation is
+A step puts followers at y = u + move, and those that would enter an obstacle at the place x nearest
+to y that is free, in the metric S of the particle (stepping/contact.py). T = ∂x/∂y is 1 for a
+particle that is free, 0 for one that is held where faces meet, and
+
+    T = t tᵀ S / (t·S t - κ n·S (x - y))
+
+for one on a single face with the normal n, the tangent t and the curvature κ. The linearisation is
 
     Ã = 1 - T (1 - A),  A that of the body alone,
 
-so that a correction keeps who is held on the outline, free along it: the step of a semi-smooth
-Newton iteration (Hintermüller, Ito, Kunisch), which changes the set until it stays.
+so that a correction keeps particles that are held on the outline, free along it: the step of a
+semi-smooth Newton iteration (Hintermüller, Ito, Kunisch), which changes the set until it stays.
 """
 
 from __future__ import annotations
@@ -30,16 +33,16 @@ from pbdkit.equilibrium.system_parts import DriftingError, Floating, Held, Part
 from pbdkit.interfaces.frame import Indices
 from pbdkit.results.progress import Watch
 from pbdkit.scene.obstacles import outlines_at
-from pbdkit.scene.outlines import slide
-from pbdkit.scene.places import Places
+from pbdkit.scene.outlines import FLAT, ROUNDING, STRAIGHTEST, Face
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
 WEAK = 1e-6
 """The stiffness of springs to where particles are, as a share of that of their neighbours."""
-DIGITS = 16.0 * float(np.finfo(float).eps)
-"""Of a place: nearer to an outline than this, a particle lies on it."""
+NO_FACE = -1
+"""Number of a face where a particle is on none."""
 REMEDY = "let a leader hold it, or take solver: {type: stepping}"
 
 
@@ -57,14 +60,17 @@ class ContactSystem(System):
         self._led = scene.raster.reference(operator.leaders)
         free = one_minus(operator.couplings_both.entries().matrix())
         self._amplification = float(np.abs(free.diagonal()).max(initial=1.0))
-        there = state.u + moves.free(state, moment)
         assert moves.contact
-        gives = moves.contact.compliance
-        self.held, turned = _turned(scene, there, self._place, moment, gives)
+        there = state.u + moves.free(state, moment)
+        self.held, turned = hold(moves.contact, scene, there, self._place, moment)
         self._matrix = matrix = _contacting(free, turned)
         led = operator.couplings_led.entries()
-        held = np.repeat(self.held, scene.axes)
+        held = np.repeat(self.held[:, 0] != NO_FACE, scene.axes)
+        self._on_outlines, self._spreads = held.copy(), dict[int, float]()
+        size = float(np.abs(state.u).max())
+        self._share_of_places = size / max(size, moves.contact.reach)
         held[led.rows[led.values != 0.0]] = True
+        held[operator.held] = True
         self._parts = self._split(matrix, held)
 
     def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Part]]:
@@ -152,10 +158,21 @@ class ContactSystem(System):
         return math.inf
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Solves once more for what is left of the moves, and adds what rounding may make of it."""
-        r = self._table(moves)
-        far = (part.farthest(r[some], rounding) for some, part in self._parts)
-        return math.sqrt(2.0) * max(far, default=0.0)
+        """Solves once more for what is left of the moves, and adds what rounding may make of it:
+        that of displacements for all followers, that of places for those that are held."""
+        r, far = self._table(moves), [0.0]
+        for n, (some, part) in enumerate(self._parts):
+            far.append(part.farthest(r[some], rounding * self._share_of_places))
+            if rounding and self._on_outlines[some].any():
+                far[-1] += self._spread(n) * rounding
+        return math.sqrt(2.0) * max(far)
+
+    def _spread(self, n: int) -> float:
+        """How far rounding of the places of particles that are held takes a part."""
+        if n not in self._spreads:
+            some, part = self._parts[n]
+            self._spreads[n] = part.spread_of(self._on_outlines[some])
+        return self._spreads[n]
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """Looks at each part by itself."""
@@ -173,6 +190,10 @@ class ContactSystem(System):
         """Whether a part that nothing holds yet has moves left."""
         r = self._table(moves)
         return any(np.abs(r[some]).max(initial=0.0) > 8 * rounding for some in self._floats)
+
+    def of_held(self, moves: Floats) -> Floats:
+        """The moves of followers that obstacles hold alone."""
+        return self._planes(np.where(self._on_outlines, self._table(moves), 0.0))
 
     def solve_loose(self, moves: Floats, most: float) -> Floats:
         """A correction, as far as `most`, where weak springs hold what nothing else does: it leads
@@ -203,35 +224,43 @@ class ContactSystem(System):
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
 
-def _turned(
-    scene: Scene, u: Floats, place: Indices, moment: float, gives: Floats | None
-) -> tuple[NDArray[np.bool_], Floats]:
-    """Who of some followers is inside an obstacle at displacements u, (follower,), or on its
-    outline, and T of each, (follower, axis, axis), through one obstacle after the other."""
-    X = scene.raster.reference_planes(Places(scene.raster.shape, place))
-    at = np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
-    on = DIGITS * float(np.abs(at).max(initial=1.0))
-    held, turned = np.zeros(len(place), bool), np.tile(np.eye(2), (len(place), 1, 1))
+def hold(
+    contact: Contact, scene: Scene, u: Floats, place: Indices, moment: float
+) -> tuple[Indices, Floats]:
+    """Return the faces on which obstacles put followers at some places from displacements u, or on
+    which they lie, by number, (follower, 2): NO_FACE beyond those, and where there are more than
+    two the first; and T of each, (follower, axis, axis)."""
+    y, codes = contact.positions(u, place), contact.led(math.ceil(moment))
+    led = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
+    x = y + contact.ways(u, place, moment)
+    C = contact.compliance_at(place)
+    S = np.array([[C[2], -C[1]], [-C[1], C[0]]])
+    count, faces = np.zeros(len(place), np.intp), np.full((len(place), 2), NO_FACE)
+    turned, number = np.tile(np.eye(2), (len(place), 1, 1)), 0
+    free = np.array([(led & 1) == 0, (led & 2) == 0])
     for _, outline in outlines_at(scene.barriers, moment):
-        gap, nx, ny, spread = outline.facing(*at)
-        inside, n = gap <= on, np.stack([nx, ny])
-        if gives is not None:
-            own = gives.reshape(3, -1)[:, place]
-            turned = _along(inside, np.stack(slide(1.0, nx, ny, *own)), n, 1.0) @ turned
-            at = at - np.where(inside, np.stack(slide(gap, nx, ny, *own)), 0.0)
-            gap, nx, ny, spread = outline.facing(*at)
-            n = np.stack([nx, ny])
-        turned = _along(inside, n, n, spread[:, None, None]) @ turned
-        at = at - np.where(inside, gap * n, 0.0)
-        held |= inside
-    return held, turned
+        digits = ROUNDING * (np.abs(x).sum(axis=0) + outline.size)
+        for face in outline.faces(*x):
+            on = face.distance <= digits
+            stops = on & (np.where(free, np.abs(face.normal), 0.0).max(axis=0) > math.sqrt(FLAT))
+            first = stops & (count == 0)
+            turned[first] = _along(face, S, x - y)[first]
+            turned[stops & ((count > 0) | (led > 0))] = 0.0
+            for n in range(2):
+                faces[stops & (count == n), n] = number
+            count, number = count + stops, number + 1
+    return faces, np.where(free.T[:, :, None], turned, 0.0)
 
 
-def _along(inside: NDArray[np.bool_], way: Floats, n: Floats, spread: Any) -> Floats:
-    """(follower, axis, axis): spread · (1 - way nᵀ) for who is inside, 1 for others."""
-    turned = spread * (np.eye(2) - way.T[:, :, None] * n.T[:, None, :])
-    found: Floats = np.where(inside[:, None, None], turned, np.eye(2))
-    return found
+def _along(face: Face, S: Floats, way: Floats) -> Floats:
+    """T of particles that are held on a face, (follower, axis, axis)."""
+    n = face.normal
+    t = np.stack([-n[1], n[0]])
+    along = np.einsum("abe,be->ae", S, t)
+    straight = (t * along).sum(axis=0)
+    bent = straight - face.curvature * np.einsum("ae,abe,be->e", n, S, way)
+    bent = np.where(bent > STRAIGHTEST * straight, bent, straight)
+    return np.asarray(np.einsum("ae,be->eab", t, along / bent))
 
 
 def _contacting(free: Any, turned: Floats) -> Any:

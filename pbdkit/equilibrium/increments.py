@@ -12,7 +12,12 @@ import numpy as np
 from pbdkit.analysis.operator import step_operator
 from pbdkit.analysis.spectrum import TooDearError, excess, spectrum
 from pbdkit.equilibrium.breaking.choice import settler_of
-from pbdkit.equilibrium.certificate import Certificate, UnconvergedError, broken_bonds
+from pbdkit.equilibrium.certificate import (
+    Certificate,
+    RoundingError,
+    UnconvergedError,
+    broken_bonds,
+)
 from pbdkit.equilibrium.contact_search import follow_contact
 from pbdkit.equilibrium.finder import finder_of
 from pbdkit.equilibrium.load_path import changes, moments, spacings
@@ -359,6 +364,8 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         place(state.u, led)
         try:
             certificate = _nearby(finder, state, target, before)
+        except RoundingError:
+            raise  # smaller parts come no nearer
         except UnconvergedError as error:
             vars(state).update(vars(before))
             part /= 2.0

@@ -14,6 +14,7 @@ from pbdkit.equilibrium.certificate import (
     FIRST_ORDER,
     LINEAR,
     Certificate,
+    RoundingError,
     UnconvergedError,
     spacing_of,
 )
@@ -39,6 +40,10 @@ NUDGE, SHARE = 1e-6, 0.25
 """By so much, in lattice spacings, leaders are moved to see what their way does to others; the
 share of the tolerance that linear systems have."""
 UNSTABLE = "what is found is not stable"
+ROUNDING = "rounding alone allows no better"
+FIRM = 1e5
+"""Distance over rounding up to which a body counts as firm: farther, it may be about to give way,
+so that a shorter way could help."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,10 @@ class Search(ABC):
     def _certified(self) -> Certificate:
         certificate = self._certificate(self._distance())
         if not certificate.distance <= self._finder.tolerance:
-            raise UnconvergedError(self._why(), certificate)
+            why = self._why()
+            is_near = certificate.distance <= FIRM * self._rounding()
+            kind = RoundingError if is_near and why.startswith(ROUNDING) else UnconvergedError
+            raise kind(why, certificate)
         return certificate
 
     def _certificate(self, distance: float) -> Certificate:
@@ -172,7 +180,7 @@ class Search(ABC):
             rounding = self._rounding()
             best = self._system.distance(np.zeros_like(self._left), rounding) / finder.scale
             if best * finder.scale > SHARE * finder.tolerance:
-                return f"rounding alone allows no better than {best:.1g}{_reachable(best)}"
+                return f"{ROUNDING} than {best:.1g}{_reachable(best)}"
         return "no correction makes the moves smaller"
 
     def _linearised(self, at: State, what: str) -> System:

@@ -25,6 +25,7 @@ from pbdkit.equilibrium.linear_solver import (
 from pbdkit.results.progress import Watch
 
 Floats = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
 SAFETY = 3.0
 """What an estimate that may come out too small is multiplied with."""
 ACCURACY = 1e-9
@@ -130,13 +131,19 @@ class Part(ABC):
 
     @cached_property
     def _spread(self) -> float:
-        """How far A⁻¹ takes numbers of up to 1: the largest row sum of |A⁻¹| where the inverse is
-        at hand; else some times as far as it takes random ones, as rounding is."""
+        """That of all unknowns."""
+        return self.spread_of(np.ones(self._size, bool))
+
+    def spread_of(self, some: Mask) -> float:
+        """How far A⁻¹ takes numbers of up to 1 in some unknowns: the largest row sum of |A⁻¹| where
+        the inverse is at hand; else some times as far as it takes random ones, as rounding is."""
+        if self._solver is None:
+            return math.inf if some.any() else 0.0
         if isinstance(self._solver, Dense):
             inverse = np.abs(self._solver.inverse[: self._size, : self._size])
-            return float(inverse.sum(axis=1).max(initial=0.0))
+            return float(inverse[:, some].sum(axis=1).max(initial=0.0))
         self._watch.begin("bounding the error")
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size)
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], self._size) * some
         # So accurately that the softest mode, with its share in random numbers, is not left out.
         accuracy = min(ROUGH, RANDOM_SHARE / math.sqrt(max(1, self._size)))
         return SAFETY * float(np.abs(self._inverted(signs, accuracy)).max(initial=0.0))

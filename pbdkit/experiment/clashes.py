@@ -90,7 +90,6 @@ def _of_forces(asked: Any) -> list[tuple[Key, bool, str]]:
     """What masses, obstacles and loads ask for."""
     rests = not asked.solver.makes_steps or asked.stepping.settle is not None
     masses = any(isinstance(group.motion, Newton) for group in asked.leaders)
-    guided = any(group.axes is not None for group in asked.leaders)
     knows_forces = material_of(asked.rule) is not None
     return [
         ("solver", masses and rests,
@@ -100,9 +99,6 @@ def _of_forces(asked: Any) -> list[tuple[Key, bool, str]]:
          f"leaders that move by Newton's law need forces, and '{asked.rule.type}' knows none "
          "with these parameters; take a calibrated rule: elastic with poisson_ratio above -1, or "
          "springs"),
-        ("obstacles", bool(asked.obstacles) and guided and rests,
-         "with leaders along one axis the equilibrium before obstacles is not known; take solver: "
-         "{type: stepping} without settle, or lead along both axes"),
         ("loads", bool(asked.loads) and not (knows_forces and isinstance(asked.rule, Loadable)),
          f"the rule '{asked.rule.type}' with these parameters knows no forces: it says where a "
          "particle goes, and of no material how far a force would move it; take a calibrated "

@@ -153,7 +153,11 @@ class StateMoment(Moment):
         )
 
     def touching(self) -> tuple[TouchingRows, ...]:
-        """Found anew each time."""
+        """Found once a moment."""
+        return self._touching
+
+    @cached_property
+    def _touching(self) -> tuple[TouchingRows, ...]:
         if not self._scene.barriers:
             return ()
         found = Contact(self._scene).touching(self._state, self._now)

@@ -10,10 +10,11 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
+from pbdkit.experiment.newton import Newton
 from pbdkit.experiment.obstacles import Obstacle
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.leader_groups import Leading
-from pbdkit.scene.outlines import Floats, Outline, outline_of
+from pbdkit.scene.outlines import Floats, Outline, Walls, outline_of
 from pbdkit.scene.places import Mask
 from pbdkit.scene.raster import Raster
 
@@ -102,10 +103,13 @@ def collisions(
     raster: Raster, leading: Sequence[Leading], barriers: Sequence[Barrier], steps: int
 ) -> list[str]:
     """Warnings about leaders that are driven into an obstacle, which does not touch them: as they
-    stand where motions change, from rest."""
+    stand where motions change, from rest. Those that move by Newton's law are stopped; guided ones
+    may make way along the axis along which they follow."""
     slack = SLACK * math.hypot(*raster.lattice.cell().vectors[0])
     found = []
     for k, led in enumerate(leading):
+        if isinstance(led.group.motion, Newton):
+            continue
         for n, barrier in enumerate(barriers):
             for step in _moments(led, barrier, steps):
                 at = led.reference + led.group.motion.offset(
@@ -113,7 +117,10 @@ def collisions(
                 )
                 outline = barrier.at(step)
                 assert outline
-                gap = outline.facing(*(at - barrier.origin).T)[0]
+                places = (at - barrier.origin).T
+                gap = outline.facing(*places)[0]
+                if len(led.axes) < len(places):
+                    gap = np.where(_makes_way(outline, places, led.axes[0]), np.inf, gap)
                 deepest = float(raster.others.least(np.array([gap.min(initial=np.inf)]))[0])
                 if deepest < -slack:
                     number = raster.others.first(_number(raster, led.rows, gap == deepest))
@@ -122,6 +129,16 @@ def collisions(
                         "obstacles stop followers, not leaders"
                     )
                     break
+    return found
+
+
+def _makes_way(outline: Outline, places: Floats, axis: int) -> Mask:
+    """Which places (axis, place) are in free space somewhere along the other axis."""
+    walls, found = Walls.of([outline]), np.zeros(places.shape[1], bool)
+    with np.errstate(all="ignore"):
+        for k, at in enumerate(places.T):
+            x, y = at + walls.way_between(at, np.array([1.0, 0.0, 1.0]), axis + 1)
+            found[k] = walls.clearance(x, y) >= 0.0
     return found
 
 

@@ -1,15 +1,17 @@
-"""Keeps particles out of obstacles: whoever lies inside one is put on its outline after the step,
+"""Keep particles out of obstacles: those that lie inside one are put on its outline after the step,
 as position-based dynamics does it, without friction.
 
-That is the nearest point. Where the rule knows forces, and a particle gives way more easily along
-some directions than others, as at corners, it goes C n / (n·C n) times the gap first, the way on
-which a push along the normal n sends it: what is left of the forces at rest is then along n.
+A rule moves a particle by S⁻¹ · force (stepping/compliance.py). A particle goes to the place
+outside of all obstacles that is nearest in the metric S: the way there is S⁻¹ n for a push along
+the normal n at that place, or normals where obstacles meet, so that what is left of the forces at
+rest is along normals. Where S is a multiple of 1 that is the nearest place. A guided particle goes
+along the axis along which it follows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import product
 
@@ -17,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
+from pbdkit.scene.guides import guided_at, has_guides
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.obstacles import SLACK, outlines_at
-from pbdkit.scene.outlines import Outline, slide
-from pbdkit.scene.places import Block, Mask, Places
+from pbdkit.scene.outlines import Outline, Walls
+from pbdkit.scene.places import Block, Mask, Places, distinct
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compliance import compliance
@@ -28,13 +31,15 @@ from pbdkit.stepping.state import Floats, State
 
 Touching = list[tuple[Indices, NDArray[np.float64]]]
 """Of each obstacle some rows, and the normals there, (row, axis)."""
+FREE, ALL_LED = 0, 3
+"""Codes of particles that follow along both axes, and along none; 1 and 2 are led along x, y."""
 
 
 class Contact:
     """The obstacles of a scene and the particles of its body.
 
-    Only those are looked at that can be in an obstacle's box, as far as displacements reach. One
-    obstacle comes after the other, in the order of the experiment.
+    Only those are looked at that can be in an obstacle's box, as far as displacements reach. The
+    order of the obstacles does not matter.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -44,20 +49,86 @@ class Contact:
         ends = [end for block in self._blocks() for end in self._ends(block)]
         self.reach = float(np.abs(ends).max())
         """How far any particle rests from the lattice's site (0, 0), along an axis."""
+        self._led: dict[tuple[bool, ...], NDArray[np.int8]] = {}
 
     @cached_property
     def compliance(self) -> Floats | None:
-        """How particles give way along different directions."""
+        """How particles give way along different directions; None where alike."""
         return compliance(self._scene)
 
+    def led(self, step: int) -> NDArray[np.int8] | None:
+        """(sublattice, cell, cell): the code of the axes along which particles lead in a step; None
+        where none can be guided."""
+        scene = self._scene
+        if not has_guides(scene.leading):
+            return None
+        roles = tuple(leading.group.leads(step) for leading in scene.leading)
+        if roles not in self._led:
+            codes = np.zeros(scene.raster.kind.size, np.int8)
+            for leading, leads in zip(scene.leading, roles, strict=True):
+                for axis in leading.axes if leads else ():
+                    codes[leading.place] |= 1 << axis
+            self._led[roles] = codes.reshape(scene.raster.shape)
+        return self._led[roles]
+
     def push_out(self, u: Floats, moment: float) -> None:
-        """Puts the body's particles, leaders too, out of the obstacles as they are at the end of a
-        step, or at a moment within it; `u` are planes."""
-        for _, outline in outlines_at(self._scene.barriers, moment):
+        """Put the body's particles out of the obstacles as they are at the end of a step, or at a
+        moment within it; `u` are planes, with guided particles where they are led to. Particles
+        that lead along both axes may be moved, too."""
+        outlines, found = self._outlines(moment), [np.empty(0, np.intp)]
+        for outline in outlines:
             for block in self._blocks():
                 near = self._near(block, block.of(u), outline.box)
                 if near is not None:
-                    self._push_block(near, u, outline)
+                    i, j = np.nonzero(self._inside(near, u, outline))
+                    at = near.sublattice, i + near.start[0], j + near.start[1]
+                    found.append(np.ravel_multi_index(at, self._scene.raster.shape))
+        place = distinct(np.concatenate(found))
+        if len(place):
+            flat = u.reshape(len(u), -1)
+            flat[:, place] = flat[:, place] + self.ways(u, place, moment)
+
+    def ways(self, u: Floats, place: Indices, moment: float) -> Floats:
+        """(axis, place): the ways of particles at flat places to where obstacles let them be."""
+        codes = self.led(math.ceil(moment))
+        led = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
+        return self._ways(self.positions(u, place), self.compliance_at(place), led, moment)
+
+    def ways_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
+        """The same of particles that give way alike along all directions, at displacements u,
+        (axis, place)."""
+        X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
+        at = np.stack([a + b for a, b in zip(X, u, strict=True)])
+        return self._ways(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)
+
+    def _ways(self, at: Floats, C: Floats, led: NDArray[np.int8], moment: float) -> Floats:
+        outlines = self._outlines(moment)
+        walls, way, size = Walls.of(outlines), np.zeros(at.shape), at.shape[1]
+        count, one = np.zeros(size, np.intp), np.zeros(size, np.intp)
+        with np.errstate(all="ignore"):
+            for n, outline in enumerate(outlines):
+                inside = outline.facing(*at)[0] < 0.0
+                count, one = count + inside, np.where(inside, n, one)
+            for n, outline in enumerate(outlines):
+                some = np.flatnonzero((count == 1) & (led == FREE) & (one == n))
+                way[:, some] = outline.way_out(at[:, some], C[:, some])
+            x, y = at + way
+            alone = (count == 1) & (led == FREE) & (walls.clearance(x, y) >= 0.0)
+            for k in np.flatnonzero((count > 0) & (led != ALL_LED) & ~alone).tolist():
+                way[:, k] = walls.way_between(at[:, k], C[:, k], int(led[k]))
+        return way
+
+    def positions(self, u: Floats, place: Indices) -> Floats:
+        """(axis, place): where particles at flat places are, from the lattice's site (0, 0)."""
+        X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
+        return np.stack([a + b for a, b in zip(X, u.reshape(len(u), -1)[:, place], strict=True)])
+
+    def compliance_at(self, place: Indices) -> Floats:
+        """C of particles at flat places, (xx xy yy, place)."""
+        if self.compliance is None:
+            return _alike(len(place))
+        found: Floats = self.compliance.reshape(3, -1)[:, place]
+        return found
 
     def touched_at_rest(self, moment: float) -> Iterator[tuple[NDArray[np.intp], ...]]:
         """The cells of particles that would be pushed where they rest, index by index."""
@@ -66,27 +137,36 @@ class Contact:
             for block in self._blocks():
                 near = self._near(block, block.of(still), outline.box)
                 if near is not None:
-                    inside, *_ = self._inside(near, still, outline)
+                    inside = self._inside(near, still, outline)
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
 
     def touching(self, state: State, moment: float) -> Touching:
         """The rows of the followers on each obstacle's outline, as the state has them at a moment,
         and the normals there, (row, axis): within what rounding allows, and 1e-9 of a lattice
-        constant."""
-        scene, raster = self._scene, self._scene.raster
-        rows = np.flatnonzero(kinds_at(raster, scene.leading, math.ceil(moment)) == FOLLOWER)
-        places = Places(raster.shape, raster.place_of(rows))
-        at = [np.asarray(a) for a in raster.reference_planes(places)]
+        constant. Guided particles are among them. Where two faces of an obstacle meet a row stands
+        twice."""
+        scene, raster, step = self._scene, self._scene.raster, math.ceil(moment)
+        kinds = kinds_at(raster, scene.leading, step)
+        if has_guides(scene.leading):
+            kinds[guided_at(raster, scene.leading, max(step, 1)).rows] = FOLLOWER
+        rows = np.flatnonzero(kinds == FOLLOWER)
+        at = self.positions(state.u, raster.place_of(rows))
         digits = 16.0 * float(np.finfo(state.u.dtype).eps) * self.reach
-        u = state.u.reshape(2, -1)[:, places.place]
-        x, y = (a + b for a, b in zip(at, u, strict=True))
         slack = SLACK * math.hypot(*self._vectors[0]) + digits
         found: Touching = [(rows[:0], np.zeros((0, 2)))] * len(scene.barriers)
         for n, outline in outlines_at(scene.barriers, moment):
-            gap, nx, ny, _ = outline.facing(x, y)
-            on = np.abs(gap) <= slack
-            found[n] = rows[on], np.stack([nx[on], ny[on]], axis=1)
+            near = np.flatnonzero(np.abs(outline.facing(*at)[0]) <= slack)
+            faces = list(outline.faces(*at[:, near]))
+            on = [face.distance <= slack for face in faces]
+            normals = [face.normal[:, own] for face, own in zip(faces, on, strict=True)]
+            found[n] = (
+                np.concatenate([rows[near[own]] for own in on]),
+                np.concatenate(normals, axis=1).T,
+            )
         return found
+
+    def _outlines(self, moment: float) -> Sequence[Outline]:
+        return [outline for _, outline in outlines_at(self._scene.barriers, moment)]
 
     def _blocks(self) -> list[Block]:
         blocks = (self._scene.raster.body_block(s) for s in range(self._scene.raster.shape[0]))
@@ -112,30 +192,15 @@ class Contact:
             return None
         return Block(block.sublattice, tuple(first.tolist()), tuple(last.tolist()))
 
-    def _push_block(self, block: Block, u: Floats, outline: Outline) -> None:
-        inside, *facing = self._inside(block, u, outline)
-        gap, *normal = (value[inside] for value in facing)
-        if self.compliance is not None:
-            own = [c[inside] for c in block.of(self.compliance)]
-            for plane, way in zip(block.of(u), slide(gap, *normal, *own), strict=True):
-                plane[inside] = plane[inside] - way
-            X = np.broadcast_arrays(*self._scene.raster.reference_planes(block))
-            at = [a[inside] + plane[inside] for a, plane in zip(X, block.of(u), strict=True)]
-            gap, *normal, _ = outline.facing(*at)
-        for plane, n in zip(block.of(u), normal, strict=True):
-            plane[inside] = plane[inside] - gap * n
-
-    def _inside(
-        self, block: Block, u: Floats, outline: Outline
-    ) -> tuple[Mask, Floats, Floats, Floats]:
-        """Which of the body's particles in a block are inside; the gap and the normal of all."""
+    def _inside(self, block: Block, u: Floats, outline: Outline) -> Mask:
+        """Which of the body's particles in a block are inside."""
         X, low = self._scene.raster.reference_planes(block), outline.box
         x, y = (a + b for a, b in zip(X, block.of(u), strict=True))
         near = (x >= low[0]) & (y >= low[1]) & (x <= low[2]) & (y <= low[3])
         near &= block.of(self._scene.raster.kind) == FOLLOWER
-        gap, *normal = (np.zeros(x.shape) for _ in range(3))
-        gap[near], normal[0][near], normal[1][near], _ = outline.facing(x[near], y[near])
-        return near & (gap < 0.0), gap, normal[0], normal[1]
+        inside = np.zeros(x.shape, bool)
+        inside[near] = outline.facing(x[near], y[near])[0] < 0.0
+        return inside
 
     def _ends(self, block: Block) -> tuple[Floats, Floats]:
         """(low, high) of the places of a block's sites, from site (0, 0)."""
@@ -144,3 +209,8 @@ class Contact:
         at = np.array(self._scene.raster.lattice.cell().sites[block.sublattice].at)
         places = sites @ self._vectors + at
         return places.min(axis=0), places.max(axis=0)
+
+
+def _alike(count: int) -> Floats:
+    """C of particles that give way alike along all directions, (xx xy yy, particle)."""
+    return np.repeat([[1.0], [0.0], [1.0]], count, axis=1)

@@ -11,22 +11,15 @@ taken at their word. On straight edges S_fl is zero, at corners and in cut cells
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.rule import material_of
-from pbdkit.interfaces.vector import vector
 from pbdkit.scene.guides import Guided, guided_at, has_guides
-from pbdkit.scene.places import Places
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator, summed
-from pbdkit.stepping.state import Floats, State, unmoved_state
-from pbdkit.stepping.surroundings import Surroundings
+from pbdkit.stepping.compliance import stiffnesses
+from pbdkit.stepping.state import Floats
 
-NUDGE = 0.01
-"""By which a particle is moved to see what pulls it back, in lattice units."""
 STRAIGHT = 1e-12
 """Shares below this are rounding."""
 Slants = dict[tuple[int, int], tuple[Indices, Floats]]
@@ -83,37 +76,13 @@ class Guidance:
         shares = np.zeros((len(guided.place), axes, axes))
         if not self.slanted or not len(guided.place):
             return shares
-        pulls = self._pulls(guided.place)
+        pulls = stiffnesses(self._scene, guided.place)
         for pattern in np.unique(guided.led, axis=1).T:
             some = np.flatnonzero((pattern == guided.led.T).all(axis=1))
             f, of = np.flatnonzero(~pattern), np.flatnonzero(pattern)
             own, across = (pulls[np.ix_(some, f, axis)] for axis in (f, of))
             shares[np.ix_(some, f, of)] = np.linalg.pinv(own) @ across
         return shares
-
-    def _pulls(self, place: Indices) -> Floats:
-        """S, (particle, axis, axis), with no bond broken."""
-        scene, evaluator = self._scene, Evaluator(self._scene)
-        each = scene.raster.kind.size // len(scene.raster.kind)
-        found = np.zeros((len(place), scene.axes, scene.axes))
-        for s in np.unique(place // each).tolist():
-            some = np.flatnonzero(place // each == s)
-            around = Surroundings(scene, Places(scene.raster.shape, place[some]), s)
-            neighbours, here = around.neighbours(self._rest), around.here(self._rest.u, self._rest)
-            answers = []
-            for e in np.eye(scene.axes):
-                u = vector(np.full(len(some), NUDGE * c) for c in e)
-                parts = [(evaluator.contribution(-u, u, to), to.present) for to in neighbours]
-                total, at = summed(parts), here._replace(u=u)
-                both = evaluator.move(total, at), evaluator.force(total, at)
-                answers.append([[np.broadcast_to(c, len(some)) for c in one] for one in both])
-            move, force = np.array(answers).transpose(1, 3, 2, 0)
-            found[some] = force @ np.linalg.pinv(move)
-        return found
-
-    @cached_property
-    def _rest(self) -> State:
-        return unmoved_state(self._scene, self._scene.raster.shape[1:])
 
     @property
     def _real(self) -> str:

@@ -9,6 +9,7 @@ from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.places import Places
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.state import Floats, State
@@ -28,6 +29,7 @@ class NewtonForces:
         self.numbers = tuple(some)
         """Of the groups that move so."""
         self._parts = {n: _parts(scene, each.place) for n, each in some.items()}
+        self._contact = Contact(scene) if some and scene.barriers else None
         # A rule that works on the moves of another is asked everywhere.
         self._whole = SlotFollowers(scene) if some and scene.inner else None
 
@@ -51,6 +53,18 @@ class NewtonForces:
             for axis, component in enumerate(force):
                 found[some, axis] = np.where(movable, component, 0.0)
         return found
+
+    def stopped(self, n: int, velocity: Floats, u: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return the velocities of a group's particles and their displacements at the end of a
+        step, (axis, particle), out of the obstacles: what they go less they lose of their velocity,
+        unless an obstacle appears where they are."""
+        leading = self._scene.leading[n]
+        if self._contact is None or len(leading.axes) < self._scene.axes:
+            return velocity, u
+        way = self._contact.ways_of_masses(u, leading.place, step)
+        if not any(barrier.group.from_ == step for barrier in self._scene.barriers):
+            velocity = velocity + way
+        return velocity, u + way
 
     def stiffness(self, n: int, state: State, nudge: float) -> float:
         """By how much the force on the group grows, at most, for a unit way of its particles, along

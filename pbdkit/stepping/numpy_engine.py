@@ -83,6 +83,8 @@ class Stepper(Engine):
         for values, prescribed in kept:
             values[clamped] = prescribed
         if self._contact:
+            if self._guidance.some:
+                place(new, led)
             self._contact.push_out(new, step)
         place(new, led)
         place(u, before)

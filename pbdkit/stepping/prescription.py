@@ -68,7 +68,8 @@ def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[F
     reached = np.zeros_like(faster)
     reached[axes] = faster[axes]
     here = state.u.reshape(scene.axes, -1)[:, leading.place]
-    return reached, (here + reached)[axes]
+    reached, u = forces.stopped(n, reached, here + reached, state.step + 1)
+    return reached, u[axes]
 
 
 def _refuse_contradiction(scene: Scene, led: Led, step: int) -> None:

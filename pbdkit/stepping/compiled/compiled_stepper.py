@@ -163,6 +163,8 @@ class CompiledStepper(Engine):
         loads = {} if load is None else dict(zip(self._plan.each("load_@"), load, strict=True))
         first = state.step + 1
         walls = wall_arrays(self._scene, range(first, first + len(ways)))
+        if self._contact and (codes := self._contact.led(first)) is not None:
+            walls["led_axes"] = codes
         return self._arrays | moved | leaders | reached | loads | walls
 
     def _clamped_arrays(self) -> Arrays:

@@ -116,9 +116,10 @@ def _write_run(
     for m in plan.rotations:
         out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
         out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
-    if pushing:
-        write_pass(out, plan, 1, pushing, "i0", "i1", "made")
     write_slants(out, plan)
+    if pushing:
+        write_guiding(out, plan)
+        write_pass(out, plan, 1, pushing, "i0", "i1", "made")
     write_leading(out, plan, "fv_@[led[e]] = held[#, e]", "fu_@[led[e]] = led_kept[#, e]")
     if plan.scene.frame:
         write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")

@@ -62,7 +62,7 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
         if isinstance(part, Loadable) and levels[-1].scene.loads:
             found[f"loaded{number}"] = part.loaded
     if levels[-1].scene.barriers:
-        found |= {"facing": outlines.facing, "slide": outlines.slide}
+        found["leave"] = outlines.leave
     return found
 
 

@@ -1,4 +1,5 @@
-"""Writes the pass that keeps particles out of obstacles, after the sweeps and before the leaders.
+"""Writes the pass that keeps particles out of obstacles, after the sweeps; where particles may be
+guided, after the leaders too.
 
 Rows whose particles reach no obstacle's box, as far as their displacements go, are passed over.
 """
@@ -9,7 +10,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from pbdkit.scene.guides import has_guides
 from pbdkit.scene.obstacles import outlines_at
+from pbdkit.scene.outlines import Walls
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.compiled.arguments import Arrays
@@ -23,15 +26,12 @@ def wall_arrays(scene: Scene, steps: Iterable[int]) -> Arrays:
     if not scene.barriers:
         return {}
     moments = [[outline for _, outline in outlines_at(scene.barriers, step)] for step in steps]
-    found = moments[0]
-    points = [np.empty((0, 2)), *(outline.points for outline in found)]
+    walls = [Walls.of(now) for now in moments]
     return {
-        "wall_kind": np.array([outline.kind for outline in found], np.int64),
-        "wall_first": np.cumsum([len(own) for own in points]),
-        "wall_points": np.array(
-            [np.concatenate([points[0], *(o.points for o in now)]) for now in moments]
-        ),
-        "wall_radii": np.array([(o.inner, o.outer) for o in found]).reshape(-1, 2),
+        "wall_kind": walls[0].kinds,
+        "wall_first": walls[0].first,
+        "wall_points": np.array([now.points for now in walls]),
+        "wall_radii": np.array([now.radii for now in walls]),
         "wall_box": np.array([[o.box for o in now] for now in moments]).reshape(
             len(moments), -1, 4
         ),
@@ -39,12 +39,10 @@ def wall_arrays(scene: Scene, steps: Iterable[int]) -> Arrays:
 
 
 def write_obstacle_pass(plan: Plan) -> Function:
-    """The function that pushes the particles of some rows out of every obstacle, one after the
-    other."""
-    has_compliance = "compliance" in plan.shared
+    """The function that pushes the particles of some rows out of all obstacles."""
     out = Function(plan.shared, "push_out", "first_row", "last_row", "moment")
     out.add(0, "m = min(moment, wall_box.shape[0] - 1)")
-    out.add(0, "points, edges = wall_points[m], wall_box[m]")
+    out.add(0, "points, edges, radii = wall_points[m], wall_box[m], wall_radii[m]")
     out.add(0, "j0, j1 = max(0, box[2]), min(kind.shape[2], box[3])", "width = j1 - j0")
     out.add(0, "for s in range(kind.shape[0]):", "    for i in range(first_row, last_row):")
     out.add(2, "if width <= 0:", "    continue")
@@ -55,22 +53,30 @@ def write_obstacle_pass(plan: Plan) -> Function:
     for name, j in (("A", "0"), ("B", "width - 1")):
         out.add(2, f"j = {j}", *_places(plan, name))
     out.add(2, *plan.each("l@, h@ = min(A@, B@) + l@, max(A@, B@) + h@"))
-    out.add(2, "near = 0", "for w in range(wall_kind.size):")
-    out.add(3, f"if {_beyond('l', 'h')}:", "    continue", "near = 1")
+    out.add(2, "near = 0", *_each_near("l", "h"))
     out.add(2, "if near == 0:", "    continue", "for j in range(width):")
     out.add(3, f"if kind[s, i, j0 + j] != {FOLLOWER}:", "    continue", *_places(plan, "A"))
-    out.add(3, *plan.each("p@ = A@ + o@[j]"), "for w in range(wall_kind.size):")
-    out.add(4, f"if {_beyond('p', 'p')}:", "    continue")
-    given = "wall_first[w], wall_first[w + 1], wall_radii[w, 0], wall_radii[w, 1]"
-    out.add(4, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], points, {given})")
-    out.add(4, "if gap < 0.0:")
-    if has_compliance:
-        own = ", ".join(f"compliance[{n}, s, i, j0 + j]" for n in range(3))
-        out.add(5, f"sx, sy = slide(gap, nx, ny, {own})")
-        out.add(5, *plan.each("o@[j] = o@[j] - s@"), *plan.each("p@ = A@ + o@[j]"))
-        out.add(5, f"gap, nx, ny, _ = facing(px, py, wall_kind[w], points, {given})")
-    out.add(5, *plan.each("o@[j] = o@[j] - gap * n@"), *plan.each("p@ = A@ + o@[j]"))
+    out.add(3, *plan.each("p@ = A@ + o@[j]"), "near = 0")
+    out.add(3, *_each_near("p", "p"), "if near == 0:", "    continue")
+    has_compliance = "compliance" in plan.shared
+    own = [f"compliance[{n}, s, i, j0 + j]" for n in range(3)]
+    own = own if has_compliance else ["1.0", "0.0", "1.0"]
+    own.append("led_axes[s, i, j0 + j]" if has_guides(plan.scene.leading) else "0")
+    walls = "wall_kind, points, wall_first, radii"
+    out.add(3, f"{', '.join(plan.each('w@'))} = leave(px, py, {', '.join(own)}, {walls})")
+    out.add(3, *plan.each("o@[j] = o@[j] + w@"))
     return out
+
+
+def _each_near(low: str, high: str) -> list[str]:
+    """A loop over the obstacles that notes whether what lies from one place to the other may be in
+    the box of one; it does not where it is not a number."""
+    return [
+        "for w in range(wall_kind.size):",
+        f"    if {_beyond(low, high)}:",
+        "        continue",
+        "    near = 1",
+    ]
 
 
 def _places(plan: Plan, name: str) -> list[str]:

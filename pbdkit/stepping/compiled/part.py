@@ -37,7 +37,11 @@ def write_part(plan: Plan, passes: Sequence[Function], pushing: Function | None)
     if has_guides(plan.scene.leading):
         _write_leaders(out, plan, "flat_v")
     _write_sweep(out, plan, sweep)
+    _write_turns(out, plan)
     if pushing:
+        if has_guides(plan.scene.leading):
+            _write_leaders(out, plan, "flat_v")
+        out.add(0, "if r0 < r1 and box[2] < box[3]:")
         out.add(1, pushing.call("r0", "r1", "made + s"))
     _write_after(out, plan)
     return out
@@ -74,15 +78,20 @@ def _write_sweep(out: Function, plan: Plan, sweep: Function) -> None:
     out.add(0, f"if r0 < r1 and box[{first}] < box[{first + 1}]:", "    " + sweep.call("r0", "r1"))
 
 
-def _write_after(out: Function, plan: Plan) -> None:
-    """What comes after the particles of the rows from i0 to i1, and columns from j0 to j1, have
-    moved."""
+def _write_turns(out: Function, plan: Plan) -> None:
+    """What the rule alone does not decide of the particles of the rows from i0 to i1, and columns
+    from j0 to j1: prescribed directions, and what guided particles add to their moves."""
     if plan.rotations:
         _write_listed(out, "clamped", "e")
         out.add(2, *(f"flat_own{m}[clamped[e]] = flat_was{m}[clamped[e]]" for m in plan.rotations))
     for to, of in plan.slanted:
         _write_listed(out, f"slant_{to}{of}", "e")
         out.add(1, *slant_lines(to, of, "flat_u", "flat_v"))
+
+
+def _write_after(out: Function, plan: Plan) -> None:
+    """What comes after the particles of the rows from i0 to i1, and columns from j0 to j1, have
+    moved."""
     _write_leaders(out, plan, "flat_v")
     if frame := plan.scene.frame:
         _write_frame_points(out, plan)
