@@ -152,11 +152,12 @@ def test_springs_find_their_equilibrium_in_all_units(power):
     assert same["share"] == known["share"]
 
 
-def test_a_tolerance_that_can_be_reached_is_named():
+@pytest.mark.parametrize("rule", [{"type": "elastic", "poisson_ratio": 0.3}, {"type": "springs"}])
+def test_a_tolerance_that_can_be_reached_is_named(rule):
     way = {"type": "displace", "displacement": [0.3, 0.15]}
     ends = [HOLD, {"select": {"edge": "right"}, "motion": way}]
     solver = {"type": "equilibrium", "tolerance": 1e-17}
-    parts = {"leaders": ends, "loads": [], "solver": solver}
+    parts = {"leaders": ends, "loads": [], "solver": solver, "rule": rule}
     with pytest.raises(pbdkit.DivergedError, match="rounding alone") as caught:
         run(cantilever(9, 5, None, **parts))
     named = float(str(caught.value).partition("solver.tolerance: ")[2].partition(":")[0])

@@ -16,7 +16,6 @@ from pbdkit.equilibrium.certificate import (
     Certificate,
     RoundingError,
     UnconvergedError,
-    spacing_of,
 )
 from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
 from pbdkit.equilibrium.moves import Moves
@@ -149,11 +148,28 @@ class Search(ABC):
     def _certified(self) -> Certificate:
         certificate = self._certificate(self._distance())
         if not certificate.distance <= self._finder.tolerance:
-            why = self._why()
+            best = self._floor() / self._finder.scale
             is_near = certificate.distance <= FIRM * self._rounding()
-            kind = RoundingError if is_near and why.startswith(ROUNDING) else UnconvergedError
-            raise kind(why, certificate)
+            kind = RoundingError if is_near and self._is_rounding(best) else UnconvergedError
+            raise kind(self._why(best), certificate)
         return certificate
+
+    def _floor(self) -> float:
+        """The distance that rounding of the moves alone makes."""
+        with suppress(StuckError):
+            nothing = np.zeros_like(self._left)
+            found = self._system.distance(nothing, self._rounding())
+            return found * (1.0 if self._linear else FIRST_ORDER)
+        return 0.0
+
+    def _is_rounding(self, share: float) -> bool:
+        """Whether rounding by that share is what keeps the tolerance from being reached."""
+        finite = math.isfinite(self._finder.rows.largest(self._left))
+        return (
+            finite
+            and not self._system.is_stuck
+            and share * self._finder.scale > SHARE * self._finder.tolerance
+        )
 
     def _certificate(self, distance: float) -> Certificate:
         return Certificate(
@@ -167,7 +183,7 @@ class Search(ABC):
             linearised=not self._linear,
         )
 
-    def _why(self) -> str:
+    def _why(self, best: float) -> str:
         finder = self._finder
         if not math.isfinite(finder.rows.largest(self._left)):
             return "it left the finite numbers"
@@ -176,11 +192,8 @@ class Search(ABC):
                 f"{self._system.methods} got stuck, as where a body is slender or soft; take "
                 "solver.method: lu"
             )
-        with suppress(StuckError):
-            rounding = self._rounding()
-            best = self._system.distance(np.zeros_like(self._left), rounding) / finder.scale
-            if best * finder.scale > SHARE * finder.tolerance:
-                return f"{ROUNDING} than {best:.1g}{_reachable(best)}"
+        if self._is_rounding(best):
+            return f"{ROUNDING} than {best:.1g}{_reachable(best)}"
         return "no correction makes the moves smaller"
 
     def _linearised(self, at: State, what: str) -> System:
@@ -291,7 +304,7 @@ class _Newton(Search):
     def _go_ahead(self) -> None:
         """As far as the equilibrium before says, leaders their whole way: by what moves a small
         part of it makes."""
-        nudge = NUDGE * spacing_of(self._finder.scene)
+        nudge = NUDGE * self._finder.scene.neighbourhood.nudge_unit
         moves, part = self._finder.moves, min(1.0, nudge / self._way) if self._way else 1.0
         here = moves.at(self._before, self._moment)
         nudged = replace(self._before, u=self._before.u + part * self._led)
@@ -317,6 +330,8 @@ class _Newton(Search):
             correction = self._system.solve(self._left, wanted, None, self._rounding())
             before, size = size, float(np.abs(correction).max(initial=0.0))
             if not size <= CONTRACTION * min(before, self._way or math.inf):
+                if size <= self._floor():
+                    return  # of rounding
                 reason = "corrections do not become smaller"
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)

@@ -164,7 +164,7 @@ class Held(Part):
 
             matrix = csr_array(matrix)
         self._how: dict[str, Any] = {"symmetric": is_symmetric(matrix), "ground": ground}
-        self._matrix = matrix
+        self._matrix, self._is_short = matrix, False
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
         solver = linear_solver(matrix, method, watch=watch, **self._how)
         super().__init__(matrix.shape[0], solver, watch)
@@ -196,17 +196,18 @@ class Held(Part):
             if not isinstance(self._solver, Krylov):
                 break
             left = float(np.linalg.norm(b - matrix @ x))
-            self.is_stuck = not left <= most * float(np.linalg.norm(b))
-            if not (self.is_stuck and self._has_choice):
+            self._is_short = not left <= most * float(np.linalg.norm(b))
+            if not (self._is_short and self._has_choice):
+                self.is_stuck |= self._is_short
                 break
             self._solver = linear_solver(self._matrix, "lu", **self._how)
-            self.is_stuck = False
+            self._is_short = False
         return x
 
     def _inverted(self, r: Floats, accuracy: float = ROUGH) -> Floats:
         """Not finite where an iteration gets stuck: what it has found then bounds nothing."""
         x = self._solved(r, accuracy, 2.0 * accuracy)
-        return np.full_like(x, math.inf) if self.is_stuck else x
+        return np.full_like(x, math.inf) if self._is_short else x
 
     def farthest(self, r: Floats, rounding: float) -> float:
         """Of what an iteration leaves, some times as far as it leads if it goes on, and as far as

@@ -59,7 +59,7 @@ def lattice_system(
             raise IndefiniteError
         return None
     if moves:
-        put = random_displacements(scene, NUDGE)
+        put = random_displacements(scene, NUDGE * scene.neighbourhood.nudge_unit)
         there = replace(state, u=state.u + put)
         if not system.mismatch(put, moves.at(state, step), moves.at(there, step)) <= FAITHFUL:
             return None

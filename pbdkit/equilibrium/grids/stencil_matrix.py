@@ -34,7 +34,7 @@ WINDOW, OWN = 9, 4
 """Places of a stencil, and the one of the particle itself among them."""
 OUTSIDE, FREE, LED = 0, 1, 2
 NUDGE = 1e-7
-"""By which differences are taken, in lattice units: rounding and curvature do some 1e-7 to them,
+"""By which differences are taken, in lattice spacings: rounding and curvature do some 1e-7 to them,
 for displacements of up to a hundred."""
 NOISE = 1e-5
 """The share of the largest entry below which there is no bond."""
@@ -96,15 +96,15 @@ def differenced_matrix(scene: Scene, state: State, step: int, moves: Moves) -> S
     ways = np.stack(np.unravel_index(np.arange(WINDOW), (3, 3)))
     numbers = _number((ways[:, :, None] - ways[:, None] + 1) % 3 - 1)
     stencils, every = np.empty((len(place), WINDOW, 2, 2)), np.arange(len(place))
-    nudged = replace(state, u=state.u.copy())
+    nudged, nudge = replace(state, u=state.u.copy()), NUDGE * scene.neighbourhood.nudge_unit
     still, largest = moves.at(nudged, step).reshape(2, -1).copy(), 0.0
     for n in range(WINDOW):
         some, number = body[groups == n], numbers[n][group]
         for axis in range(2):
             nudged.u[...] = state.u
-            nudged.u.reshape(2, -1)[axis, some] += NUDGE
+            nudged.u.reshape(2, -1)[axis, some] += nudge
             moved = moves.at(nudged, step).reshape(2, -1)
-            found = kernels().differences(still, moved, place, number, 1 / NUDGE, axis, stencils)
+            found = kernels().differences(still, moved, place, number, 1 / nudge, axis, stencils)
             largest = max(largest, found)
     kernels().clear_noise(stencils, NOISE * largest)
     code[place] = np.where(stencils[:, OWN].any(axis=(1, 2)), every, -1)
