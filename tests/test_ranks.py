@@ -170,6 +170,20 @@ OTHERS = {
     "loads": ELASTIC | {"loads": [{"select": {"edge": "top"}, "force": [0.01, 0.02]}]},
     "an obstacle": ELASTIC
     | {"obstacles": [{"shape": DISC, "motion": {**UP, "velocity": [0, -0.1]}}]},
+    "rollers and masses between obstacles": ELASTIC
+    | {
+        "leaders": [
+            *along(UP | {"velocity": [0.02, 0.0]}, axes=["x"]),
+            {"select": {"edge": "bottom"}, "motion": {"type": "newton", "mass": 40.0}, "from": 3},
+        ],
+        "obstacles": [
+            {"shape": DISC, "motion": {**UP, "velocity": [0, -0.1]}},
+            {"shape": {"half_plane": {"point": [0, 7.0], "normal": [0.3, -1]}}, "motion": DOWN},
+            {"shape": {"half_plane": {"point": [17.1, 6.0], "normal": [-1, -1]}}},
+            {"shape": {"half_plane": {"point": [0, -1.0], "normal": [0.0, 1.0]}}, "motion": UP},
+        ],
+        "diagnostics": [{"type": "contact", "youngs_modulus": 1.0}],
+    },
     "bonds to the frame are spared": {
         "fracture": {"type": "threshold", "thresholds": [1.1], "frame_bonds": False},
         "initial": {"type": "affine", "gradient": [[0.2, 0.0], [0.0, 0.2]]},
