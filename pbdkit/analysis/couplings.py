@@ -58,13 +58,19 @@ class Entries:
         return scipy.sparse.coo_array((self.values, (self.rows, self.columns)), self.shape).tocsr()
 
 
-def one_minus(matrix: Any) -> Any:
-    """1 - a matrix, dense or sparse as it is."""
+def identity_like(matrix: Any) -> Any:
+    """1, dense or sparse as a square matrix is."""
     if isinstance(matrix, np.ndarray):
-        return np.eye(len(matrix)) - matrix
+        return np.eye(len(matrix))
     from scipy.sparse import eye_array
 
-    return (eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
+    return eye_array(matrix.shape[0], format="csr")
+
+
+def one_minus(matrix: Any) -> Any:
+    """1 - a matrix, dense or sparse as it is."""
+    found = identity_like(matrix) - matrix
+    return found if isinstance(matrix, np.ndarray) else found.tocsr()
 
 
 def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:

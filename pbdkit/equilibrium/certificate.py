@@ -24,6 +24,8 @@ WAYS = {
     "inverse": "the solution for what is left of the moves, and the inverse for their rounding",
     "solution": "the solution for what is left of the moves",
     "iteration": "some iterations more, and how they fall",
+    "damped": "the solution for what is left of the moves, but for motions that cost next to "
+    "nothing, as of what hangs by one bond",
     "energy": "some iterations more, and the energy of what they leave",
     "nothing to solve": "nobody follows",
 }

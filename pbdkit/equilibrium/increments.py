@@ -355,7 +355,8 @@ def _settle_bonds_at(
 
 def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: float) -> Certificate:
     """From the equilibrium of a moment to that of a later one, in parts as large as keep to one
-    way; where none is small enough, since the body snaps or bonds broke, by steps."""
+    way; where none is small enough, since the body snaps, by steps. Where bonds broke, by implicit
+    steps at once."""
     here, part = since, moment - since
     while True:
         target = moment if here + part > moment - TINY * part else here + part
@@ -364,10 +365,15 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         place(state.u, led)
         try:
             certificate = _nearby(finder, state, target, before)
-        except RoundingError:
-            raise  # smaller parts come no nearer
-        except UnconvergedError as error:
+        except (NoEquilibriumError, UnconvergedError) as error:
+            torn = _torn(before) and not scene.barriers
+            if isinstance(error, RoundingError) and not torn:
+                raise  # smaller parts come no nearer
             vars(state).update(vars(before))
+            if torn:
+                return _relaxed(scene, state, finder, moment)
+            if isinstance(error, NoEquilibriumError):
+                raise
             part /= 2.0
             if part > (moment - since) * SMALLEST:
                 continue
@@ -378,6 +384,17 @@ def _follow(scene: Scene, state: State, finder: Finder, since: float, moment: fl
         if here >= moment:
             return certificate
         part = min(2.0 * part, moment - here)
+
+
+def _relaxed(scene: Scene, state: State, finder: Finder, moment: float) -> Certificate:
+    """As steps would go on from a state in which bonds have broken, with leaders where they are at
+    a moment."""
+    led, state.starts = prescribe(scene, state, moment)
+    place(state.u, led)
+    certificate = finder.relax(state, moment)
+    state.step = math.floor(moment)
+    state.previous[...] = state.u
+    return certificate
 
 
 def _nearby(finder: Finder, state: State, moment: float, before: State) -> Certificate:

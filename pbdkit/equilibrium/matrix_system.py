@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.analysis.couplings import connected, one_minus
+from pbdkit.analysis.couplings import connected, identity_like, one_minus
 from pbdkit.analysis.operator import step_operator
 from pbdkit.equilibrium.linear_solver import Ground
 from pbdkit.equilibrium.stage import Stage
@@ -38,11 +38,19 @@ SOFT = (
 
 
 class MatrixSystem(System):
-    """The system by one of the solver's methods, direct or iterative."""
+    """The system by one of the solver's methods, direct or iterative; with `damping` that of an
+    implicit step, (A + damping) c = move."""
 
     def __init__(
-        self, scene: Scene, state: State, method: str, watch: Watch, step: int | None = None
+        self,
+        scene: Scene,
+        state: State,
+        method: str,
+        watch: Watch,
+        step: int | None = None,
+        damping: float = 0.0,
     ) -> None:
+        self._damping = damping
         self._shape, self._amplification = state.u.shape, 1.0
         self._operator = operator = step_operator(scene, state, step)
         self._method, self._watch = method, watch
@@ -76,6 +84,8 @@ class MatrixSystem(System):
     @property
     def how(self) -> str:
         """By the solution; its rounding by the inverse itself where that is at hand."""
+        if self._damping:
+            return "damped"
         ways = {part.how for stage in self._stages for _, part in stage.parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
@@ -217,6 +227,8 @@ class MatrixSystem(System):
 
     def _stage(self, axes: list[int]) -> Stage:
         matrix = one_minus(self._both.entries(axes).matrix())
+        if self._damping:
+            matrix = matrix + self._damping * identity_like(matrix)
         largest = float(np.abs(matrix.diagonal()).max(initial=0.0))
         self._amplification = max(self._amplification, largest)
         led = self._operator.couplings_led.entries(axes)

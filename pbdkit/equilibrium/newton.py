@@ -18,6 +18,7 @@ from pbdkit.equilibrium.certificate import (
     UnconvergedError,
 )
 from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
+from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves
 from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.equilibrium.system import IndefiniteError, StuckError, System, one_thread
@@ -43,6 +44,13 @@ ROUNDING = "rounding alone allows no better"
 FIRM = 1e5
 """Distance over rounding up to which a body counts as firm: farther, it may be about to give way,
 so that a shorter way could help."""
+MOST_IMPLICIT_STEPS = 400
+LEAP = 0.2
+"""The longest move of an implicit step, in lattice spacings."""
+LEAST_DAMPING, FASTEST, FALL, SLOWEST = 1e-6, 0.05, 0.5, 2.0
+"""The damping of the last implicit steps, relative to the stiffness of a particle among others at
+rest. From one to the next it falls by this share of what the moves do, and no faster than this, and
+rises with them, up to twofold."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,12 @@ class Finder:
         ExperimentError where a part has no equilibrium, UnconvergedError and StoppedError."""
         with one_thread():
             return _Linear(self.at(moment), state, moment).run()
+
+    def relax(self, state: State, moment: float) -> Certificate:
+        """The same for rules that are not linear, from a state in which bonds have just broken, by
+        implicit steps: to where steps lead that are small enough. Raises UnconvergedError."""
+        with one_thread():
+            return _Relaxing(self.at(moment), state, moment).run()
 
     def follow(self, state: State, moment: float, before: State) -> Certificate:
         """The same for rules that are not linear, from the equilibrium `before` all went on a
@@ -336,3 +350,44 @@ class _Newton(Search):
                 raise UnconvergedError(reason, self._certificate(math.inf))
             self._shift(correction)
             farther, far = far, self._distance()
+
+
+class _Relaxing(Search):
+    """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
+    move, with a damping that falls with the moves.
+
+    What the last damping leaves out is stiffer than it, or moves at no cost: parts that hang by one
+    bond, or that nothing holds, stay where implicit steps have them.
+    """
+
+    def __init__(self, finder: Finder, state: State, moment: float) -> None:
+        self._damping = 1.0
+        super().__init__(finder, state, moment, state, "relaxing what broke")
+
+    def _linearised(self, at: State, what: str) -> System:
+        finder = self._finder
+        finder.watch.begin(what)
+        self._linearisations += 1
+        step, method = math.ceil(self._moment), finder.method
+        return MatrixSystem(finder.scene, at, method, finder.watch, step, self._damping)
+
+    def run(self) -> Certificate:
+        """Raises UnconvergedError where moves do not die away, or do so where nothing is stable."""
+        leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._left)
+        for _ in range(MOST_IMPLICIT_STEPS):
+            if self._damping <= LEAST_DAMPING and self._distance() <= self._finder.tolerance:
+                break
+            correction = self._system.solve(self._left, self._wanted, None, self._rounding())
+            most = float(np.abs(correction).max(initial=0.0))
+            if not math.isfinite(most):
+                break
+            self._shift(correction * min(1.0, leap / most if most else 1.0))
+            before, size = size, self._finder.rows.norm(self._left)
+            share = size / before if before and most <= leap else 1.0
+            share = max(FASTEST, FALL * share) if share < 1.0 else min(SLOWEST, share)
+            self._damping = min(1.0, max(LEAST_DAMPING, self._damping * share))
+            self._system = self._linearised(self._state, "relaxing what broke")
+        certificate = self._certified()
+        if not self._system.is_stable():
+            raise UnconvergedError(UNSTABLE, certificate)
+        return certificate
