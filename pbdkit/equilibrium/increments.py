@@ -251,10 +251,10 @@ def _load(
             raise
         except (NoEquilibriumError, UnconvergedError) as error:
             failed = state.copy()
-            if not _is_worth_keeping(failed, moment, finder, error):
-                vars(state).update(vars(before))
-            torn = 0 if isinstance(error, NoEquilibriumError) else _torn(before)
-            if _torn(failed) > torn:
+            if _is_worth_keeping(failed, moment, finder, error):
+                raise
+            vars(state).update(vars(before))
+            if _torn(failed):
                 text = _parting(scene, before, failed, (since, moment), error)
                 raise SeparatedError(text) from None
             raise
@@ -310,8 +310,9 @@ def _parting(
     bonds, count = scene.bonds, _torn(failed) - _torn(before)
     fresh = (failed.broken_step >= 0) & (before.broken_step < 0)
     rows = np.flatnonzero(fresh.reshape(len(fresh), -1)[bonds.plane, bonds.place])
-    first = ""
+    what, first = "what is left of the body has no equilibrium", ""
     if len(rows):
+        what = "the body came apart"
         a, b = (bonds.ends[rows[0]] + 1).tolist()
         plural = f" and {count - 1} more" if count > 1 else ""
         first = f"the bond between particles {a} and {b}{plural} broke, and "
@@ -322,8 +323,8 @@ def _parting(
     leads = f", leaders displaced by up to {way:.6g}" if way else ""
     cause = str(error).partition("; ")[0]
     return (
-        f"the body came apart between step {since:.6g} and step {moment:.6g}: {first}{cause}; the "
-        f"last equilibrium is that of step {since:.6g}{leads}. {REMEDY}"
+        f"{what} between step {since:.6g} and step {moment:.6g}: {first}{cause}; the last "
+        f"equilibrium is that of step {since:.6g}{leads}. {REMEDY}"
     )
 
 

@@ -16,6 +16,7 @@ from pbdkit.equilibrium.certificate import (
     Certificate,
     RoundingError,
     UnconvergedError,
+    spacing_of,
 )
 from pbdkit.equilibrium.linearisation import linearised, mismatch_at_rest
 from pbdkit.equilibrium.matrix_system import MatrixSystem
@@ -44,13 +45,16 @@ ROUNDING = "rounding alone allows no better"
 FIRM = 1e5
 """Distance over rounding up to which a body counts as firm: farther, it may be about to give way,
 so that a shorter way could help."""
-MOST_IMPLICIT_STEPS = 400
+MOST_IMPLICIT_STEPS = 200
 LEAP = 0.2
 """The longest move of an implicit step, in lattice spacings."""
-LEAST_DAMPING, FASTEST, FALL, SLOWEST = 1e-6, 0.05, 0.5, 2.0
-"""The damping of the last implicit steps, relative to the stiffness of a particle among others at
-rest. From one to the next it falls by this share of what the moves do, and no faster than this, and
-rises with them, up to twofold."""
+LEAST_DAMPING, FASTEST, FALL, SLOWEST = 1e-10, 0.05, 0.5, 2.0
+"""The least damping, relative to the stiffness of a particle among others at rest. Between implicit
+steps it falls by this share of what the moves do, and no faster than this; it rises with them, up
+to twofold."""
+NEXT_TO_NOTHING, MUCH = 1e-6, 100.0
+"""The stiffness, as a damping, below which motions are left out of a certificate. It is tried once
+the moves are so many times what softer ones would allow."""
 
 
 @dataclass(frozen=True)
@@ -356,8 +360,7 @@ class _Relaxing(Search):
     """Pseudo-transient continuation (Kelley and Keyes, 1998): implicit steps, (A + damping) c =
     move, with a damping that falls with the moves.
 
-    What the last damping leaves out is stiffer than it, or moves at no cost: parts that hang by one
-    bond, or that nothing holds, stay where implicit steps have them.
+    Parts that hang by one bond, or that nothing holds, stay where implicit steps have them.
     """
 
     def __init__(self, finder: Finder, state: State, moment: float) -> None:
@@ -375,7 +378,7 @@ class _Relaxing(Search):
         """Raises UnconvergedError where moves do not die away, or do so where nothing is stable."""
         leap, size = LEAP * spacing_of(self._finder.scene), self._finder.rows.norm(self._left)
         for _ in range(MOST_IMPLICIT_STEPS):
-            if self._damping <= LEAST_DAMPING and self._distance() <= self._finder.tolerance:
+            if self._is_near():
                 break
             correction = self._system.solve(self._left, self._wanted, None, self._rounding())
             most = float(np.abs(correction).max(initial=0.0))
@@ -391,3 +394,12 @@ class _Relaxing(Search):
         if not self._system.is_stable():
             raise UnconvergedError(UNSTABLE, certificate)
         return certificate
+
+    def _is_near(self) -> bool:
+        """Whether the tolerance is reached but for motions that cost next to nothing."""
+        most, tolerance = self._finder.rows.largest(self._left), self._finder.tolerance
+        if most > MUCH * NEXT_TO_NOTHING * tolerance:
+            return False
+        self._damping = NEXT_TO_NOTHING
+        self._system = self._linearised(self._state, "relaxing what broke")
+        return self._distance() <= tolerance
