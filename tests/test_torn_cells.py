@@ -48,21 +48,25 @@ def torn_bodies(draw):
     lattice = draw(st.sampled_from(LATTICES))
     triangles = lattice["type"] == "hexagonal"
     rule = draw(st.sampled_from(RULES if triangles else [*RULES, ORTHOTROPIC]))
-    outline = {"type": "rectangle", "width": 4.3, "height": 3.2, "origin": [0.1, 0.2]}
+    scene = torn_scene(lattice, rule, draw(st.sampled_from(["natural", "natural", "none"])))
+    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return scene, torn_state(scene, generator), generator
+
+
+def torn_scene(lattice, rule, frame):
+    triangles = lattice["type"] == "hexagonal"
     experiment = pbdkit.Experiment(
         name="torn",
         lattice=lattice,
-        body=outline,
+        body={"type": "rectangle", "width": 4.3, "height": 3.2, "origin": [0.1, 0.2]},
         neighbours=TRIANGLES if triangles else SQUARES,
         rule=rule,
         regions=REGIONS,
-        frame={"type": draw(st.sampled_from(["natural", "natural", "none"]))},
+        frame={"type": frame},
         fracture=SOFTENING,
         steps=1,
     )
-    scene = build_scene(experiment)
-    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return scene, torn_state(scene, generator), generator
+    return build_scene(experiment)
 
 
 def torn_state(scene, generator, broken=0.25, softened=0.25):
