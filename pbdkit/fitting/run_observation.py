@@ -19,7 +19,6 @@ from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.record import Record
-from pbdkit.experiment.solvers import Stepping
 from pbdkit.fitting.observation import Near, Observation, Seen
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
@@ -123,6 +122,6 @@ class RunObservation(Observation):
 def _of_steps(experiment: Experiment, steps: int) -> Experiment:
     """The experiment with so many steps, all of which are made."""
     changed: dict[str, Any] = {"steps": steps}
-    if isinstance(experiment.solver, Stepping):
-        changed["solver"] = experiment.solver.model_copy(update={"settle": None})
+    if experiment.solver.makes_steps:
+        changed["solver"] = experiment.stepping.model_copy(update={"settle": None})
     return experiment.model_copy(update=changed)

@@ -80,7 +80,7 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
             found.append(general)
             runs.insert(0, str(s))
         else:
-            found.append(write_row(plan, level, s, kind, events))
+            found += write_row(plan, level, s, kind, events)
         out.add(0, found[-1].call(*runs))
     return [*dict.fromkeys(found), out]
 

@@ -34,13 +34,20 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
     at the particles themselves and of where their moves go; what comes after stands in it."""
     out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
     *lead, name = plan.lead
-    a, n = len(lead), level.number
+    a = len(lead)
     out.add(1, *(f"{outer} = runs[n, {m}]" for m, outer in enumerate(lead)))
     out.add(1, f"j0 = max(runs[n, {a + 2}], box[{2 * a + 2}])")
     out.add(1, f"j1 = min(runs[n, {a + 3}], box[{2 * a + 3}])", "if j0 >= j1:", "    continue")
     low, high = (f"box[{2 * a}]", f"box[{2 * a + 1}]") if a else ("first_row", "last_row")
     out.add(1, f"for {name} in range(max(runs[n, {a}], {low}), min(runs[n, {a + 1}], {high})):")
     out.depth += 2
+    write_rows(out, plan, level, s)
+
+
+def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
+    """The rows of what stands at the particles of a row from j0 to j1, and of where their moves
+    go."""
+    n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
         rows["z@"] = f"{level.source}_@"

@@ -16,8 +16,10 @@ from pbdkit.stepping.compiled.particle import (
     difference,
     displacements,
     local_places,
+    parameters,
     target_lines,
     write_row_loop,
+    write_rows,
 )
 from pbdkit.stepping.compiled.plan import Function, Plan, listed, values
 from pbdkit.stepping.compiled.tearing import CHUNK, RowDamage
@@ -41,11 +43,33 @@ class Words(NamedTuple):
     since: str
 
 
-def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | None) -> Function:
-    """The function that moves the particles of such a row."""
+def write_row(
+    plan: Plan, level: Level, s: int, kind: int, events: Function | None
+) -> list[Function]:
+    """The functions that move the particles of such a row, the one to be called last."""
     out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
-    slots = plan.scene.neighbourhood.slots[s]
     write_row_loop(out, plan, level, str(s))
+    words = _write_neighbours(out, plan, level, s, kind)
+    if plan.judged:
+        out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
+    if plan.tears:
+        out.add(0, f"marks = {plan.row('torn', s)}", "marked = 0")
+    out.add(0, "for j in range(j1 - j0):")
+    write_whole(out, plan, level, s, words, "gone[j]", "marks[j]" if plan.tears else "")
+    if events:
+        out.add(0, "if changed:")
+        out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
+    if not plan.tears:
+        return [out]
+    torn = write_torn_row(plan, level, s, kind)
+    out.add(1, "marked = marked | marks[j]")
+    _write_marked(out, torn)
+    return [torn, out]
+
+
+def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int) -> list[Words]:
+    """The rows of the neighbours of a row, and the words for what each has."""
+    slots = plan.scene.neighbourhood.slots[s]
     for k, slot in enumerate(slots):
         there = plan.row(f"{level.source}_@", slot.target, slot.cell)
         out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
@@ -56,25 +80,13 @@ def write_row(plan: Plan, level: Level, s: int, kind: int, events: Function | No
         rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
         shares = {row: f"s{n}" for n, row in enumerate(rows)}
     out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
-    if plan.judged:
-        out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
-    if plan.tears:
-        out.add(0, f"marks = {plan.row('torn', s)}", "marked = 0")
-    out.add(0, "for j in range(j1 - j0):")
     words = []
     for k, slot in enumerate(slots):
         own = [f"e{k}_{m}[j]" for m in range(len(plan.shown))]
         beside = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
         bond = f"b{k}_{{n}}[j]", f"x{k}_{{n}}[j]", f"f{k}[j]"
         words.append(Words(f"n{k}@[j]", own, beside, *bond))
-    write_whole(out, plan, level, s, words, "gone[j]", "marks[j]" if plan.tears else "")
-    if plan.tears:
-        out.add(1, "marked = marked | marks[j]")
-        _write_marked(out, plan, level, s, words)
-    if events:
-        out.add(0, "if changed:")
-        out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
-    return out
+    return words
 
 
 def write_whole(
@@ -103,17 +115,26 @@ def write_whole(
         out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
 
 
-def _write_marked(out: Function, plan: Plan, level: Level, s: int, words: Sequence[Words]) -> None:
-    """The loops over chunks of a row in which particles are marked."""
+def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
+    """The function that moves the marked particles of such a row, from j0 to j1. All that it reads
+    begins at j0, so that its loops vectorise."""
+    out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
     damage = RowDamage(plan, s)
-    out.add(0, "if marked:", *("    " + line for line in damage.rows))
-    out.add(1, f"for begin in range(0, j1 - j0, {CHUNK}):")
+    out.add(0, *parameters(plan, level))
+    write_rows(out, plan, level, str(s))
+    words = _write_neighbours(out, plan, level, s, kind)
+    out.add(0, f"marks = {plan.row('torn', s)}", *damage.lines, "for j in range(j1 - j0):")
+    write_whole(out, plan, level, s, words, "", "marks[j]", damage)
+    return out
+
+
+def _write_marked(out: Function, torn: Function) -> None:
+    """A call for each chunk of a row in which particles are marked."""
+    *lead, _, _ = torn.own
+    out.add(0, "if marked:", f"    for begin in range(0, j1 - j0, {CHUNK}):")
     out.add(2, f"end, marked = min(begin + {CHUNK}, j1 - j0), 0", "for j in range(begin, end):")
     out.add(3, "marked = marked | marks[j]")
-    out.add(2, "if not marked:", "    continue", *damage.chunk, "for j in range(begin, end):")
-    out.depth += 2
-    write_whole(out, plan, level, s, words, "", "marks[j]", damage)
-    out.depth -= 2
+    out.add(2, "if marked:", "    " + torn.call(*lead, "j0 + begin", "j0 + end"))
 
 
 def _slot_lines(

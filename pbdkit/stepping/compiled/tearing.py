@@ -76,29 +76,28 @@ def torn_at_slot(plan: Plan) -> list[str]:
 
 class RowDamage:
     """The damage of the cells and bonds around the particles of a row of sublattice s that have all
-    their neighbours. `rows` are the lines before all chunks of it; `chunk` those that compute the
-    damage for a chunk from `begin` to `end`, kind by kind in loops of their own: one loop with as
-    many arrays would not vectorise."""
+    their neighbours, from j0 to j1. `lines` compute it, kind by kind in loops of their own: one
+    loop with as many arrays would not vectorise."""
 
     def __init__(self, plan: Plan, s: int) -> None:
         self._around = plan.scene.neighbourhood.cells_around[s]
         self._home = plan.scene.neighbourhood.home
-        self.rows, self.chunk = list[str](), list[str]()
         self._number: dict[tuple[int, Slot | None], int] = {}
+        rows, loops = list[str](), list[str]()
         for cell in self._around.cells:
             for bond in cell:
-                self._add(plan, bond)
+                self._add(plan, bond, rows, loops)
         count, cells = len(self._number), self._around.cells
-        self.chunk.append("for e in range(end - begin):")
+        loops.append("for j in range(j1 - j0):")
         for n, cell in enumerate(cells):
             first, *others = (self._number[bond.plane, bond.home] for bond in cell)
-            self.chunk.append(f"    m = damage[{first}, e]")
-            self.chunk += [f"    {_raised('m', f'damage[{other}, e]')}" for other in others]
-            self.chunk.append(f"    damage[{count + n}, e] = m")
-        empty = f"damage = np.empty(({count + len(cells)}, {CHUNK}), {plan.real})"
-        self.rows.append(empty)
+            loops.append(f"    m = damage[{first}, j]")
+            loops += [f"    {_raised('m', f'damage[{other}, j]')}" for other in others]
+            loops.append(f"    damage[{count + n}, j] = m")
+        made = f"damage = np.empty(({count + len(cells)}, j1 - j0), {plan.real})"
+        self.lines = [made, *rows, *loops]
 
-    def _add(self, plan: Plan, bond: CellBond) -> None:
+    def _add(self, plan: Plan, bond: CellBond, rows: list[str], loops: list[str]) -> None:
         if (bond.plane, bond.home) in self._number:
             return
         n = self._number[bond.plane, bond.home] = len(self._number)
@@ -107,18 +106,16 @@ class RowDamage:
         if isinstance(plan.model, Softens):
             arrays |= {f"y{n}_b{m}": f"bond{m}" for m in range(plan.bonds)}
             arrays |= {f"y{n}_x{m}": f"limit{m}" for m in range(plan.limits)}
-        for name, array in arrays.items():
-            self.rows.append(f"{name} = {plan.row(array, bond.plane, step)}")
-        words = f"y{n}[begin + e]", str(bond.plane), f"y{n}_b{{n}}[begin + e]"
-        own = damage_word(plan, *words, f"y{n}_x{{n}}[begin + e]")
-        self.chunk += ["for e in range(end - begin):", f"    damage[{n}, e] = {own}"]
+        rows += [f"{name} = {plan.row(of, bond.plane, step)}" for name, of in arrays.items()]
+        words = f"y{n}[j]", str(bond.plane), f"y{n}_b{{n}}[j]", f"y{n}_x{{n}}[j]"
+        loops += ["for j in range(j1 - j0):", f"    damage[{n}, j] = {damage_word(plan, *words)}"]
 
     def beside(self, slot: Slot) -> str:
-        """The damage t beside a slot of the particle j of the chunk."""
+        """The damage t beside a slot of the particle j of the row."""
         plane, at_this_end = self._home[slot]
         own = self._number[plane, None if at_this_end else slot]
         sides = (len(self._number) + cell for cell in self._around.beside[slot])
-        left, right, own_word = (f"damage[{n}, j - begin]" for n in (*sides, own))
+        left, right, own_word = (f"damage[{n}, j]" for n in (*sides, own))
         return f"t = Torn({left}, {right}, {own_word}, {own_word})"
 
 
