@@ -312,3 +312,13 @@ def test_what_hangs_by_one_bond_does_not_end_a_test():
     ds = pbdkit.run(given, progress=False)
     assert ds.attrs["status"] == "complete"
     assert len(ds.time) == 7
+
+
+def test_the_shipped_dogbone_bears_what_its_page_says():
+    hexagonal = "lattice={type: hexagonal, a: 1.0}", "neighbours={type: coordination, shells: 1}"
+    ds = pbdkit.run(pbdkit.load("modelling/dogbone-to-failure", settings=hexagonal), progress=False)
+    force = ds.reaction.values[:, 1, 0]
+    assert force.argmax() == 20
+    assert force.max() == pytest.approx(1601.0, abs=1.0)
+    assert abs(force[21:]).max() < 1e-6
+    refuse_overstretched(ds, 0.02)
