@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.interfaces.lattice import Index
 from pbdkit.scene.ground import Ground
 from pbdkit.scene.others import Others, Stretch
-from pbdkit.scene.places import hull
+from pbdkit.scene.places import LeftOut, hull
 from pbdkit.scene.raster import EMPTY
 from pbdkit.scene.sites import Lines, framed, window
 
@@ -25,7 +25,8 @@ SITES_AT_ONCE = 2**22
 class Survey:
     """What all processes know of a lattice: the body's box of sites, from `low` to below `high`;
     how many particles each line of sites has, frame included, from the first on that has any; how
-    many indices a repeat cell has, and how many cells neighbours reach, along the first axis."""
+    many indices a repeat cell has, and how many cells neighbours reach, along the first axis; the
+    cells left out at narrow voids."""
 
     low: Index
     high: Index
@@ -33,6 +34,7 @@ class Survey:
     period: int
     reach: int
     layers: int
+    left_out: LeftOut
 
     @property
     def first(self) -> int:
@@ -57,6 +59,7 @@ class Survey:
             int(self.lines[: first - self._start].sum()),
             self.rows,
             self.first,
+            self.left_out,
         )
 
     @property
@@ -80,15 +83,17 @@ def survey(ground: Ground, others: Others, rank: int) -> Survey | None:
     across = math.prod(b - a + 1 for a, b in zip(low[1:], high[1:], strict=True))
     found = [_counted(ground, some) for some in _bands(cuts[rank : rank + 2], across)]
     every = [one for own in others.every(found) for one in own]
-    boxes = [box for box, _ in every if box]
+    boxes = [box for box, _, _ in every if box]
     if not boxes:
         return None
-    lines = np.concatenate([counts for _, counts in every])
+    lines = np.concatenate([counts for _, counts, _ in every])
+    left_out = sum((cells for *_, cells in every), LeftOut())
     low, high = hull(boxes)
     begin = low[0] - layers - cuts[0]
     lines = lines[begin : high[0] + layers - cuts[0]]
     period = ground.cell.period[0]
-    return Survey(low, high, lines, period, ground.neighbourhood.reach_in_cells[0], layers)
+    reach = ground.neighbourhood.reach_in_cells[0]
+    return Survey(low, high, lines, period, reach, layers, left_out)
 
 
 def _bands(lines: list[int], across: int) -> Iterator[Lines]:
@@ -98,13 +103,16 @@ def _bands(lines: list[int], across: int) -> Iterator[Lines]:
         yield begin, min(begin + some, last)
 
 
-def _counted(ground: Ground, lines: Lines) -> tuple[tuple[Index, Index] | None, NDArray[np.int64]]:
-    """(box of the body, particles on each line) of some lines."""
+def _counted(
+    ground: Ground, lines: Lines
+) -> tuple[tuple[Index, Index] | None, NDArray[np.int64], LeftOut]:
+    """(box of the body, particles on each line, cells left out) of some lines."""
     first, last = lines
     counts, layers = np.zeros(last - first, np.int64), ground.layers
     filling = ground.filled((first - layers, last + layers))
+    left_out = filling.left_out_on(lines)
     if not (box := filling.box):
-        return None, counts
+        return None, counts, left_out
     low, kinds = framed(ground.experiment.lattice, filling.within(*box), layers)
     many = np.count_nonzero(kinds != EMPTY, axis=tuple(range(1, kinds.ndim)))
     line = np.arange(low[0], low[0] + len(many))
@@ -112,5 +120,5 @@ def _counted(ground: Ground, lines: Lines) -> tuple[tuple[Index, Index] | None, 
     counts[line[own] - first] = many[own]
     inside = [max(first, box[0][0]), min(last, box[1][0])]
     if inside[0] >= inside[1]:
-        return None, counts
-    return ((inside[0], *box[0][1:]), (inside[1], *box[1][1:])), counts
+        return None, counts, left_out
+    return ((inside[0], *box[0][1:]), (inside[1], *box[1][1:])), counts, left_out

@@ -10,12 +10,13 @@ import numpy as np
 
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.motions import Rotation
-from pbdkit.interfaces import MixesCells
+from pbdkit.interfaces import Lattice, MixesCells
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
 from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.neighbourhood import Neighbourhood, flatness
-from pbdkit.scene.raster import FOLLOWER, Raster
+from pbdkit.scene.places import LeftOut
+from pbdkit.scene.raster import FOLLOWER, Raster, cells_of_sites, positions
 from pbdkit.scene.selecting import Selecting
 from pbdkit.scene.setting import body_box
 from pbdkit.scene.sites import has_narrow_slot
@@ -64,6 +65,20 @@ def doubts_of(
             "take {type: natural}"
         )
     return doubts
+
+
+def narrow_voids(lattice: Lattice, left_out: LeftOut) -> Iterator[str]:
+    """A line where cells are left out because they would connect the two sides of a void."""
+    if left_out.first is not None:
+        cell = lattice.cell()
+        at = positions(cell, *cells_of_sites(cell, *(np.array([n]) for n in left_out.first)))
+        x, y = (float(c[0]) + origin for c, origin in zip(at, lattice.origin, strict=True))
+        cells = "a cell is" if left_out.count == 1 else f"{left_out.count} cells are"
+        yield (
+            f"body: {cells} left out, near ({x:.6g}, {y:.6g}) first, where a void is less than two "
+            "cells wide: they would connect both of its sides; take a finer lattice, so that two "
+            "cells lie across the void, or for a crack without width `cuts`"
+        )
 
 
 def locking(experiment: Experiment, raster: Raster) -> Iterator[str]:

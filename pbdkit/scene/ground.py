@@ -12,6 +12,7 @@ from pbdkit.scene.cells import WeighedCells, whole_cells
 from pbdkit.scene.cut_cells import fill_with_cells, margin_of
 from pbdkit.scene.neighbourhood import build_neighbourhood, checked_cell
 from pbdkit.scene.others import ALONE, Others
+from pbdkit.scene.places import LeftOut
 from pbdkit.scene.raster import Extent, Raster
 from pbdkit.scene.sites import Filling, Lines, build_raster, fill, framed, window
 from pbdkit.scene.sizes import refuse_too_large
@@ -19,12 +20,14 @@ from pbdkit.scene.sizes import refuse_too_large
 
 class Ground:
     """The neighbourhood, how many `layers` the frame has, and what they have to warn of; then the
-    raster of all sites. Nothing of the size of the body is made before it is asked for.
+    raster of all sites, and the cells `left_out` at narrow voids. Nothing of the size of the body
+    is made before it is asked for.
 
     Raises ExperimentError where parts do not go together, and for bodies too large for the memory.
     """
 
     def __init__(self, experiment: Experiment, others: Others = ALONE) -> None:
+        self.left_out = LeftOut()
         self.experiment, self._others, lattice = experiment, others, experiment.lattice
         neighbours, fracture, frame = experiment.neighbours, experiment.fracture, experiment.frame
         with blaming(lattice, "when asked for its cell", "lattice"):
@@ -56,6 +59,7 @@ class Ground:
         """The raster, and the cells where the frame weighs them."""
         lattice, stretch = self.experiment.lattice, self._others.stretch
         filling = self.filled((stretch.low[0], stretch.high[0]) if stretch else None)
+        self.left_out = stretch.left_out if stretch else filling.left_out_on()
         box = (stretch.low, stretch.high) if stretch else filling.box
         if not box:
             raise self.nothing()

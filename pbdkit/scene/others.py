@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
-from pbdkit.scene.places import Mask, hull
+from pbdkit.scene.places import LeftOut, Mask, hull
 
 Box = tuple[tuple[Any, ...], tuple[Any, ...]]
 
@@ -21,7 +21,7 @@ class Stretch:
     """Some `lines` of sites of a lattice, from the first to below the second; `before` particles
     are before them. What of the body is near lies from the site `low` to below `high`. `rows` are
     the particles of each row of repeat cells of the lattice, padding included, from the cells
-    `first` on."""
+    `first` on. `left_out` are the cells left out at narrow voids, of the whole."""
 
     lines: tuple[int, int]
     low: Index
@@ -29,6 +29,7 @@ class Stretch:
     before: int
     rows: NDArray[np.int64]
     first: int
+    left_out: LeftOut
 
 
 class Others:

@@ -26,6 +26,25 @@ def distinct(numbers: NDArray[np.integer[Any]]) -> Indices:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """Cells left out because they would connect two sides of a void: their `count`, and the site of
+    the first corner of the `first` of them, in the order of sites."""
+
+    count: int = 0
+    first: Index | None = None
+
+    @classmethod
+    def of(cls, sites: Indices) -> LeftOut:
+        """Those with some first corners, (cell, axis)."""
+        return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
+
+    def __add__(self, other: LeftOut) -> LeftOut:
+        """All of both."""
+        first = min((one.first for one in (self, other) if one.first), default=None)
+        return LeftOut(self.count + other.count, first)
+
+
+@dataclass(frozen=True)
 class Block:
     """A rectangle of repeat cells of one sublattice; `stop` is excluded."""
 

@@ -22,6 +22,7 @@ from pbdkit.scene.doubts import (
     doubts_of,
     far_from_the_body,
     locking,
+    narrow_voids,
     without_effect,
 )
 from pbdkit.scene.field_constants import with_fields
@@ -164,6 +165,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     warnings += check_diagnostics(experiment, raster, neighbourhood)
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
     warnings += [*angles_in_radians(experiment), *locking(experiment, raster)]
+    warnings += narrow_voids(experiment.lattice, ground.left_out)
     warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)

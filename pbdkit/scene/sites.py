@@ -18,7 +18,7 @@ from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.polygons import Tiling
 from pbdkit.scene.cells import WeighedCells
-from pbdkit.scene.places import Mask, bounds, hull
+from pbdkit.scene.places import LeftOut, Mask, bounds, hull
 from pbdkit.scene.raster import (
     CHUNK_ROWS,
     EMPTY,
@@ -37,11 +37,13 @@ Lines = tuple[int, int]
 @dataclass(frozen=True)
 class Filling:
     """The sites of the body on a window whose first site index is `first`, (i, j), and where cells
-    are weighed the shares of the cells by the site of their first corner, (kind, i, j)."""
+    are weighed the shares of the cells by the site of their first corner, (kind, i, j), and those
+    sites of the cells left out at narrow voids, (cell, axis)."""
 
     body: Mask
     first: Index
     share: Floats | None = None
+    left_out: Indices | None = None
 
     @property
     def box(self) -> tuple[Index, Index] | None:
@@ -51,6 +53,14 @@ class Filling:
             return None
         low, high = (tuple(map(add, self.first, end)) for end in found)
         return low, high
+
+    def left_out_on(self, lines: Lines | None = None) -> LeftOut:
+        """The cells left out at narrow voids whose first corner is on some lines."""
+        if self.left_out is None:
+            return LeftOut()
+        line = self.left_out[:, 0]
+        low, high = lines or (line.min(initial=0), line.max(initial=0) + 1)
+        return LeftOut.of(self.left_out[(line >= low) & (line < high)])
 
     def within(self, low: Index, high: Index) -> Filling:
         """The same on a window within its own, from the site `low` on, to below `high`."""
