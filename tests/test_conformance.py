@@ -48,6 +48,7 @@ def mostly_interpreted(request):
 
 SOUND = [
     rules.Sound(),
+    rules.Net(),
     others.Rows(),
     others.Following(),
     others.Strain(),
@@ -77,6 +78,12 @@ FAULTS = [
     (rules.ClaimsLinear, "superposes", "do not declare `linear`"),
     (rules.HoldsOn, "follows-translations", "use differences `d`, not `here.u`"),
     (rules.BearsTwice, "bears-loads-as-forces", "the force is not the same as without, and the"),
+    (rules.HasAScale, "goes-alike-in-all-units", "annotate parameters that are lengths"),
+    (rules.LeansRight, "goes-alike-mirrored-and-turned", "or declare `has_axes`"),
+    (rules.ResistsTurning, "moves-rigidly-for-nothing", "a rigid motion of a whole body meets"),
+    (rules.PullsOneWay, "acts-both-ways-alike", "give both ends of a bond one weight"),
+    (rules.Gives, "gives-no-energy-back", "let `force` pull towards where neighbours are"),
+    (remembering.Hardens, "does-not-stiffen-by-breaking", "a share of its difference, falling"),
     (rules.Unlike, "is-the-same-compiled", "the compiled engine gives another `u`"),
     (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
     (rules.Raises, "changes-no-input", "has no attribute 'strength'"),
@@ -193,7 +200,7 @@ def test_nobody_is_excused():
 def test_a_report_tells_what_ran_and_why_not():
     text = str(examine(rules.Sound()))
     assert text.startswith(
-        "FollowerRule sound: 19 properties ran, 0 failed; 3 skipped: it remembers nothing"
+        "FollowerRule sound: 21 properties ran, 0 failed; 3 skipped: it remembers nothing"
     )
     assert "  held     rests" in text
 
@@ -307,7 +314,7 @@ def test_one_line_is_enough_for_pytest(tmp_path, share, code):
     call = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "."]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == code, done.stdout
-    assert f"FollowerRule mine: 19 properties ran, {code} failed; 3 skipped: it" in done.stdout
+    assert f"FollowerRule mine: 21 properties ran, {code} failed; 3 skipped: it" in done.stdout
     assert "does not declare `linear`" in done.stdout
     if code:
         assert "FollowerRule mine: rests: a body at rest moves by 1e-09" in done.stdout
@@ -320,12 +327,12 @@ def test_plugins_check_tries_a_distribution(install, call):
     )
     good = call("plugins", "check", "pbdkit_good")
     assert good.code == 0
-    assert "FollowerRule mine: 19 properties ran, 0 failed; 3 skipped: it remembers" in good.out
+    assert "FollowerRule mine: 21 properties ran, 0 failed; 3 skipped: it remembers" in good.out
     assert "all properties hold for 1 example of its components" in good.out
     both = call("plugins", "check")
     assert both.code == 3
     assert "failed  rests: a body at rest moves by 1e-09" in both.out
-    assert "mine: 19 properties ran, 0 failed" in both.out
+    assert "mine: 21 properties ran, 0 failed" in both.out
 
 
 def test_plugins_check_as_json_and_in_full(install, call):

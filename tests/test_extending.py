@@ -34,6 +34,7 @@ CAPABILITIES = {
     "FollowerRule": (
         pbdkit.Calibrated,
         pbdkit.Loadable,
+        pbdkit.TearsCells,
         pbdkit.StoresEnergy,
         pbdkit.HasStiffBonds,
         pbdkit.Remembers,
@@ -194,7 +195,7 @@ def test_the_tutorial_leads_from_a_notebook_to_a_tested_plugin(
         pytest_call, cwd=tmp_path, capture_output=True, text=True, env=environment
     )
     assert done.returncode == 0, done.stdout
-    assert "FollowerRule lazy: 19 properties ran, 0 failed" in done.stdout
+    assert "FollowerRule lazy: 21 properties ran, 0 failed" in done.stdout
 
     commands = re.findall(r"^pbdkit (.*)$", text, re.M)
     assert len(commands) == 2

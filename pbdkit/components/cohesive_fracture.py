@@ -11,7 +11,7 @@ from pydantic import Field
 
 from pbdkit.components.strain_fracture import DAMAGE, Softening, StrainLimit
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import KnowsStiffness, Remembered, Setting, Slot, Vector, length
+from pbdkit.interfaces import LENGTH, KnowsStiffness, Remembered, Setting, Slot, Vector, length
 
 
 class Cohesive(KnowsStiffness, Softening):
@@ -31,7 +31,7 @@ class Cohesive(KnowsStiffness, Softening):
     fictitious_at: Literal["cell"] = Field(
         "cell", alias="fictitious", description="As `placement`: `cell`."
     )
-    energy: Annotated[float, Field(gt=0.0, le=1e75)] = Field(
+    energy: Annotated[float, Field(gt=0.0, le=1e75), LENGTH] = Field(
         description="G_c over Young's modulus: a length (lattice units).", examples=[0.05]
     )
     onset: StrainLimit = Field(

@@ -195,6 +195,8 @@ class Orthotropic(CellElastic):
     `shear_ratio` G_xy/E_x. Young's modulus, where forces ask for it, is E_x.
     """
 
+    has_axes: ClassVar[bool] = True
+
     type: Literal["orthotropic"] = "orthotropic"
     poisson_ratio: Annotated[float, Field(gt=-10.0, lt=10.0)] = Field(
         description="ν_xy, the contraction along y under tension along x.", examples=[0.3]

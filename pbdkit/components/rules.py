@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -25,6 +25,7 @@ from pbdkit.interfaces import (
     length,
     where,
 )
+from pbdkit.interfaces.units import PER_LENGTH
 
 
 class Barycentre(FollowerRule):
@@ -99,7 +100,7 @@ class MixedCoordinate(FollowerRule):
     """
 
     type: Literal["mixed-coordinate"] = "mixed-coordinate"
-    K: float = Field(
+    K: Annotated[float, PER_LENGTH] = Field(
         description="Contraction across the loading axis, per way and height (1 / lattice unit).",
         examples=[-0.004],
     )
@@ -107,6 +108,7 @@ class MixedCoordinate(FollowerRule):
 
     linear: ClassVar[bool] = True
     uses_reference: ClassVar[bool] = True
+    has_axes: ClassVar[bool] = True
 
     def parameters(self, setting: Setting) -> dict[str, float]:
         """K, and the loading axis as 0 or 1."""

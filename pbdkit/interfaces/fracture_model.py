@@ -34,6 +34,9 @@ class FractureModel(TakesFields):
     `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
+    has_axes: ClassVar[bool] = False
+    """Whether directions count: mirrored, or turned by a right angle, bonds may then break
+    otherwise."""
     can_break: ClassVar[bool] = True
     """False where nothing ever breaks: the scene then has no bond state at all."""
 

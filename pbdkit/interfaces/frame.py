@@ -72,6 +72,9 @@ class FramePolicy(Component):
     """Whether each point is told of by itself, and follows particles that are nearest to it, or no
     farther off than twice the layers in site index. Several processes then build the frame in
     parts; else each of them builds the whole."""
+    has_axes: ClassVar[bool] = False
+    """Whether directions, or the order of the sites, count: mirrored, or turned by a right angle, a
+    body may then move otherwise."""
     edges_are_free: ClassVar[bool] = False
     """Whether edges are free of stress under a calibrated rule; where not, a warning says so."""
 

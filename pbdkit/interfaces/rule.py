@@ -97,6 +97,9 @@ class FollowerRule(TakesFields):
     uses_reference: ClassVar[bool] = False
     """Whether it counts where the particle stands: `here.X` and `here.centred` are then given.
     Other rules move a translated body in the same way, wherever it stands."""
+    has_axes: ClassVar[bool] = False
+    """Whether directions count: mirrored, or turned by a right angle, a body may then move
+    otherwise."""
     uses_cells: ClassVar[bool] = False
     """Whether the rule works cell by cell of the lattice. ``w.left`` and ``w.right`` are then the
     shares, 0 to 1, of the cells to the left and to the right of the bond, seen from j, that belong

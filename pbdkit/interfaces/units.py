@@ -56,6 +56,7 @@ class Quantity:
 
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
+PER_LENGTH = Quantity("number per length", "1 / lattice unit", "1/mm", length=-1)
 AREA = Quantity("area", "lattice unit^2", "mm^2", length=2)
 STRESS = Quantity("stress", "stress unit", "MPa", youngs_modulus=1)
 FORCE = Quantity(

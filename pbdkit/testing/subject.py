@@ -29,6 +29,7 @@ from pbdkit.interfaces.units import is_needed
 from pbdkit.registry.blame import interface_of
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.testing.question import Question, questions_of
+from pbdkit.testing.solids import Solid, solids_of
 
 LATTICES: dict[str, dict[str, Any]] = {
     "square": {"type": "square", "a": 1.0},
@@ -155,6 +156,12 @@ class Subject:
                 "go with it, `conformance(..., lattice=..., neighbours=...)`"
             )
         return scenes
+
+    @cached_property
+    def solids(self) -> list[Solid]:
+        """The small solids that it takes part in. Raises NoSolidError without any."""
+        every = {"lattice": [*LATTICES.values()], "neighbours": [*NEIGHBOURS.values()]}
+        return solids_of(self.component, every | dict(self.parts))
 
     @property
     def scene(self) -> Scene:

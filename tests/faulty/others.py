@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -100,20 +100,24 @@ class Approximate(pbdkit.NeighbourMetric):
     """Rest offsets to ten digits."""
 
     type: Literal["approximate"] = "approximate"
+    radius: Annotated[float, pbdkit.LENGTH] = Field(1.35, description="How far it sees.")
 
     def shells_around(self, cell, sublattice):
-        shell = cell.offsets(sublattice, 1.35)
-        return [[replace(o, rest=pbdkit.Vector(*np.round(o.rest, 10).tolist())) for o in shell]]
+        shell = cell.offsets(sublattice, self.radius)
+        return [[replace(o, rest=(1.0 + 1e-10) * o.rest) for o in shell]]
 
 
 class Favours(pbdkit.NeighbourMetric):
     """The first sublattice sees farther within itself."""
 
     type: Literal["favours"] = "favours"
+    radius: Annotated[float, pbdkit.LENGTH] = Field(1.45, description="How far it sees.")
 
     def shells_around(self, cell, sublattice):
-        near = cell.offsets(sublattice, 1.45)
-        far = [o for o in cell.offsets(sublattice, 1.9) if o.target == sublattice == 0]
+        near = cell.offsets(sublattice, self.radius)
+        far = [
+            o for o in cell.offsets(sublattice, 1.3 * self.radius) if o.target == sublattice == 0
+        ]
         return [list(dict.fromkeys([*near, *far]))]
 
 
@@ -160,6 +164,7 @@ class SaysItIsLocal(Following):
     """Follows the body's first particle, wherever that is."""
 
     type: Literal["says-it-is-local"] = "says-it-is-local"
+    has_axes: ClassVar[bool] = True
 
     local: ClassVar[bool] = True
 

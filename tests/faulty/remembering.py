@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import random
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 import pbdkit
 from faulty.others import Extent
@@ -56,6 +56,16 @@ class Wearing(
     @staticmethod
     def breaking_strain(r, c, p):
         return pbdkit.where(c.wear > c.strength, c.wear, c.strength)
+
+
+class Hardens(Wearing):
+    """Bonds are the stiffer, the more they were strained."""
+
+    type: Literal["hardens"] = "hardens"
+
+    @staticmethod
+    def seen(d, lost, r, c, p):
+        return (1.0 + c.wear) * d
 
 
 class TakesAName(Wearing):
@@ -272,13 +282,14 @@ class Tired(pbdkit.RenewsParticles, Sound):
     """Follows the less, the farther it has come: what the others would be without their fault."""
 
     type: Literal["tired"] = "tired"
+    stamina: Annotated[float, pbdkit.LENGTH] = Field(1.0, description="The way that halves moves.")
 
     def remembered(self):
         return (Remembered("way", "way made in x", "lattice unit"),)
 
     @staticmethod
     def apply(total, here, p):
-        return total[0] / (total[1] * (1.0 + here.own.way))
+        return total[0] / (total[1] * (1.0 + here.own.way / p.stamina))
 
     @staticmethod
     def remember(total, here, p):

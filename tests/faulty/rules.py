@@ -169,7 +169,8 @@ class Divides(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return d / pbdkit.length(r + d), 1.0
+        share = 1.0 / pbdkit.length(r + d)
+        return share * d, share
 
 
 class Square(Sound):
@@ -201,7 +202,7 @@ class ClaimsLinear(Sound):
 
     @staticmethod
     def gather(d, r, w, p):
-        return pbdkit.Vector(d.x * d.x, d.y), 1.0
+        return (pbdkit.squared_length(d) / (r.x * r.x + r.y * r.y)) * d, 1.0
 
 
 class HoldsOn(Sound):
@@ -214,13 +215,18 @@ class HoldsOn(Sound):
         return -0.5 * here.u
 
 
-class BearsTwice(pbdkit.Loadable, Sound):
-    """Counts a load twice."""
+class Net(pbdkit.Loadable, Sound):
+    """Springs between neighbours, for small displacements: what the next would be without their
+    fault."""
 
-    type: Literal["bears-twice"] = "bears-twice"
+    type: Literal["net"] = "net"
 
     def elasticity(self):
         return pbdkit.Stiffness(1.0, 1.0, 0.0, 0.5)
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return pull_along(d, r), 1.0
 
     @staticmethod
     def force(total, here, p):
@@ -228,7 +234,79 @@ class BearsTwice(pbdkit.Loadable, Sound):
 
     @staticmethod
     def loaded(total, load, p):
+        return total[0] + load, total[1]
+
+
+def pull_along(d, r):
+    """The part of d along r."""
+    return ((d.x * r.x + d.y * r.y) / pbdkit.squared_length(r)) * r
+
+
+class BearsTwice(Net):
+    """Counts a load twice."""
+
+    type: Literal["bears-twice"] = "bears-twice"
+
+    @staticmethod
+    def loaded(total, load, p):
         return total[0] + 2.0 * load, total[1]
+
+
+class ResistsTurning(Net):
+    """Pulls back whatever moves, across the bond as along it."""
+
+    type: Literal["resists-turning"] = "resists-turning"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d, 1.0
+
+
+class PullsOneWay(Net):
+    """Springs pull more at their left end."""
+
+    type: Literal["pulls-one-way"] = "pulls-one-way"
+    has_axes: ClassVar[bool] = True
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return (2.0 if r.x > 0.0 else 1.0) * pull_along(d, r), 1.0
+
+
+class Gives(Net):
+    """Forces push where springs would pull."""
+
+    type: Literal["gives"] = "gives"
+
+    @staticmethod
+    def force(total, here, p):
+        return -1.0 * total[0]
+
+    @staticmethod
+    def loaded(total, load, p):
+        return total[0] - load, total[1]
+
+
+class HasAScale(Sound):
+    """Moves nobody by more than a lattice unit."""
+
+    type: Literal["has-a-scale"] = "has-a-scale"
+
+    @staticmethod
+    def apply(total, here, p):
+        move = total[0] / total[1]
+        return move / (1.0 + pbdkit.length(move))
+
+
+class LeansRight(Sound):
+    """Counts neighbours to the right twice."""
+
+    type: Literal["leans-right"] = "leans-right"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        count = 2.0 if r.x > 0.0 else 1.0
+        return count * d, count
 
 
 class Unlike(Sound):

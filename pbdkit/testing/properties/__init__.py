@@ -7,8 +7,10 @@ from pbdkit.testing.properties import (
     directions,
     elementwise,
     every,
+    invariance,
     lattice_parts,
     loads,
+    mechanics,
     particulars,
     repetition,
     start,
@@ -28,6 +30,8 @@ PROPERTIES: tuple[Property, ...] = tuple(
         loads,
         steps,
         directions,
+        invariance,
+        mechanics,
     )
     for found in vars(page).values()
     if isinstance(found, Property)

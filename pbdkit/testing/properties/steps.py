@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 from contextlib import suppress
 
@@ -19,19 +18,15 @@ from pbdkit.interfaces import (
     NeighbourMetric,
 )
 from pbdkit.results.moment import StateMoment
-from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import MemorySink
 from pbdkit.results.tables import Tables
-from pbdkit.runs.continuation import take_up
 from pbdkit.runs.course import Run, record
-from pbdkit.runs.processes import Processes
-from pbdkit.runs.standing import standing_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import obstacle
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.storage.standing import Standing
+from pbdkit.testing.laws import resumed
 from pbdkit.testing.properties.repetition import differing
 from pbdkit.testing.question import flat
 from pbdkit.testing.states import (
@@ -183,25 +178,10 @@ def continues_where_it_stopped(subject: Subject) -> None:
 def _refuse_other_records(scene: Scene, again: Scene) -> None:
     """Raises PropertyError where a run that is stopped, kept as the run store keeps it, and gone on
     with in a scene made anew records something else than one that was never interrupted."""
-    whole, parts = MemorySink(), MemorySink()
-    start = state_with(scene, displacements(scene, 5, share=0.4))
+    whole, start = MemorySink(), state_with(scene, displacements(scene, 5, share=0.4))
     record(Run(scene, start=start.copy()), whole)
-    left, recorder = Run(scene, start=start), Recorder(scene, parts)
-    recorder.begin()
-    for state in left:
-        recorder.observe(state)
-        if state.step >= STEPS - 1:
-            break
-    kept = standing_of(left.driver, recorder)
-    facts = json.loads(json.dumps(kept.facts))
-    rest, recorder = Run(again), Recorder(again, parts)
-    standing = Standing(kept.about, facts, kept.copied().arrays)
-    take_up(rest.driver, recorder, standing, Processes())
-    record(rest, parts, recorder=recorder)
-    found, needed = (
-        {str(name): values for name, values in sink.dataset().variables.items()}
-        for sink in (parts, whole)
-    )
+    datasets = resumed(scene, again, STEPS - 1, start), whole.dataset()
+    found, needed = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
     for name in differing(needed, found):
         raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
 
