@@ -1,0 +1,48 @@
+"""Every pair of features meets in a scene that obeys the laws, or is refused with one message."""
+
+import re
+from itertools import combinations
+
+import pytest
+from crossed_scenes import (
+    FEATURES,
+    PAIRS,
+    REFUSALS,
+    covering,
+    experiment_of,
+    refusal_of,
+)
+from scene_laws import LAWS, run
+
+import pbdkit
+
+SCENES = tuple(covering())
+REFUSED = sorted(tuple(sorted(pair)) for pair in PAIRS if refusal_of(pair))
+
+
+def test_every_pair_of_features_meets_or_is_refused():
+    met = {frozenset(pair) for features in SCENES for pair in combinations(features, 2)}
+    assert PAIRS - met == {frozenset(pair) for pair in REFUSED}
+    assert {feature for features in SCENES for feature in features} == {*FEATURES}
+
+
+@pytest.mark.parametrize(("first", "second", "words"), REFUSALS, ids=lambda v: str(v)[:30])
+def test_what_does_not_go_together_is_refused_with_one_message(first, second, words):
+    """In pairs, each with nothing else in its way."""
+    pairs = {frozenset((a, b)) for a in first for b in second} & PAIRS
+    assert pairs
+    for pair in sorted(map(sorted, pairs)):
+        if refusal_of(pair) != words:
+            continue  # told by an earlier line
+        with pytest.raises(pbdkit.ExperimentError) as refusal:
+            run(experiment_of(pair))
+        text = str(refusal.value)
+        assert re.search(words, text), (pair, text)
+        assert "\n" not in text, text
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("n", range(len(SCENES)))
+def test_scenes_obey_the_laws(n, law):
+    faults = LAWS[law](experiment_of(SCENES[n], n), n)
+    assert not faults, (sorted(SCENES[n]), faults)
