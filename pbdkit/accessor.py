@@ -35,7 +35,7 @@ class PbdAccessor:
 
     def plot(
         self,
-        time: int | Iterable[int | None] | None = None,
+        time: float | Iterable[float | None] | None = None,
         color: str | None = None,
         *,
         ax: Axes | Sequence[Axes] | None = None,
@@ -53,7 +53,7 @@ class PbdAccessor:
     def compare(
         self,
         other: xarray.Dataset,
-        time: int | None = None,
+        time: float | None = None,
         color: str | None = None,
         *,
         difference: bool = False,

@@ -2,6 +2,7 @@
 
 import json
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -322,3 +323,20 @@ def test_the_shipped_dogbone_bears_what_its_page_says():
     assert force.max() == pytest.approx(1601.0, abs=1.0)
     assert abs(force[21:]).max() < 1e-6
     refuse_overstretched(ds, 0.02)
+
+
+def test_equilibria_within_a_step_are_drawn_and_explained(call, tmp_path):
+    given = specimen("square", "elastic", failure=0.02, once=True)
+    Path("dogbone.json").write_text(json.dumps(given))
+    assert call("run", "dogbone.json", "-o", "dogbone.nc").code == 0
+    with pbdkit.open("dogbone.nc") as ds:
+        moment = float(f"{ds.time.values[3]:.6g}")
+        strain = np.where(ds.broken_step.values < 0, strains(ds, 5), 0.0)
+        a, b = map(str, ds.bond_ends.values[strain.argmax()].tolist())
+    assert moment % 1.0 > 0.0
+    assert call("plot", "dogbone.nc", "--time", str(moment), "-o", "plot.png").code == 0
+    refused = call("plot", "dogbone.nc", "--time", "0.33", "-o", "other.png")
+    assert "step 0.33 was not recorded; the nearest recorded: 0." in refused.err
+    assert call("curve", "dogbone.nc", "load-displacement", "-o", "curve.png").code == 0
+    explained = call("explain", "dogbone.nc", "--bond", a, b).out
+    assert "longest of the recorded steps in step 0." in explained

@@ -50,7 +50,7 @@ color_option = click.option(
 times_option = click.option(
     "--time",
     "times",
-    type=int,
+    type=float,
     multiple=True,
     help="Draw this recorded step, else the last; again for a panel more.",
     shell_complete=completed_by("times"),

@@ -54,7 +54,9 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
 @click.option("--dpi", type=int, default=200, show_default=True, help="Pixels an inch.")
 @force_option
-def plot(file: Path, output: Path | None, times: tuple[int, ...], force: bool, **look: Any) -> None:
+def plot(
+    file: Path, output: Path | None, times: tuple[float, ...], force: bool, **look: Any
+) -> None:
     """Draw configurations of a result: kinds, or a variable as dots, bonds or a field."""
     from pbdkit.cli.output import refuse_output, refuse_unwritable, save
     from pbdkit.drawing.picture import plot as draw

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def compare(
     first: xarray.Dataset,
     second: xarray.Dataset,
-    time: int | None = None,
+    time: float | None = None,
     color: str | None = None,
     *,
     difference: bool = False,
@@ -55,7 +55,7 @@ def compare(
 
 
 def difference_of(
-    first: xarray.Dataset, second: xarray.Dataset, time: int | None, color: str
+    first: xarray.Dataset, second: xarray.Dataset, time: float | None, color: str
 ) -> tuple[xarray.Dataset, None, str]:
     """The second dataset at one step, at rest, with the difference in `color` as a variable more,
     where a particle of that number is in both; the time to draw, and the name of what to draw."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -67,7 +68,7 @@ def crack(dataset: xarray.Dataset, *, kind: Kind = "map", ax: Axes | None = None
         reached = np.searchsorted(broken.step, steps, side="right") - 1
         factor, units = in_its_units(dataset["reference"].attrs)
         values, said = factor * _lengths(broken)[reached], "length of the longest crack"
-    last = int(dataset["time"].values[-1])
+    last = math.ceil(dataset["time"].values[-1])
     x = np.concatenate([[0], np.repeat(steps, 2), [last]])
     y = np.repeat([0.0, *values], 2)
     ax = ax or new_axes()

@@ -19,6 +19,7 @@ from pbdkit.drawing.recording import Recording, Snapshot
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.registry.extras import refuse_no_matplotlib, refuse_without
+from pbdkit.results.layout import as_step
 
 if TYPE_CHECKING:
     import xarray
@@ -134,14 +135,14 @@ class Moving:
         self._recording, self._name = recording, recording.title
         looked_at = _told(recording.snapshots(rows), len(rows), "the scale of colours", show)
         extent: Extent = extent_of(recording, looked_at, look)
-        title = self._title(int(recording.steps[-1]))
+        title = self._title(as_step(recording.steps[-1]))
         self.sheet: Sheet = Sheet([recording], [title], "", extent, look, finer=FINER, alone=alone)
         (self._panel,) = self.sheet.panels
         self._heading = self._panel.ax.title
         if self._heading.get_text() != title:  # it was too long
             self._name = ""
 
-    def _title(self, step: int) -> str:
+    def _title(self, step: float) -> str:
         return f"{self._name}, step {step}".lstrip(", ")
 
     def put(self, now: Snapshot) -> list[Any]:

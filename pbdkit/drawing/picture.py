@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def plot(
     dataset: xarray.Dataset,
-    time: int | Iterable[int | None] | None = None,
+    time: float | Iterable[float | None] | None = None,
     color: str | None = None,
     *,
     ax: Axes | Sequence[Axes] | None = None,

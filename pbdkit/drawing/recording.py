@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +15,7 @@ from pbdkit.drawing.labels import counted_in, label, plain
 from pbdkit.drawing.mesh import cells_of, whole
 from pbdkit.drawing.quantity import Quantity, quantity_of
 from pbdkit.errors import ExperimentError
-from pbdkit.results.layout import OF_BODY, broken_by
+from pbdkit.results.layout import OF_BODY, as_step, broken_by
 from pbdkit.results.sites import rows_of
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class Snapshot:
     """One step: `position` (particle, axis), `kind` (particle,), `values` of the quantity, if any,
     and which bonds are `broken` (bond,)."""
 
-    step: int
+    step: float
     position: Array
     kind: Array
     values: Array | None
@@ -131,16 +132,18 @@ class Recording:
             beyond = inside & ~dataset["inside"].values[rows].astype(bool)
         return Body(reference, site, numbers, inside, ends, broken, beyond)
 
-    def row(self, time: int | None) -> int:
+    def row(self, time: float | None) -> int:
         """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""
         if time is None:
             return len(self.steps) - 1
-        rows = np.flatnonzero(self.steps == time)
+        exactly = self.steps.dtype.kind == "i"
+        known = self.steps if exactly else np.array([as_step(step) for step in self.steps])
+        rows = np.flatnonzero(known == (time if exactly else as_step(time)))
         if not len(rows):
             near = [*self.steps[self.steps < time][-1:], *self.steps[self.steps > time][:1]]
             raise ExperimentError(
-                f"step {time} was not recorded; the nearest recorded: "
-                f"{' and '.join(map(str, near))}"
+                f"step {as_step(time)} was not recorded; the nearest recorded: "
+                f"{' and '.join(str(as_step(step)) for step in near)}"
             )
         return int(rows[-1])
 
@@ -158,10 +161,12 @@ class Recording:
             kind = part["kind"].transpose("time", "particle").values
             values = quantity.values(part) if quantity else None
             for n, row in enumerate(chosen):
-                step = int(self.steps[row])
-                broken = broken_by(body.broken_step, step)
+                step = float(self.steps[row])
+                # In which fraction of a step a bond broke is not known but for the last one.
+                is_last = row == len(self.steps) - 1
+                broken = broken_by(body.broken_step, math.ceil(step) if is_last else step)
                 yield Snapshot(
-                    step,
+                    as_step(step),
                     position[n][self._rows],
                     np.nan_to_num(kind[n][self._rows]).astype(np.int8),
                     None if values is None else values[n][self._owners],

@@ -310,9 +310,10 @@ def _parting(
     bonds, count = scene.bonds, _torn(failed) - _torn(before)
     fresh = (failed.broken_step >= 0) & (before.broken_step < 0)
     rows = np.flatnonzero(fresh.reshape(len(fresh), -1)[bonds.plane, bonds.place])
-    what, first = "what is left of the body has no equilibrium", ""
+    parted = isinstance(error, NoEquilibriumError)
+    what = "the body came apart" if parted else "no stable equilibrium was found"
+    first = ""
     if len(rows):
-        what = "the body came apart"
         a, b = (bonds.ends[rows[0]] + 1).tolist()
         plural = f" and {count - 1} more" if count > 1 else ""
         first = f"the bond between particles {a} and {b}{plural} broke, and "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Bonds, BreaksAtStrain, FractureModel
 from pbdkit.interfaces.fracture_model import breaking_order
-from pbdkit.results.layout import OF_FRAME
+from pbdkit.results.layout import OF_FRAME, as_step
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.places import Places
 from pbdkit.scene.scene import Scene
@@ -44,7 +45,7 @@ class Standing:
     strain_at_break: float | None
     breaks_above: float | None
     strain: float
-    at_step: int
+    at_step: float
 
     @property
     def share(self) -> float | None:
@@ -88,7 +89,7 @@ class Explained:
     def limits(self) -> Floats:
         """(bond,): the strain above which each broke, or breaks at the last recorded step; NaN
         where the model does not say."""
-        limits, last = np.full(len(self.bonds), np.nan), int(self._dataset["time"][-1])
+        limits, last = np.full(len(self.bonds), np.nan), math.ceil(self._dataset["time"].values[-1])
         moments = np.where(self.steps > 0, self.steps, last)
         if not self._scene.experiment.courses:
             moments[:] = last
@@ -155,7 +156,7 @@ class Explained:
                 strain_at_break=_known(self.strains_at_break[row]),
                 breaks_above=None if self.spared[row] else _known(self.limits[row]),
                 strain=strain,
-                at_step=int(times[time]),
+                at_step=as_step(times[time]),
             )
             for row, strain in zip(rows.tolist(), strains, strict=True)
         ]
@@ -198,11 +199,11 @@ class Explained:
         touches[broken] = False
         return np.append(broken, np.flatnonzero(touches))
 
-    def most_strained(self, row: int) -> tuple[int, float]:
+    def most_strained(self, row: int) -> tuple[float, float]:
         """The recorded step at which a bond was the longest, and its strain then."""
         history = self.strains(np.array([row]), slice(None))[:, 0]
         most = int(np.argmax(history))
-        return int(self._dataset["time"].values[most]), float(history[most])
+        return as_step(self._dataset["time"].values[most]), float(history[most])
 
     def remembered(self, row: int) -> dict[str, float]:
         """What the model remembers of a bond, at the last recorded step."""

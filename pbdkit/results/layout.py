@@ -74,6 +74,11 @@ class Column:
         return {name: text for name, text in said.items() if text} | self.more
 
 
+def as_step(time: Any) -> float:
+    """A recorded time as it is written: a whole number of steps, or a fraction with six digits."""
+    return int(time) if float(time).is_integer() else float(f"{time:.6g}")
+
+
 def broken_by(broken_step: Any, step: Any) -> Any:
     """Whether bonds that broke in these steps, -1 where they did not, are broken after a step."""
     return (broken_step >= 0) & (broken_step <= step)
