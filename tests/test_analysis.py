@@ -52,11 +52,13 @@ def test_the_operator_makes_the_steps_that_the_stepper_makes(experiment):
         operator = step_operator(scene, state, step=5)
         before_step = [u.copy() for u in (state.u, state.previous)]
         broken = None if state.broken_step is None else state.broken_step.copy()
+        softened = [value.copy() for value in state.bond_values]
         state = stepper.advance(state)
     except pbdkit.ExperimentError:
         assume(False)
     now, before = (unknowns(scene, u, operator.followers) for u in before_step)
     assume(broken is None or np.array_equal(broken, state.broken_step))
+    assume(all(map(np.array_equal, softened, state.bond_values)))
     led = unknowns(scene, state.u, operator.leaders)
     old_led = unknowns(scene, state.previous, operator.leaders)
     # Frame points that follow leaders see them where they stood before the step, or one earlier.
@@ -293,7 +295,9 @@ def test_a_step_is_linearised_alike_in_all_units(rule, a):
 
     def operator(a):
         cracks = [[[2.5 * a, -a], [2.5 * a, 1.5 * a]]]
-        fracture = {"type": "threshold", "thresholds": [1.7 * a], "placement": 1.5}
+        fracture = {"type": "threshold", "thresholds": [1.7 * a]}
+        if rule == "distance-weighted":  # lost bonds of calibrated rules push nowhere
+            fracture["placement"] = 1.5
         given = sheet(
             columns=6,
             rows=5,

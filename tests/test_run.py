@@ -32,9 +32,6 @@ SOLVERS = {
 }
 
 
-ROLES = "stepping until roles and loads change no more"
-
-
 def scene_of(given: dict[str, Any], **parts: Any) -> Scene:
     return build_scene(pbdkit.Experiment(**given | parts))
 
@@ -134,7 +131,7 @@ def test_who_watches_a_run_can_stop_it(tensile: dict[str, Any], solver: str) -> 
     sink, run = MemorySink(), Run(scene_of(given), watch=watch)
     report = record(run, sink)
     assert report.outcome.status == "interrupted"
-    assert told[0] == {"stepping": "step 0 of 1000000", "equilibrium": ROLES}[solver]
+    assert told[0] == {"stepping": "step 0 of 1000000", "equilibrium": "assembling"}[solver]
     assert sink.dataset().time[-1] == report.outcome.steps < 10**6
 
 
