@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -35,19 +35,15 @@ class PantographBeams(pbdkit.SharesParticles, pbdkit.TurnsParticles, pbdkit.Foll
     stretching: float = Field(
         1.0, gt=0.0, le=1e12, description="EA of a fibre: force over strain.", examples=[100.0]
     )
-    bending: float = Field(
+    bending: Annotated[float, Field(gt=0.0, le=1e12), pbdkit.AREA] = Field(
         0.01,
-        gt=0.0,
-        le=1e12,
-        description="EI of a fibre: moment over curvature, force × length².",
+        description="EI of a fibre: moment over curvature, in the unit of `stretching` × length².",
         examples=[1.0],
     )
-    pivot: float = Field(
+    pivot: Annotated[float, Field(ge=0.0, le=1e12), pbdkit.LENGTH] = Field(
         0.0,
-        ge=0.0,
-        le=1e12,
-        description="Moment of a pivot over the angle between its fibres, force × length; 0: they "
-        "turn freely.",
+        description="Moment of a pivot over the angle between its fibres, in the unit of "
+        "`stretching` × length; 0: they turn freely.",
         examples=[0.1],
     )
 
