@@ -257,13 +257,12 @@ def test_increments_of_an_equilibrium_follow_courses():
     """What ages under a steady strain breaks within the increment in which its strength is reached,
     in step 898; then nothing holds its parts, and the last equilibrium is that before."""
     given_ = pbdkit.load("modelling/ageing", settings=["solver={type: equilibrium}"])
-    with pytest.raises(pbdkit.DivergedError, match="came apart between") as error:
+    with pytest.raises(pbdkit.DivergedError, match="between step 892 and step 900") as error:
         pbdkit.run(given_, progress=False)
     kept = error.value.dataset
     assert kept.status == "separated"
     assert kept.time.values[-1] < 898
     assert (kept.broken_step.values < 0).all()
-    assert "between step 892 and step 900" in str(error.value)
     assert {100, 1000} <= set(moments(build_scene(given_), 10))
 
 

@@ -227,26 +227,6 @@ def test_broken_bonds_exert_what_the_rule_sees():
         assert (np.abs(ds.reaction[-1]).max() < 1e-10) == torn
 
 
-@pytest.mark.parametrize("rule", [STRESS, {"type": "springs"}])
-def test_no_strain_energy_comes_from_where_a_lost_neighbour_is_put(rule):
-    """`placement` pulls at both ends of a broken bond with forces that stay: u for u the energy
-    grows as without."""
-
-    def energies(placement):
-        found = []
-        for by in (0.0, 0.1, 0.2):
-            fracture = {"type": "strain", "failure": 9.0, "placement": placement,
-                        "cracks": [[[1.8, 1.3], [1.8, 9.0]]]}  # fmt: skip
-            parts = SQUARE | {"rule": rule, "fracture": fracture, "diagnostics": [ENERGY]}
-            halves = ([-99, -99, 1.8, 99], HOLD), ([1.8, -99, 99, 99], moved((by, 0.0)))
-            parts["leaders"] = [{"select": {"box": b}, "motion": motion} for b, motion in halves]
-            ds = ran(pulled(parts, solver={"type": "stepping"}))
-            found.append(float(ds.strain_energy[-1]))
-        return np.diff(found)
-
-    np.testing.assert_allclose(energies(1.2), energies(1.0), rtol=1e-12)
-
-
 def test_the_dataset_is_described_and_stored(tmp_path):
     given = pulled(SQUARE | {"rule": STRESS})
     curve = {"type": "stress-strain", "youngs_modulus": E, "width": 2.5}

@@ -92,7 +92,7 @@ def rectangle(width, height, x=0.0, y=0.0):
 
 def quarters(part):
     """A plate with a hole, pulled at both sides, or its quarter on two planes of symmetry."""
-    whole = {"type": "difference", "of": [rectangle(10, 8, -5, -4), rectangle(3, 1, -1.5, -0.5)]}
+    whole = {"type": "difference", "of": [rectangle(10, 8, -5, -4), rectangle(3, 3, -1.5, -1.5)]}
     body = {"type": "intersection", "of": [whole, rectangle(6, 6)]} if part else whole
     pull = {"type": "velocity", "velocity": [0.05, 0.0], "steps": 20}
     push = {"type": "velocity", "velocity": [-0.05, 0.0], "steps": 20}

@@ -91,9 +91,9 @@ def test_matrices_without_a_symmetric_pattern_are_told_apart():
 def test_derivatives_are_exact_where_functions_are_analytic_and_to_nine_digits_elsewhere():
     x, y = np.array([0.3, -0.7, 2.0]), np.array([1.5, -0.4, 0.9])
     root = np.sqrt(x * x + y * y)
-    exact = derivative(lambda s: (np.sqrt((x + s) ** 2 + y * y), x / (y - 2 * s)), x.shape)
+    exact = derivative(lambda s: (np.sqrt((x + s) ** 2 + y * y), x / (y - 2 * s)), x.shape, 1.0)
     np.testing.assert_allclose(exact, [x / root, 2 * x / (y * y)], rtol=1e-15)
-    close = derivative(lambda s: (np.abs(x + s), np.hypot(x, y + s)), x.shape)
+    close = derivative(lambda s: (np.abs(x + s), np.hypot(x, y + s)), x.shape, 1.0)
     np.testing.assert_allclose(close, [np.sign(x), y / root], rtol=1e-9)
 
 
