@@ -57,8 +57,8 @@ def write_scripts(folder: Path) -> None:
         (place / "GALLERY_HEADER.rst").write_text(f"{title}\n{'=' * len(title)}\n")
         (place / f"plot_{short.replace('-', '_')}.py").write_text(script_of(name))
     (folder / "GALLERY_HEADER.rst").write_text(
-        "Gallery\n=======\n\nEvery experiment that comes along: its picture, its movie, its file. "
-        "`pbdkit experiments` lists them.\n"
+        "Gallery\n=======\n\nEvery experiment that is shipped: its picture, its movie, its file. "
+        "`pbdkit experiments` lists them, `pbdkit init --from paper/a` copies one.\n"
     )
 
 

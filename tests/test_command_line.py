@@ -18,6 +18,7 @@ import xarray
 
 import pbdkit
 from pbdkit.cli import COMMANDS, FIRST, GROUPS
+from pbdkit.experiment.shipped import shipped_text
 
 Call = Callable[..., Any]
 Probing = Callable[..., None]
@@ -188,6 +189,9 @@ WRONG = {
     "closed folder": (6, ["run", "e.json", "-o", "/proc/o.nc"], "/proc/o.nc: cannot be written"),
     "long file name": (6, ["run", "e.json", "-o", "o" * 300], "File name too long"),
     "init over a file": (2, ["init", "e.json"], "e.json: exists and is left as it is"),
+    "init of a shipped one": (2, ["init", "paper/f1"], "paper/f1: is a shipped experiment, no file to be written; `pbdkit init f1.yaml --from paper/f1` copies it"),
+    "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is no shipped experiment; did you mean 'paper/f2'?"),
+    "no shipped experiment": (2, ["experiments", "f1"], "f1: is no shipped experiment; `pbdkit experiments` lists them"),
     "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
 }  # fmt: skip
 
@@ -357,6 +361,32 @@ def test_init_writes_an_experiment_that_runs_and_can_be_drawn(call: Call) -> Non
     assert call("run", "a.yaml", "--set", "steps=5", "-o", "a.nc").code == 0
     assert call("plot", "a.nc", "--color", "pe1").code == 0
     assert left() == ["a.nc", "a.png", "a.yaml"]
+
+
+def test_a_shipped_experiment_is_printed_as_it_stands(call: Call) -> None:
+    assert call("experiments", "paper/f1") == (0, shipped_text("paper/f1"), "")
+
+
+@pytest.mark.parametrize("name", ["material/dogbone", "modelling/measured-boundary"])
+def test_a_copy_of_a_shipped_experiment_is_the_same_experiment(call: Call, name: str) -> None:
+    assert call("init", "a.yaml", "--from", name).code == 0
+    copy, shipped = Path("a.yaml").read_text(), shipped_text(name)
+    assert copy == shipped
+    assert pbdkit.load("a.yaml").model_dump() == pbdkit.load(name).model_dump()
+    data = ["measured-boundary.csv"] if "measured" in name else []
+    assert left() == ["a.yaml", *data]
+    assert call("check", "a.yaml").code == 0
+
+
+def test_a_copy_takes_the_name_of_the_shipped_experiment_and_replaces_nothing(call: Call) -> None:
+    assert "f1.yaml written; next: pbdkit check f1.yaml" in call("init", "--from", "paper/f1").out
+    Path("measured-boundary.csv").write_text("mine")
+    refused = call("init", "--from", "modelling/measured-boundary")
+    assert (refused.code, "measured-boundary.csv: exists and is left as" in refused.err) == (
+        2,
+        True,
+    )
+    assert left() == ["f1.yaml", "measured-boundary.csv"]
 
 
 def completed(*words: str) -> list[str]:

@@ -32,8 +32,10 @@ class Listed:
 
 GROUPS = {
     "Start": (
-        Listed("init", "experiments", "Writes a commented experiment to start from."),
-        Listed("experiments", "experiments", "Lists the experiments that come along."),
+        Listed(
+            "init", "experiments", "Writes an experiment to start from, or copies a shipped one."
+        ),
+        Listed("experiments", "experiments", "Lists the shipped experiments, or prints one."),
     ),
     "Run": (
         Listed("run", "run", "Runs an experiment, and writes its result to a file."),

@@ -59,6 +59,13 @@ def _experiments(context: click.Context, begun: str) -> Iterator[str | Completio
     yield from sorted(p.name for p in Path().glob(f"{escape(begun)}*") if p.suffix in SUFFIXES)
 
 
+def _shipped(context: click.Context, begun: str) -> Iterable[str]:
+    """The shipped experiments."""
+    from pbdkit.experiment.shipped import shipped_names
+
+    return shipped_names()
+
+
 def _results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
     """The results in a folder, those of runs that are not finished, and the folders in it."""
     from pbdkit.storage.run_files import STORE
@@ -148,6 +155,7 @@ def _content(context: click.Context) -> Iterator[Any]:
 
 
 experiments = _completer(_experiments)
+shipped = _completer(_shipped)
 results = _completer(_results)
 settings = _completer(_settings)
 variables = _completer(_variables)

@@ -8,30 +8,60 @@ from pathlib import Path
 
 import click
 
+from pbdkit.cli.options import PATH, completed_by
+
+START = "start"
+"""The shipped experiment that `init` writes by default."""
+
 
 @click.command()
-def experiments() -> None:
-    """List the shipped experiments."""
-    from pbdkit.experiment.shipped import shipped_names, shipped_title
+@click.argument("name", required=False, shell_complete=completed_by("shipped"))
+def experiments(name: str | None) -> None:
+    """List the shipped experiments, or print the file of one, e.g. paper/f1."""
+    from pbdkit.experiment.shipped import shipped_names, shipped_text, shipped_title
 
+    if name is not None:
+        click.echo(shipped_text(name), nl=False)
+        return
     width = max(map(len, names := shipped_names()))
-    for name in names:
-        click.echo(f"{name:<{width}}  {shipped_title(name)}")
+    for each in names:
+        click.echo(f"{each:<{width}}  {shipped_title(each)}")
 
 
 @click.command()
-@click.argument("file", default="experiment.yaml", type=click.Path(path_type=Path))
-def init(file: Path) -> None:
-    """Write a commented experiment to start from."""
+@click.argument("file", required=False, type=PATH)
+@click.option(
+    "--from",
+    "origin",
+    metavar="NAME",
+    shell_complete=completed_by("shipped"),
+    help="Copy this shipped experiment with its data files, e.g. paper/f1.",
+)
+def init(file: Path | None, origin: str | None) -> None:
+    """Write an experiment to start from: a commented one, or a copy of a shipped one.
+
+    FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml."""
     from pbdkit.cli.output import refusals_as
     from pbdkit.errors import ExperimentError
-    from pbdkit.experiment.shipped import shipped_text
+    from pbdkit.experiment.shipped import SUFFIX, shipped_data, shipped_names, shipped_text
 
-    if os.path.lexists(file):
-        raise ExperimentError(f"{file}: exists and is left as it is; name another file")
-    with refusals_as(f"{file}: cannot be written"), file.open("x", encoding="utf-8") as written:
-        written.write(shipped_text("start"))
-    click.echo(f"{file} written; next: pbdkit check {file}, then pbdkit run {file}")
+    path, text = (
+        file or Path(Path(origin or "experiment").name + SUFFIX),
+        shipped_text(origin or START),
+    )
+    if origin is None and str(path) in shipped_names():
+        copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
+        raise ExperimentError(f"{path}: is a shipped experiment, no file to be written; {copy}")
+    data = shipped_data(origin) if origin else []
+    files = {path: text.encode()} | {path.with_name(d.name): d.read_bytes() for d in data}
+    for each in files:
+        if os.path.lexists(each):
+            raise ExperimentError(f"{each}: exists and is left as it is; name another file")
+    for each, content in files.items():
+        with refusals_as(f"{each}: cannot be written"), each.open("xb") as written:
+            written.write(content)
+    beside = f" with {', '.join(d.name for d in data)}" if data else ""
+    click.echo(f"{path} written{beside}; next: pbdkit check {path}, then pbdkit run {path}")
 
 
 @click.command()

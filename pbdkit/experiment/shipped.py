@@ -24,8 +24,18 @@ def shipped_names() -> list[str]:
 
 
 def shipped_text(name: str) -> str:
-    """The file of a shipped experiment."""
+    """Return the file of a shipped experiment. Raises ExperimentError where there is none of that
+    name."""
+    if name not in (names := shipped_names()):
+        hint = did_you_mean(name, names) or "; `pbdkit experiments` lists them"
+        raise ExperimentError(f"{name}: is no shipped experiment{hint}")
     return (FOLDER / f"{name}{SUFFIX}").read_text("utf-8")
+
+
+def shipped_data(name: str) -> list[Path]:
+    """Return the data files that a shipped experiment names; they lie beside it."""
+    text, beside = shipped_text(name), (FOLDER / name).parent.iterdir()
+    return sorted(path for path in beside if path.suffix != SUFFIX and path.name in text)
 
 
 def shipped_title(name: str) -> str:
