@@ -389,6 +389,13 @@ def test_a_copy_takes_the_name_of_the_shipped_experiment_and_replaces_nothing(ca
     assert left() == ["f1.yaml", "measured-boundary.csv"]
 
 
+def test_the_set_up_is_drawn_before_the_run(call: Call) -> None:
+    assert call("plot", "e.json", "--dpi", "50").out == "tensile-setup.png written\n"
+    assert call("plot", "paper/a", "--set", "steps=3", "-o", "a.svg").out == "a.svg written\n"
+    assert left() == ["a.svg", "tensile-setup.png"]
+    assert "tensile-setup.png: exists" in call("plot", "e.json").err
+
+
 def completed(*words: str) -> list[str]:
     """What the tabulator key offers after these words in bash."""
     asked = {"_PBDKIT_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(["pbdkit", *words])}

@@ -15,7 +15,7 @@ from pbdkit.experiment.kinds import EXPERIMENT, FIT, PARTS, SWEEP, kind_of
 from pbdkit.experiment.shipped import read_experiment, shipped_names
 
 TAKES_EXPERIMENTS = ["run", "check", "identify", "bench"]
-TAKES_RESULTS = ["plot", "explain", "status", "verify", "resume"]
+TAKES_RESULTS = ["animate", "explain", "status", "verify", "resume"]
 SWEEP_FILE = "experiment: e.json\nvary: {solver.memory: [0.1, 0.2]}\n"
 FIT_FILE = "experiment: e.json\nunknown: {rule.K: [-1, 0]}\nmeasured: {file: d.csv}\n"
 
@@ -83,6 +83,17 @@ def test_where_a_result_is_wanted(told: Any, command: str) -> None:
         assert told(command, file).startswith(message)
 
 
+def test_plot_takes_an_experiment_by_any_name_and_refuses_what_is_neither(told: Any) -> None:
+    for file in ("sweep.nc", "fit.nc", "other.yaml"):
+        assert told("plot", file).startswith(NO_RESULT[file])
+    assert told("plot", "picture.yaml").startswith(NO_EXPERIMENT["picture.yaml"])
+    refused = "--color: is for results; e.json is an experiment, of which the set-up is drawn; `pbdkit run e.json` makes a result of it"
+    assert told("plot", "e.json", "--color", "u") == refused
+    assert told("plot", "experiment.nc", "--time", "3").startswith("--time: is for results")
+    refused = "--set: changes an experiment, and result.yaml is a result"
+    assert told("plot", "result.yaml", "--set", "steps=3") == refused
+
+
 @pytest.mark.parametrize("command", ["plot", "animate", "curve", "export", "report", "explain"])
 def test_a_folder_is_no_result(call: Any, command: str) -> None:
     assert call(command, ".").err == "pbdkit: .: is a folder, no result of pbdkit\n"
@@ -111,7 +122,7 @@ def test_the_folder_of_a_sweep_names_its_dataset(call: Any) -> None:
 
 def test_a_shipped_experiment_is_no_result(call: Any) -> None:
     told = "paper/a: is a shipped experiment; `pbdkit run paper/a` makes a result of it"
-    for command in ("explain", "plot", "status", "resume"):
+    for command in ("explain", "animate", "status", "resume"):
         assert told in call(command, "paper/a").err
 
 

@@ -7,10 +7,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from property_cases import LATTICES, experiment, pull_right
 
 import pbdkit
-from pbdkit.drawing import notebook
+from pbdkit.drawing import notebook, plot_experiment
+from pbdkit.drawing.figures import figure_of
 from pbdkit.drawing.scene_picture import edge_of, picture_of
 from pbdkit.drawing.svg import Svg
 from pbdkit.drawing.ways import extreme
@@ -69,6 +71,59 @@ def test_what_the_scene_has_is_in_the_legend():
     assert {"region core", "obstacle", "body", "cut at step 3", "held", "led", "force"} == {*said}
     framed = picture_of(scene_of()).legend
     assert "frame" in [words for _, words in framed]
+
+
+UNITS = {"units": {"length": "2 mm"}}
+
+
+def test_the_set_up_is_drawn_on_axes_in_mm():
+    ring = {"type": "ring", "inner": 0.5, "outer": 1.0, "centre": [2.5, -2.0]}
+    whole = pbdkit.Experiment(
+        **experiment(
+            **PULLED,
+            **UNITS,
+            cuts=[{"from": [-1.0, 2.5], "to": [1.0, 2.5], "at": 3}],
+            obstacles=[{"shape": ring, "motion": {"type": "hold"}}],
+        )
+    )  # fmt: skip
+    ax = plot_experiment(whole, dpi=80)
+    scene = build_scene(whole)
+    assert {"x (mm)", "y (mm)"} <= {text.get_text() for text in figure_of(ax).texts}
+    drawn = np.concatenate([line.get_xydata() for line in ax.lines])
+    body = 2.0 * scene.raster.reference(scene.raster.body_rows)
+    assert {*map(tuple, body)} <= {*map(tuple, drawn)}
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    assert (drawn > [left, low]).all()
+    assert (drawn < [right, high]).all()
+    arrows = [a for a in ax.texts if a.arrow_patch]
+    assert arrows
+    assert all(a.xy[0] > a.xyann[0] and a.xy[1] == a.xyann[1] for a in arrows)
+    (ring,) = ax.patches
+    assert ring.get_path().contains_point((5.0 + 1.5, -4.0))
+    figure_of(ax).canvas.draw()
+    image = np.asarray(figure_of(ax).canvas.buffer_rgba())[::-1]
+    column, row = (round(v) for v in ax.transData.transform((5.0, -4.0)))
+    assert image[row, column].tolist() == [255, 255, 255, 255]  # a hole
+    words = {text.get_text() for legend in figure_of(ax).legends for text in legend.get_texts()}
+    assert words == {"obstacle", "frame", "body", "cut at step 3", "held", "led"}
+
+
+@pytest.mark.parametrize(
+    "name", ["paper/f1", "modelling/composite-plate", "modelling/mass-on-a-bar"]
+)
+def test_a_notebook_and_the_axes_show_the_same(name):
+    loaded = pbdkit.load(name)
+    ax = plot_experiment(loaded, dpi=60)
+    words = {text.get_text() for legend in figure_of(ax).legends for text in legend.get_texts()}
+    named = [said for _, said in picture_of(build_scene(loaded)).legend]
+    assert {w for text in words for w in text.split(", ")} == {*named}
+
+
+def test_the_set_up_is_drawn_into_axes_that_are_given():
+    given = Figure().subplots()
+    assert plot_experiment(pbdkit.load("paper/a"), ax=given) is given
+    assert given.get_title() == "paper/a"
+    assert given.get_legend() is not None
 
 
 def test_arrows_point_where_leaders_go():

@@ -44,7 +44,7 @@ GROUPS = {
         Listed("live", "live", "Steps an experiment in the browser, led by the mouse."),
     ),
     "Look": (
-        Listed("plot", "picture", "Draws a result: kinds of particles, or any variable."),
+        Listed("plot", "picture", "Draws a result, or the set-up of an experiment before it runs."),
         Listed("animate", "picture", "Makes a movie of a result."),
         Listed("curve", "curve", "Draws what changes: a curve, a history, the crack."),
         Listed("report", "report", "Makes one page to share: its motion, curves, all else."),

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from pbdkit.cli.options import PATH, color_option, result_argument, times_option
+from pbdkit.cli.options import PATH, color_option, result_argument, set_option, times_option
 
 LOOK = [
     color_option,
@@ -47,23 +47,39 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command()
-@result_argument("file")
+@result_argument("file", metavar="OUT.nc|EXPERIMENT")
 @click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
 @times_option
+@set_option
 @look_options
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
 @click.option("--dpi", type=int, default=200, show_default=True, help="Pixels an inch.")
 @force_option
 def plot(
-    file: Path, output: Path | None, times: tuple[float, ...], force: bool, **look: Any
+    file: Path,
+    output: Path | None,
+    times: tuple[float, ...],
+    settings: tuple[str, ...],
+    force: bool,
+    **look: Any,
 ) -> None:
-    """Draw configurations of a result: kinds, or a variable as dots, bonds or a field."""
+    """Draw configurations of a result: kinds, or a variable as dots, bonds or a field.
+
+    Of an experiment, draw the set-up before it runs, to NAME-setup.png: the body, supports, motions
+    and loads.
+    """
     from pbdkit.cli.output import refuse_output, refuse_unwritable, save
     from pbdkit.drawing.picture import plot as draw
-    from pbdkit.results.other_files import refuse_other_file
+    from pbdkit.errors import ExperimentError
+    from pbdkit.results.other_files import is_experiment, refuse_other_file
     from pbdkit.results.result_file import reading
 
+    if is_experiment(file):
+        _plot_set_up(str(file), output, settings, force=force, look={"times": times} | look)
+        return
     refuse_other_file(file)
+    if settings:
+        raise ExperimentError(f"--set: changes an experiment, and {file} is a result")
     path = output or file.with_suffix(".png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
@@ -72,6 +88,32 @@ def plot(
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
         save(path, figure_of(axes[0] if isinstance(axes, list) else axes))
+
+
+def _plot_set_up(
+    name: str, output: Path | None, settings: tuple[str, ...], *, force: bool, look: dict[str, Any]
+) -> None:
+    """Draw an experiment before it runs. Raises ExperimentError for options of results."""
+    from pbdkit.api import load
+    from pbdkit.cli.output import refuse_output, refuse_unwritable, save
+    from pbdkit.drawing.picture import plot_experiment
+    from pbdkit.errors import ExperimentError
+
+    size, dpi = look.pop("size"), look.pop("dpi")
+    words = {"filled": "field", "times": "time"}
+    if asked := [words.get(k, k) for k, value in look.items() if value not in (None, False, ())]:
+        raise ExperimentError(
+            f"--{asked[0]}: is for results; {name} is an experiment, of which the set-up is drawn; "
+            f"`pbdkit run {name}` makes a result of it"
+        )
+    experiment = load(name, settings=settings)
+    path = output or Path(f"{experiment.name.replace('/', '-')}-setup.png")
+    refuse_output(path, force=force)
+    refuse_unwritable(path)
+    axes = plot_experiment(experiment, size=size, dpi=dpi)
+    from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
+
+    save(path, figure_of(axes))
 
 
 @click.command()

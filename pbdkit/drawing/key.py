@@ -117,10 +117,9 @@ class ScaleBar:
 class Legend:
     """Names and colours, below the panels."""
 
-    def __init__(self, figure: Figure, palette: Palette, present: set[int]) -> None:
-        self._figure = figure
+    def __init__(self, figure: Figure, handles: list[Line2D]) -> None:
+        self._figure, self._handles = figure, handles
         self.beside = False
-        self._handles = legend_handles(palette, present)
         self.size = (0.0, 0.0)
         self._legend: Any = None
 
@@ -165,7 +164,12 @@ def shortened(figure: Figure, text: str, points: float, width: float) -> str:
 def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
     """A dot with its name for each class that is there."""
     return [
-        Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
+        handle(name, colour)
         for number, (name, colour) in reversed(palette.colours.items())
         if number in present
     ]
+
+
+def handle(name: str, colour: str) -> Line2D:
+    """A dot with a name."""
+    return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)

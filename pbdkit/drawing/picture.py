@@ -1,4 +1,5 @@
-"""Pictures of a dataset's configurations: kinds, or a variable as dots, bonds or a field."""
+"""Pictures of a dataset's configurations: kinds, or a variable as dots, bonds or a field; and of an
+experiment before it runs."""
 
 from __future__ import annotations
 
@@ -14,6 +15,8 @@ from pbdkit.registry.extras import refuse_no_matplotlib
 if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
+
+    from pbdkit.experiment.model import Experiment
 
 
 def plot(
@@ -56,3 +59,30 @@ def plot(
         if chosen.numbers:
             sheet.number(panel.ax, now)
     return sheet.axes if several else sheet.axes[0]
+
+
+def plot_experiment(
+    experiment: Experiment,
+    *,
+    ax: Axes | None = None,
+    size: tuple[float, float] | None = None,
+    dpi: int = 200,
+) -> Axes:
+    """Draw the set-up of an experiment before it runs, and return the axes.
+
+    The picture shows the body with its frame and regions, supports and leaders, loads, obstacles,
+    cracks and cuts. Arrows are as long in proportion to each other as motions and forces are.
+    Coordinates are in mm where the experiment has `units`. `ax` are axes to draw into; without them
+    a figure is made, of that `size` in inches, with so many `dpi`.
+
+    Raises ExperimentError where there is no such scene, where space is no plane, and where
+    matplotlib is missing.
+    """
+    refuse_no_matplotlib()
+    from pbdkit.drawing.scene_axes import draw_on_axes
+    from pbdkit.scene.scene import build_scene
+
+    look, scene = Look(size=size, dpi=dpi), build_scene(experiment)
+    if scene.axes != 2:
+        raise ExperimentError(f"pictures are of the plane, and this lattice has {scene.axes} axes")
+    return draw_on_axes(scene, look, ax)

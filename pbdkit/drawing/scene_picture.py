@@ -1,11 +1,14 @@
-"""A scene before it runs, as SVG: the body, who leads, what acts on it and what is in its way."""
+"""A scene before it runs: the body, who leads, what acts on it and what is in its way.
+
+Shapes are drawn on a canvas: the SVG of a notebook, or axes of matplotlib (`scene_axes.py`).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,48 +35,94 @@ of a group; by so much of the body's size the picture goes beyond it to show obs
 Rows = NDArray[np.intp]
 
 
+Legend = tuple[tuple[str, str], ...]
+"""What colours mean: (colour, words)."""
+
+
+class Canvas(Protocol):
+    """What a scene is drawn on: places are in lattice units, sizes and widths in pixels, of which
+    `scale` make a lattice unit; the picture reaches from the corner `low` to `high`."""
+
+    scale: float
+    low: Floats
+    high: Floats
+
+    def dots(
+        self, places: Floats, size: float, colour: str, *, square: bool = ..., opacity: float = ...
+    ) -> None:
+        """Draw dots of one size."""
+
+    def line(self, places: Floats, colour: str, width: float, dashes: str = ...) -> None:
+        """Draw a line from place to place."""
+
+    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+        """Fill what lies between closed outlines: an inner one is a hole."""
+
+    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+        """Draw an arrow from a place, by so many pixels, y up."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """The element to be shown, and what its colours mean: (colour, words)."""
 
     svg: str
-    legend: tuple[tuple[str, str], ...]
+    legend: Legend
 
 
 def picture_of(scene: Scene) -> Picture | None:
-    """The picture of a scene in a plane; None in space. Arrows show where to and how far in
-    proportion to each other, not to the body."""
+    """Return the picture of a scene in a plane as SVG; None in space."""
     if scene.axes != 2:
         return None
-    drawing = _Drawing(scene)
+    svg = Svg(*corners(scene), WITHIN, MARGIN)
+    legend = draw_scene(scene, svg)
+    return Picture(svg.text(f"the scene of {scene.experiment.name}"), legend)
+
+
+def draw_scene(scene: Scene, canvas: Canvas) -> Legend:
+    """Draw a scene in a plane, and return what its colours mean. Arrows show where to and how far
+    in proportion to each other, not to the body."""
+    drawing = _Drawing(scene, canvas)
     drawing.draw()
-    return Picture(drawing.svg.text(f"the scene of {scene.experiment.name}"), tuple(drawing.legend))
+    return tuple(drawing.legend)
+
+
+def corners(scene: Scene) -> tuple[Floats, Floats]:
+    """Return the lower left and the upper right corner of what a picture of a scene shows."""
+    shown = _shown(scene)
+    return _with_obstacles(scene.barriers, shown.min(axis=0), shown.max(axis=0))
+
+
+def _is_small(scene: Scene) -> bool:
+    return int(np.count_nonzero(scene.raster.table_kind == FOLLOWER)) <= DOTS
+
+
+def _shown(scene: Scene) -> Floats:
+    """The particles of a small body and its frame, and of a large body alone."""
+    X = scene.raster.reference()
+    return X if _is_small(scene) else X[scene.raster.table_kind == FOLLOWER]
 
 
 class _Drawing:
     """One picture in the making."""
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.legend = scene, list[tuple[str, str]]()
+    def __init__(self, scene: Scene, canvas: Canvas) -> None:
+        self.scene, self.canvas, self.legend = scene, canvas, list[tuple[str, str]]()
         self.X = scene.raster.reference()
         self.body = scene.raster.table_kind == FOLLOWER
-        self.few = int(self.body.sum()) <= DOTS
-        inside = self.X if self.few else self.X[self.body]
-        low, high = inside.min(axis=0), inside.max(axis=0)
-        self.middle = (low + high) / 2
-        low, high = _with_obstacles(scene.barriers, low, high)
-        self.svg = Svg(low, high, WITHIN, MARGIN)
-        self.dot = min(max(0.5 * spacing(scene.raster) * self.svg.scale, 1.2), 7.0)
+        self.few, shown = _is_small(scene), _shown(scene)
+        self.middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        self.dot = min(max(0.5 * spacing(scene.raster) * canvas.scale, 1.2), 7.0)
 
     def draw(self) -> None:
         """From what lies below to what must be seen."""
         self._regions()
         self._obstacles()
         if self.few:
-            self._tell(self.svg.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame")
+            self._tell(self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame")
         shown = self.body if self.few else edge_of(self.scene.raster)
         colour, said = (BODY, "body") if self.few else (OUTLINE, "edge of the body")
-        self._tell(self.svg.dots, self.X[shown], self.dot, colour, said)
+        self._tell(self.canvas.dots, self.X[shown], self.dot, colour, said)
         self._cuts()
         self._leaders()
         self._loads()
@@ -93,30 +142,25 @@ class _Drawing:
         for n, (name, shape) in enumerate(self.scene.experiment.regions.items()):
             inside = at[signed_distance(shape, cell, *at.T) <= 0.0]
             step = 1 + len(inside) // TINTED
-            size = spacing(self.scene.raster) * self.svg.scale * math.sqrt(step)
+            size = spacing(self.scene.raster) * self.canvas.scale * math.sqrt(step)
             colour = TINTS[n % len(TINTS)]
-            self.svg.dots(inside[::step], size, colour, square=True, opacity=0.45)
+            self.canvas.dots(inside[::step], size, colour, square=True, opacity=0.45)
             self._note(colour, f"region {name}")
 
     def _obstacles(self) -> None:
         for barrier in self.scene.barriers:
-            self.svg.filled(_outlines(barrier.start, *self._corners()), "#E3E3E3", STANDS)
+            self.canvas.filled(
+                _outlines(barrier.start, self.canvas.low, self.canvas.high), "#E3E3E3", STANDS
+            )
             self._note(STANDS, "obstacle")
-
-    def _corners(self) -> tuple[Floats, Floats]:
-        """The lower left and upper right corners of the picture, in coordinates."""
-        size = np.array([self.svg.width, self.svg.height]) / self.svg.scale
-        low = -(self.svg.at(np.zeros(2)) * (1.0, -1.0)) / self.svg.scale
-        low[1] -= size[1]
-        return low, low + size
 
     def _cuts(self) -> None:
         experiment = self.scene.experiment
         for crack in getattr(experiment.fracture, "cracks", ()):
-            self.svg.line(np.array(crack), CUT, 2.2)
+            self.canvas.line(np.array(crack), CUT, 2.2)
             self._note(CUT, "crack")
         for cut in experiment.cuts:
-            self.svg.line(np.array(cut.segment), CUT, 2.2, "5 4" if cut.at else "")
+            self.canvas.line(np.array(cut.segment), CUT, 2.2, "5 4" if cut.at else "")
             self._note(CUT, f"cut at step {cut.at}" if cut.at else "cut")
 
     @property
@@ -130,7 +174,7 @@ class _Drawing:
         longest = self._longest
         for barrier in self.scene.barriers:
             way = extreme(barrier.group.motion, barrier.reference, self.scene.experiment.steps)
-            ring = np.concatenate(_outlines(barrier.start, *self._corners()))
+            ring = np.concatenate(_outlines(barrier.start, self.canvas.low, self.canvas.high))
             nearest = ring[np.argmin(np.hypot(*(ring - self.middle).T))]
             self._arrows(nearest[None], way.mean(axis=0, keepdims=True), longest, DRIVEN)
         for leading in self.scene.leading:
@@ -139,7 +183,7 @@ class _Drawing:
             said = "mass" if isinstance(motion, Newton) else "held" if held else "led"
             if leading.group.axes:
                 said += f" along {' and '.join(leading.group.axes)} only"
-            self.svg.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=held)
+            self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=held)
             self._note(colour, said)
             ways = np.zeros((len(leading.rows), 2)) + extreme(
                 motion, leading.reference, self.scene.experiment.steps
@@ -163,15 +207,15 @@ class _Drawing:
 
     def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
         """At some of the places, from them outwards or, into the body, towards them."""
-        extent = float(np.ptp(at, axis=0).max()) * self.svg.scale
+        extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / APART), 1), ARROWS)
         ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
         some = np.unique(ends.round().astype(int))
         for place, way in zip(at[some], ways[some], strict=True):
             pixels = _pixels(way, longest)
             inwards = float((self.middle - place) @ way) > 1e-9 * float(np.hypot(*way))
-            tail = place - pixels / self.svg.scale if inwards else place
-            self.svg.arrow(tail, pixels, colour)
+            tail = place - pixels / self.canvas.scale if inwards else place
+            self.canvas.arrow(tail, pixels, colour)
 
 
 def _pixels(way: Floats, longest: float) -> Floats:

@@ -162,7 +162,8 @@ class Sheet:
         if page:
             bar = ScaleBar(page.figure, scale, text) if scale else None
             present = set(self._extent.kinds if of_kinds else self._extent.classes)
-            legend = Legend(page.figure, palette, present) if palette else None
+            handles = legend_handles(palette, present) if palette else []
+            legend = Legend(page.figure, handles) if palette else None
             page.arrange(bar, legend, self._larger)
             return
         if scale:

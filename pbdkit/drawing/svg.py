@@ -16,7 +16,8 @@ HEAD = 7.0
 
 class Svg:
     """A picture of the coordinates from `low` to `high` within so many pixels, `margin` around
-    them; y goes up. Shapes stand in the order in which they are added."""
+    them: with it the picture reaches from `self.low` to `self.high`. y goes up. Shapes stand in the
+    order in which they are added."""
 
     def __init__(
         self, low: Floats, high: Floats, within: tuple[float, float], margin: float
@@ -25,6 +26,8 @@ class Svg:
         self.scale = float(((np.array(within) - 2.0 * margin) / size).min())
         self.width, self.height = (float(s) for s in size * self.scale + 2.0 * margin)
         self._origin = np.array([margin - low[0] * self.scale, margin + high[1] * self.scale])
+        self.low: Floats = self._origin * (-1.0, 1.0) / self.scale - (0.0, self.height / self.scale)
+        self.high: Floats = self.low + np.array([self.width, self.height]) / self.scale
         self._shapes: list[str] = []
 
     def at(self, places: Floats) -> Floats:

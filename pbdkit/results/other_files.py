@@ -12,6 +12,8 @@ from pbdkit.results.trial import BEGINNINGS
 from pbdkit.storage.run_files import STORE
 
 TEXTS = (".yaml", ".yml", ".json")
+FAULTY = "faulty"
+"""The kind of what is no text, or of a text at fault."""
 
 
 def refuse_other_file(path: Path) -> None:
@@ -29,20 +31,38 @@ def other_file(path: Path) -> str:
     if not path.is_file():
         known = path.as_posix() in shipped_names()
         return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * known
-    try:
-        with path.open("rb") as file:
-            if file.read(8).startswith(BEGINNINGS):
-                return ""
-        source = read_file(path)
-    except OSError:
+    kind = _kind_of_text(path)
+    if kind is None:
         return ""
-    except ExperimentError:  # no text, or text that is at fault
+    if kind == FAULTY:
         return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
-    kind = kind_of(source.data)
     if kind == EXPERIMENT:
         return f"is an experiment; `pbdkit run {path}` makes a result of it, and says where"
     takes = f"is {kind}, no result; {what_takes(kind, str(path))}"
     return takes if kind else "is no result: those end in .nc"
+
+
+def is_experiment(path: Path) -> bool:
+    """Return whether a path leads to an experiment, in a file or shipped: one that cannot be read
+    is told by its name."""
+    if not path.is_file():
+        return path.as_posix() in shipped_names()
+    kind = _kind_of_text(path)
+    return kind == EXPERIMENT or (kind == FAULTY and path.suffix in TEXTS)
+
+
+def _kind_of_text(path: Path) -> str | None:
+    """What a text describes, FAULTY where it is no text of YAML; None for results, and what cannot
+    be read."""
+    try:
+        with path.open("rb") as file:
+            if file.read(8).startswith(BEGINNINGS):
+                return None
+        return kind_of(read_file(path).data)
+    except OSError:
+        return None
+    except ExperimentError:  # no text, or text that is at fault
+        return FAULTY
 
 
 def refuse_store(path: Path) -> None:
