@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from pbdkit.lazy_accessor import register_accessor
+
 TYPE_CHECKING = False  # to load `typing` takes longer than all that is here
 if TYPE_CHECKING:
     from typing import Any
@@ -136,3 +138,4 @@ def __dir__() -> list[str]:
 
 
 __all__ = sorted(_MODULE_OF)
+register_accessor()

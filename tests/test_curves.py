@@ -178,7 +178,7 @@ def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({}, "of which particle? Say particle=67, or i=4, j=5"),
+        ({}, "no particle is given; write history('u', particle=67), or i=4, j=5"),
         ({"particle": 999}, "there is no particle 999; there are 56"),
         ({"particle": 3, "i": 1}, "by number or by i and j, not by both"),
         ({"i": 77, "j": 1}, "there is no particle at i=77, j=1"),
@@ -266,6 +266,8 @@ def test_energies_are_sums_over_the_body(torn, pulled):
 def test_any_number_over_another(torn, pulled):
     (line,) = drawn(torn.pbd.curve(y="broken_bonds"))
     np.testing.assert_array_equal(line, [torn.time, torn.broken_bonds])
+    (alone,) = drawn(torn.pbd.curve("broken_bonds"))
+    np.testing.assert_array_equal(alone, line)
     (line,) = drawn(torn.pbd.curve("broken_bonds", "pe2"))
     np.testing.assert_allclose(line[1], torn.pe2.where(torn.role == 0).mean("particle"), rtol=1e-12)
     (line,) = drawn(pulled.pbd.curve("strain_energy", "reaction_x", group=1))
@@ -302,7 +304,6 @@ def test_maps_of_cracks_keep_their_legend_within_given_axes(torn):
             {"kind": "speed"},
             "there is no curve 'speed'; there are stress-strain, load-displacement",
         ),
-        ({"x": "pe1"}, "what is to be drawn over 'pe1'? Say y"),
         ({"y": "pe1", "kind": "energies"}, "give y or the kind 'energies', not both"),
         ({"y": "position"}, "'position' is a vector; take one of 'position_x', 'position_y'"),
         ({"y": "strain_energy"}, "add {type: strain-energy, youngs_modulus: ...} to `diagnostics`"),

@@ -19,7 +19,7 @@ from pbdkit.drawing.look import Look
 from pbdkit.drawing.movie import Moving
 from pbdkit.drawing.recording import Recording
 
-SMALL = {"size": (3.01, 2.47), "dpi": 61}
+SMALL = {"figsize": (3.01, 2.47), "dpi": 61}
 """Of an odd number of pixels either way, as it is given."""
 
 
@@ -48,7 +48,7 @@ def frames_of(path):
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_every_recorded_step_is_there(torn, tmp_path, suffix):
     shares, path = [], tmp_path / f"torn{suffix}"
-    torn.pbd.animate(path, "pe1_intact", show=lambda what, share: shares.append(share), **SMALL)
+    torn.pbd.animate("pe1_intact", path, show=lambda what, share: shares.append(share), **SMALL)
     frames = frames_of(path).astype(int)
     assert frames.shape == (25, 152, 184, 3)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
@@ -73,7 +73,7 @@ def test_a_frame_is_the_picture_of_its_step(torn):
 
 
 def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
-    torn.pbd.animate(tmp_path / "some.gif", every=10, **SMALL)
+    torn.pbd.animate(file=tmp_path / "some.gif", every=10, **SMALL)
     assert len(frames_of(tmp_path / "some.gif")) == 4  # 0, 10, 20 and 24
 
 
@@ -83,14 +83,13 @@ def test_some_steps_only_and_the_last_in_any_case(torn, tmp_path):
         ("torn.avi", {}, "torn.avi: a movie ends in .mp4 or .gif"),
         ("torn.gif", {"fps": 100.0}, "fps: 100 is not between 0.1 and 50"),
         ("torn.gif", {"every": 0}, "every: 0 is below 1; 1 shows all recorded steps"),
-        ("torn.mp4", {"numbers": True}, "numbers are for pictures of one step"),
         ("torn.mp4", {"color": "pe3"}, "'pe3' cannot be drawn; did you mean"),
     ],
 )
 def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ExperimentError) as refused:
-        torn.pbd.animate(name, **look)
+        torn.pbd.animate(file=name, **look)
     assert message in str(refused.value)
     assert [*tmp_path.iterdir()] == []
 
@@ -99,13 +98,13 @@ def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
     monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda name: None)
     for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
         with pytest.raises(ExperimentError) as refused:
-            torn.pbd.animate(tmp_path / name)
+            torn.pbd.animate(file=tmp_path / name)
         assert f"need {missing}: pip install 'pbdkit[movie]'" in str(refused.value)
 
 
 def test_a_movie_that_cannot_be_written_leaves_nothing(torn, tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="there is no folder"):
-        torn.pbd.animate(tmp_path / "none" / "torn.gif", **SMALL)
+        torn.pbd.animate(file=tmp_path / "none" / "torn.gif", **SMALL)
     shown = []
 
     def stop(what, share):
@@ -116,7 +115,7 @@ def test_a_movie_that_cannot_be_written_leaves_nothing(torn, tmp_path, monkeypat
     path = tmp_path / "torn.mp4"
     path.write_text("mine")
     with pytest.raises(KeyboardInterrupt):
-        torn.pbd.animate(path, show=stop, **SMALL)
+        torn.pbd.animate(file=path, show=stop, **SMALL)
     assert [p.name for p in tmp_path.iterdir()] == ["torn.mp4"]
     assert path.read_text() == "mine"
 
@@ -139,6 +138,6 @@ def test_notebooks_have_an_animation_of_no_more_than_sixty_steps(torn):
     from matplotlib.animation import FuncAnimation
 
     many = torn.isel(time=np.repeat(np.arange(25), 3)).assign_coords(time=np.arange(75))
-    moving = many.pbd.animation("pe1_intact", size=(3, 2), dpi=40)
+    moving = many.pbd.animation("pe1_intact", figsize=(3, 2), dpi=40)
     assert isinstance(moving, FuncAnimation)
     assert moving.to_jshtml().count("data:image/png") == 60

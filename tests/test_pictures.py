@@ -120,8 +120,8 @@ LOOKS = {
     "kinds": {},
     "a field or dots": {"color": "u_x"},
     "13 panels": {"color": "u", "time": range(13)},
-    "bonds in a given size": {"color": "broken_step", "size": (4.0, 9.0)},
-    "two in a given size": {"time": [0, 12], "size": (7.0, 6.5)},
+    "bonds in a given size": {"color": "broken_step", "figsize": (4.0, 9.0)},
+    "two in a given size": {"time": [0, 12], "figsize": (7.0, 6.5)},
     "numbers": {"numbers": True},
 }
 TRIED = [(name, look) for name in MADE for look in LOOKS if name not in ("50 x 50", "ring")]
@@ -140,7 +140,7 @@ def test_nothing_is_clipped_or_overprinted(bodies, name, look, monkeypatch):
 
 def test_units_make_labels_no_longer_than_there_is_room(monkeypatch):
     strip = pbdkit.run("modelling/strip", progress=False)
-    axes = plot(strip, None, "stress_xx")
+    axes = plot(strip, "stress_xx")
     assert faults(figure_of(axes), monkeypatch) == []
     assert axes.get_title() == "modelling/strip, step 1"
     said = " ".join(" ".join(text.split()) for text, _ in drawn_texts(axes.figure, monkeypatch))
@@ -157,26 +157,26 @@ def image_of(ax):
 def test_fields_of_both_signs_are_neutral_at_zero(bodies):
     ds = bodies("50 x 50")
     signed = ds.assign(stress_xx=ds.pe1 - 0.3 * float(ds.pe1.max()))
-    image = image_of(plot(signed, None, "stress_xx"))
+    image = image_of(plot(signed, "stress_xx"))
     low, high = image.get_clim()
     assert low == -high
     assert image.cmap.name == "RdBu_r" or np.allclose(image.cmap(0.5)[:3], 0.97, atol=0.01)
-    one = image_of(plot(signed, None, "stress_xx", range=(-0.1, 0.3)))
+    one = image_of(plot(signed, "stress_xx", vmin=-0.1, vmax=0.3))
     assert one.get_clim() == (-0.1, 0.3)
     neutral = one.cmap(one.norm(0.0))
     assert np.allclose(neutral[:3], 0.97, atol=0.02)
-    above = image_of(plot(ds, None, "pe1"))
-    below = image_of(plot(ds.assign(pe1=-ds.pe1), None, "pe1"))
+    above = image_of(plot(ds, "pe1"))
+    below = image_of(plot(ds.assign(pe1=-ds.pe1), "pe1"))
     assert (above.get_clim()[0], below.get_clim()[1]) == (0.0, 0.0)
     assert above.cmap(0.0) == below.cmap(1.0)
 
 
 def test_all_panels_have_one_scale_and_one_place(torn):
-    axes = plot(torn, [0, 10, 400], "pe1_intact")
+    axes = plot(torn, "pe1_intact", [0, 10, 400])
     assert len({ax.collections[-1].get_clim() for ax in axes}) == 1
     assert len({(ax.get_xlim(), ax.get_ylim()) for ax in axes}) == 1
     assert [ax.get_title() for ax in axes] == ["step 0", "step 10", "step 400"]
-    given = plot(torn, [0, 400], "pe1_intact", range=(0.0, 5.0), map="magma")
+    given = plot(torn, "pe1_intact", [0, 400], vmin=0.0, vmax=5.0, cmap="magma")
     assert {ax.collections[-1].get_clim() for ax in given} == {(0.0, 5.0)}
     assert {ax.collections[-1].get_cmap().name for ax in given} == {"magma"}
 
@@ -184,7 +184,7 @@ def test_all_panels_have_one_scale_and_one_place(torn):
 def test_every_panel_shows_something():
     """At the last step of a sheet that came to rest there is next to nothing to see in colour."""
     sheet = pbdkit.run("paper/a", progress=False)
-    for ax in plot(sheet, [10, 400], "pe1", contours=True):
+    for ax in plot(sheet, "pe1", [10, 400], contours=True):
         pixels = image_of(ax).get_array()
         assert np.isfinite(np.ma.filled(pixels, np.nan)).mean() > 0.3
 
@@ -202,7 +202,7 @@ def test_every_panel_shows_something():
 )
 def test_colours_are_values(bodies, color, expected, said):
     ds = bodies("50 x 50")
-    ax = plot(ds, 6, color, filled=False)
+    ax = plot(ds, color, 6, filled=False)
     dots = next(c for c in ax.collections if isinstance(c, PathCollection))
     order = np.argsort([*map({2: 0, 1: 1, 0: 2}.get, ds.kind.sel(time=6).values)], kind="stable")
     wanted = np.asarray(expected(ds.sel(time=6)), float)[order]
@@ -214,12 +214,12 @@ def test_colours_are_values(bodies, color, expected, said):
 
 def test_bonds_show_when_they_broke_and_those_that_did_are_dashed(torn):
     shown = int(((torn.broken_step >= 0) & (torn.broken_step <= 8)).sum())
-    ax = plot(torn, 8, "broken_step")
+    ax = plot(torn, "broken_step", 8)
     whole_lines, values = (c for c in ax.collections if isinstance(c, LineCollection))
     assert len(values.get_segments()) == shown > 0
     assert len(whole_lines.get_segments()) == torn.sizes["bond"] - shown
     assert values.get_array().max() <= 8
-    kinds = plot(torn, 8, broken=True, outline=True)
+    kinds = plot(torn, time=8, broken=True, outline=True)
     dashed = [c for c in kinds.collections if isinstance(c, LineCollection)][1]
     assert len(dashed.get_segments()) == shown
     assert dashed.get_linestyle()[0][1] is not None
@@ -228,7 +228,7 @@ def test_bonds_show_when_they_broke_and_those_that_did_are_dashed(torn):
 def test_numbers_are_thinned_where_they_would_overprint(bodies, monkeypatch):
     few = {t for t, _ in drawn_texts(plot(bodies("few"), numbers=True).figure, monkeypatch)}
     assert {str(n) for n in bodies("few").number.values} <= few
-    ax = plot(bodies("200 x 6"), numbers=True, size=(7.0, 2.0))
+    ax = plot(bodies("200 x 6"), numbers=True, figsize=(7.0, 2.0))
     written = [t for t, _ in drawn_texts(ax.figure, monkeypatch) if t.isdigit()]
     assert 10 < len(written) < bodies("200 x 6").sizes["particle"] / 4
 
@@ -241,15 +241,21 @@ REFUSED = {
         "'pe1_intat' cannot be drawn; did you mean 'pe1_intact'? what can be drawn: position, ",
     ),
     "component": ({"color": "position_z"}, "did you mean 'position_"),
-    "not measured": ({"color": "u_x"}, "u is what {type: displacement} in `diagnostics` records"),
+    "not measured": ({"color": "u_x"}, "add {type: displacement} to `diagnostics`"),
     "of nothing": ({"color": "track"}, "'track' cannot be drawn"),
     "field of names": ({"contours": True}, "contours need numbers at particles as color"),
     "field of bonds": ({"color": "broken_step", "filled": True}, "contours need numbers at"),
     "dots and contours": ({"color": "pe1", "filled": False, "contours": True}, "to be dots"),
-    "range": ({"color": "pe1", "range": (2.0, 1.0)}, "range: from 2 to 1 is none; give LOW HIGH"),
-    "map": ({"color": "pe1", "map": "virids"}, "'virids' is no map of colours; did you mean"),
-    "size": ({"size": (0.0, 3.0)}, "size: is in inches, each above 0 and at most 100"),
-    "no room": ({"size": (0.4, 0.4)}, "size: 0.4 by 0.4 inches leave no room for 1 panels"),
+    "limits": (
+        {"color": "pe1", "vmin": 2.0, "vmax": 1.0},
+        "2 (vmin), is not below the upper one, 1",
+    ),
+    "map": ({"color": "pe1", "cmap": "virids"}, "'virids' is no map of colours; did you mean"),
+    "size": (
+        {"figsize": (0.0, 3.0)},
+        "a height in inches, each above 0 and at most 100; got (0.0, 3",
+    ),
+    "no room": ({"figsize": (0.4, 0.4)}, "figsize: 0.4 by 0.4 inches leave no room for 1 panels"),
     "dpi": ({"dpi": 5}, "dpi: 5 is not between 10 and 2400"),
     "axes": ({"time": [0, 1], "ax": []}, "2 steps need as many axes; 0 are given"),
 }
@@ -279,7 +285,7 @@ def test_what_has_no_places_is_refused(torn):
 
 def test_a_variable_that_says_nothing_of_itself_has_its_name(torn):
     silent = torn.assign(pe1=torn.pe1.assign_attrs(long_name="", units=""))
-    bar = silent.pbd.plot(color="pe1", range=(0.0, 1.0)).figure.axes[1]
+    bar = silent.pbd.plot(color="pe1", vmin=0.0, vmax=1.0).figure.axes[1]
     assert bar.get_ylabel() == "pe1"
 
 
@@ -340,14 +346,14 @@ def test_fields_end_at_the_outline_and_scales_are_of_what_lies_inside():
 def test_axes_are_drawn_into(torn):
     figure = Figure((8, 4), layout="constrained")
     axes = figure.subplots(1, 2)
-    assert plot(torn, [0, 400], "pe1", ax=axes)[0] is axes[0]
+    assert plot(torn, "pe1", [0, 400], ax=axes)[0] is axes[0]
     assert torn.pbd.plot(time=8, ax=Figure().add_subplot()).get_title() == "paper/f2, step 8"
     assert isinstance(torn.pbd.plot(time=[0, 8]), Figure)
 
 
 def test_two_runs_side_by_side_have_one_scale_and_one_place(torn):
     other = pbdkit.run("paper/f1", progress=False)
-    one, two = compare(torn, other, 8, "pe1_intact")
+    one, two = compare(torn, other, "pe1_intact", 8)
     assert one.get_xlim() == two.get_xlim()
     assert one.collections[-1].get_clim() == two.collections[-1].get_clim()
     assert [ax.get_title() for ax in (one, two)] == ["paper/f2, step 8", "paper/f1, step 8"]
@@ -434,5 +440,5 @@ def test_where_pyplot_is_in_use_figures_are_its_own(tmp_path):
     ax = ds.pbd.plot()
     assert ax.figure.number in plt.get_fignums()
     assert ds.pbd.history(particle=67).figure.number in plt.get_fignums()
-    ds.pbd.animate(tmp_path / "a.gif", every=2, dpi=40)
+    ds.pbd.animate(file=tmp_path / "a.gif", every=2, dpi=40)
     assert len(plt.get_fignums()) == before + 2

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pbdkit.cli.options import PATH, result_argument
+from pbdkit.errors import ExperimentError
 
 if TYPE_CHECKING:
     import xarray
@@ -85,6 +86,10 @@ def _drawn(
     from pbdkit.drawing.curve import curve
     from pbdkit.drawing.history import history
 
+    if x is not None and y is None:
+        raise ExperimentError(
+            f"--x {x}: no variable is given to be drawn over it; add --y VARIABLE"
+        )
     if kind in CRACKS:
         return crack(dataset, kind=CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +26,38 @@ LOOK = [
     click.option("--outline", is_flag=True, help="Draw the outline at rest."),
     click.option(
         "--range",
+        "limits",
         nargs=2,
         type=float,
         metavar="LOW HIGH",
         default=None,
         help="The values of the first and the last colour.",
     ),
-    click.option("--map", metavar="NAME", help="A colour map of matplotlib, e.g. magma."),
+    click.option("--map", "cmap", metavar="NAME", help="A colour map of matplotlib, e.g. magma."),
     click.option(
-        "--size", nargs=2, type=float, metavar="WIDTH HEIGHT", default=None, help="In inches."
+        "--size",
+        "figsize",
+        nargs=2,
+        type=float,
+        metavar="WIDTH HEIGHT",
+        default=None,
+        help="In inches.",
     ),
 ]
 force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
 
 
 def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What pictures and movies have in common, in the order of the help."""
+    """Add the options that pictures and movies have in common, in the order of the help."""
+
+    @wraps(command)
+    def with_limits(*args: Any, limits: tuple[float, float] | None, **more: Any) -> Any:
+        vmin, vmax = limits or (None, None)
+        return command(*args, vmin=vmin, vmax=vmax, **more)
+
     for option in reversed(LOOK):
-        command = option(command)
-    return command
+        with_limits = option(with_limits)
+    return with_limits
 
 
 @click.command()
@@ -84,7 +98,8 @@ def plot(
     refuse_output(path, force=force)
     refuse_unwritable(path)
     with reading(file) as dataset:
-        axes = draw(dataset, times if len(times) > 1 else times[0] if times else None, **look)
+        time = times if len(times) > 1 else times[0] if times else None
+        axes = draw(dataset, time=time, **look)
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
         save(path, figure_of(axes[0] if isinstance(axes, list) else axes))
@@ -141,5 +156,5 @@ def animate(file: Path, output: Path | None, force: bool, **look: Any) -> None:
     refuse_output(path, force=force)
     refuse_unwritable(None, path)
     with reading(file) as dataset, progress_bar(sys.stderr.isatty()) as show:
-        write(dataset, path, show=show, **look)
+        write(dataset, file=path, show=show, **look)
     click.echo(f"{path} written")

@@ -45,7 +45,7 @@ DIRECTIONS = 180
 Array = NDArray[Any]
 
 
-def crack(dataset: xarray.Dataset, *, kind: Kind = "map", ax: Axes | None = None) -> Axes:
+def crack(dataset: xarray.Dataset, kind: Kind = "map", *, ax: Axes | None = None) -> Axes:
     """Draws what broke and returns the axes: the broken bonds on the body at rest, coloured by the
     step in which they broke (`map`); or over the steps the `length` of the longest crack, the
     largest distance between the middles of its bonds, or the number of broken `bonds`. What was

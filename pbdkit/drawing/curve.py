@@ -42,20 +42,21 @@ def curve(
     obstacle: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws a curve and returns its axes.
+    """Draw a curve and return its axes.
 
-    `kind` says which, by default the first that the dataset has; `x` and `y` name two variables
-    instead, one number a step each (`x` the time if it is None): a component as `reaction_x`, and
-    of what particles have the sum or mean. `group`, `load` and `obstacle` say of which one forces
-    are; without them of the one that goes farthest. Lengths, forces and energies are in mm, N and
-    mJ where the dataset says their scale. A dataset of a sweep has a line a member.
+    `kind` is which, by default the first that the dataset has. `curve(y)` draws a variable over
+    the time instead and `curve(x, y)` one over another, one number a step each: a component as
+    `reaction_x`, and of what particles have the sum or mean. `group`, `load` and `obstacle` choose
+    the one whose forces are drawn; without them it is the one that goes farthest. Lengths, forces
+    and energies are in mm, N and mJ where the dataset has their scale. A dataset of a sweep has a
+    line a member.
 
     Raises ExperimentError for what is not there, with the diagnostic that it takes, and where
     matplotlib is missing.
     """
     chosen = {"group": group, "load": load, "obstacle": obstacle}
-    if y is None and x is not None:
-        raise ExperimentError(f"what is to be drawn over '{x}'? Say y")
+    if y is None:
+        x, y = None, x
     if y is not None and kind is not None:
         raise ExperimentError(f"give y or the kind '{kind}', not both")
     if y is not None:

@@ -35,7 +35,7 @@ def history(
     bond: Sequence[int] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draws a variable of particles over the steps and returns the axes.
+    """Draw a variable of particles over the steps and return the axes.
 
     The particles are told by number, one or several, or by their site indices: `i` and `j` are one
     particle, one of them alone is a line of them. `name` is any variable of particles, a vector
@@ -108,7 +108,9 @@ def _numbers(
 def _of_particles(dataset: xarray.Dataset, name: str, numbers: list[int] | None) -> list[Followed]:
     dim = "tracked" if name.partition("_")[0] == "track" else "particle"
     if numbers is None and dim == "particle":
-        raise ExperimentError("of which particle? Say particle=67, or i=4, j=5")
+        raise ExperimentError(
+            f"history: no particle is given; write history('{name}', particle=67), or i=4, j=5"
+        )
     made = name.partition("_")[0] == "u" and "u" not in dataset.variables
     found = variable(dataset, name.replace("u", "position", 1) if made else name)
     if dim not in found.dims:

@@ -46,33 +46,57 @@ def silent(what: str, share: float) -> None:
 
 def animate(
     dataset: xarray.Dataset,
-    file: str | Path,
     color: str | None = None,
+    file: str | Path | None = None,
     *,
     fps: float = 25.0,
     every: int = 1,
     show: Show = silent,
-    **look: Any,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = DPI,
 ) -> None:
-    """Writes a movie of every recorded step (with `every`, of the first of each so many, and the
-    last), MP4 or GIF as the name ends, with `fps` of them a second.
+    """Write a movie of the recorded steps; the scale of colours is that of the whole run.
 
-    `color` is that of `plot`, and `look` are the options of `Look`; the scale of colours is that of
-    the whole run. `show` is told how far it is. The file appears whole or not at all. Raises
-    ExperimentError for what `plot` does and where what writes movies is missing, and StorageError
-    where the file cannot be written.
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of one run.
+    color : str, optional
+        What is drawn, as in `plot`.
+    file : path
+        MP4 or GIF, as the name ends. The file appears whole or not at all.
+    fps : float
+        Recorded steps a second.
+    every : int
+        Draw each so many recorded steps only, and the last.
+    show : callable
+        Called with what is done and the share that is done.
+
+    The other parameters are those of `plot`. Raises ExperimentError as `plot` does, and where what
+    writes movies is missing; StorageError where the file cannot be written.
     """
-    path = Path(file)
+    path = _movie_file(color, file)
     refuse_no_movie(path)
     if not 0.1 <= fps <= 240 or (path.suffix == ".gif" and fps > FASTEST_GIF):
         fastest = FASTEST_GIF if path.suffix == ".gif" else 240
         raise ExperimentError(f"fps: {fps:g} is not between 0.1 and {fastest}")
     if every < 1:
         raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
+    look = Look(
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
     recording = Recording(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
-    moving = Moving(recording, rows, _for_movies(look), show)
+    moving = Moving(recording, rows, look, show)
     frames = moving.frames(rows, show)
     with _appearing(path) as part:
         if path.suffix == ".gif":
@@ -82,16 +106,52 @@ def animate(
             _write_mp4(part, frames, fps)
 
 
-def animation(dataset: xarray.Dataset, color: str | None = None, **look: Any) -> FuncAnimation:
-    """The same as an animation of matplotlib, for notebooks: of longer runs 60 steps, evenly
-    chosen."""
+def _movie_file(color: str | None, file: str | Path | None) -> Path:
+    """Return the path of the movie. Raises ExperimentError where it stands for the variable."""
+    if file is not None and Path(str(color)).suffix not in FORMATS:
+        return Path(file)
+    if isinstance(color, str | Path) and Path(color).suffix in FORMATS:
+        variable = f"{str(file)!r}, " if file is not None else ""
+        raise ExperimentError(
+            f"animate: '{color}' is a file, and the variable comes first; write "
+            f"animate({variable}file={str(color)!r})"
+        )
+    named = f"{color!r}, " if color is not None else ""
+    raise ExperimentError(
+        f"animate: no file is given; write animate({named}file='movie.mp4'), or in a notebook "
+        f"animation({named.rstrip(', ')})"
+    )
+
+
+def animation(
+    dataset: xarray.Dataset,
+    color: str | None = None,
+    *,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = 80,
+) -> FuncAnimation:
+    """Return a movie as an animation of matplotlib, for notebooks.
+
+    Of longer runs it has 60 steps, evenly chosen. The parameters are those of `plot`.
+    """
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation
 
+    look = Look(
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
     recording = Recording(dataset, color or "kind")
     last = len(recording.steps) - 1
     rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
-    moving = Moving(recording, rows, _for_movies({"dpi": 80} | look), silent, alone=False)
+    moving = Moving(recording, rows, look, silent, alone=False)
     shown = [*recording.snapshots(rows)]
     return FuncAnimation(
         moving.sheet.figure, lambda n: moving.put(shown[n]), frames=len(shown), interval=80,
@@ -109,13 +169,6 @@ def refuse_no_movie(path: Path) -> None:
         refuse_without(module, "movie", f"movies need {name}")
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
-
-
-def _for_movies(look: dict[str, Any]) -> Look:
-    found = Look(**({"dpi": DPI} | look))
-    if found.numbers:
-        raise ExperimentError("numbers are for pictures of one step: leave them out of a movie")
-    return found
 
 
 class Moving:

@@ -89,8 +89,8 @@ class Page:
         plan = best_plan(count, self._shown.shape, room)
         if min(plan.width, plan.height) < SMALLEST_IN:
             raise ExperimentError(
-                f"size: {page[0]:g} by {page[1]:g} inches leave no room for {count} panels beside "
-                "what is written there; give a larger size, or fewer times"
+                f"figsize: {page[0]:g} by {page[1]:g} inches leave no room for {count} panels "
+                "beside what is written there; give a larger size, or fewer times"
             )
         return plan
 

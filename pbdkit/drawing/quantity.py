@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbdkit.drawing.labels import counted_in
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.results.layout import INDICES, broken_by
+from pbdkit.results.layout import INDICES, broken_by, makers_of
 
 if TYPE_CHECKING:
     import xarray
@@ -80,6 +80,11 @@ def component_of(dataset: xarray.Dataset, name: str) -> tuple[str, int | None]:
 def quantity_of(dataset: xarray.Dataset, name: str) -> Quantity:
     """The quantity of that name: a variable, its length where it is a vector, or `u_x`, the
     component along x of a vector `u`. Raises ExperimentError for what cannot be drawn."""
+    if not isinstance(name, str):
+        raise ExperimentError(
+            f"color: expected the name of a variable, such as 'pe1' or 'u_x', got {name!r}; a "
+            "recorded step is given as time=400"
+        )
     found = {str(n): v for n, v in dataset.variables.items() if _is_drawable(v)}
     axes = axes_of(dataset)
     variable, component = component_of(dataset, name)
@@ -106,17 +111,29 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> Quantity:
 def refuse_color(
     name: str, dataset: xarray.Dataset, found: Iterable[str], axes: Iterable[str]
 ) -> None:
-    """Raises ExperimentError that says what can be drawn instead."""
+    """Raise ExperimentError that names the diagnostic which makes the variable, or what can be
+    drawn instead."""
     known = [n for n in found if n in dataset.data_vars]
+    if makers := makers_of_missing(dataset, name):
+        raise ExperimentError(
+            f"'{name}' was not recorded, and cannot be drawn: add {' or '.join(makers)} to "
+            f"`diagnostics`, and run again; what can be drawn now: {', '.join(known)}"
+        )
     vectors = [n for n in (*known, *found) if "axis" in dataset[n].dims]
     parts = [f"{n}_{axis}" for n in vectors for axis in axes]
     near = did_you_mean(name, [*found, *parts]) or ";"
-    displaced = name in ("u", *(f"u_{axis}" for axis in axes))
-    measured = "; u is what {type: displacement} in `diagnostics` records" * displaced
     raise ExperimentError(
         f"'{name}' cannot be drawn{near} what can be drawn: {', '.join(known)}; of vectors, the "
-        f"length and components, as {parts[0]}{measured}"
+        f"length and components, as {parts[0]}"
     )
+
+
+def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
+    """Return the diagnostics that make the variable, or the vector of which it is a component, as
+    an experiment names them; none where it was recorded, or no diagnostic makes it."""
+    vector, _, axis = name.rpartition("_")
+    names = {name, vector} if axis in axes_of(dataset) else {name}
+    return [] if names & {*dataset.variables} else makers_of(names)
 
 
 def _is_drawable(variable: xarray.Variable) -> bool:

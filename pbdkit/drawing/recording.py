@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.drawing.labels import counted_in, label, plain
+from pbdkit.drawing.look import is_number
 from pbdkit.drawing.mesh import cells_of, whole
 from pbdkit.drawing.quantity import Quantity, quantity_of
 from pbdkit.errors import ExperimentError
@@ -136,6 +137,11 @@ class Recording:
         """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""
         if time is None:
             return len(self.steps) - 1
+        if not is_number(time):
+            raise ExperimentError(
+                f"time: expected a recorded step, such as {as_step(self.steps[-1])}, got {time!r}; "
+                "a variable is given as color='pe1'"
+            )
         exactly = self.steps.dtype.kind == "i"
         known = self.steps if exactly else np.array([as_step(step) for step in self.steps])
         rows = np.flatnonzero(known == (time if exactly else as_step(time)))

@@ -45,7 +45,7 @@ def scale_of(quantity: Quantity, values: tuple[float, float], look: Look, filled
     """The scale of a quantity whose values lie between these two.
 
     Where they have both signs, and zero is neutral, it reaches as far on either side, unless `look`
-    has a range: neutral is zero even then. Raises ExperimentError for a map that is not there.
+    has limits: neutral is zero even then. Raises ExperimentError for a map that is not there.
     """
     from matplotlib.colors import BoundaryNorm, Normalize
     from matplotlib.ticker import MaxNLocator
@@ -53,8 +53,15 @@ def scale_of(quantity: Quantity, values: tuple[float, float], look: Look, filled
     low, high = values
     far = max(abs(low), abs(high))
     both = quantity.is_signed and low < -NEARLY * far and high > NEARLY * far
-    if look.range is not None:
-        low, high = look.range
+    limited = look.vmin is not None or look.vmax is not None
+    if limited:
+        low = low if look.vmin is None else look.vmin
+        high = high if look.vmax is None else look.vmax
+        if not low < high:
+            raise ExperimentError(
+                f"no value lies between the limits of the colours: values are {values[0]:g} to "
+                f"{values[1]:g}; give both vmin and vmax"
+            )
         both = quantity.is_signed and low < 0.0 < high
     elif both:
         low, high = -far, far
@@ -64,12 +71,12 @@ def scale_of(quantity: Quantity, values: tuple[float, float], look: Look, filled
         high = 0.0
     elif high - low <= NEARLY * far:
         high = low + (far or 1.0)
-    name = look.map or (BOTH_SIGNS if both else FIELD if filled else DOTS)
-    if quantity.is_signed and low < high <= 0.0 and not look.map:
+    name = look.cmap or (BOTH_SIGNS if both else FIELD if filled else DOTS)
+    if quantity.is_signed and low < high <= 0.0 and not look.cmap:
         name += "_r"  # what is next to zero has the same colour on either side
     norm: Normalize = Normalize(low, high)
     if look.contours:
-        levels = MaxNLocator(LEVELS, symmetric=both and look.range is None).tick_values(low, high)
+        levels = MaxNLocator(LEVELS, symmetric=both and not limited).tick_values(low, high)
         norm, low, high = BoundaryNorm(levels, 256), float(levels[0]), float(levels[-1])
     beyond = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}
     slack = NEARLY * (high - low)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.drawing.labels import in_its_units
-from pbdkit.drawing.quantity import axes_of, component_of
+from pbdkit.drawing.quantity import axes_of, component_of, makers_of_missing
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.component import did_you_mean
-from pbdkit.results.layout import OF_BODY, makers_of
+from pbdkit.results.layout import OF_BODY
 
 if TYPE_CHECKING:
     import xarray
@@ -31,6 +31,8 @@ def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
 
     Raises ExperimentError where there is none of that name.
     """
+    if not isinstance(name, str):
+        raise ExperimentError(f"expected the name of a variable, such as 'pe1', got {name!r}")
     (whole, component), axes = component_of(dataset, name), axes_of(dataset)
     if whole not in dataset.variables:
         raise ExperimentError(_unknown(dataset, name, axes))
@@ -47,9 +49,10 @@ def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
         if values.dtype.kind in "biuf":
             parts = [f"{each}_{axis}" for axis in axes] if "axis" in values.dims else [str(each)]
             known += parts
-    makers = makers_of({name, name.rpartition("_")[0]})
-    if makers:
-        return f"there is no '{name}': add {' or '.join(makers)} to `diagnostics`, and run again"
+    if makers := makers_of_missing(dataset, name):
+        return (
+            f"'{name}' was not recorded: add {' or '.join(makers)} to `diagnostics`, and run again"
+        )
     near = did_you_mean(name, known) or ";"
     return f"there is no variable '{name}'{near} what there is: {', '.join(known)}"
 

@@ -82,7 +82,7 @@ class Sheet:
         self._quantity, self._body = first.quantity, first.body
         self._palette = palette_of(self._quantity) if self._quantity.words else None
         panels = Panels(extent.box, titles, heading, first.axis_labels)
-        self._page = Page(panels, look.dpi, look.size, alone=alone) if axes is None else None
+        self._page = Page(panels, look.dpi, look.figsize, alone=alone) if axes is None else None
         self.axes = self._page.axes if self._page else list(axes or [])
         self._larger = 1.0
         if self._page:

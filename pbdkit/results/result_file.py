@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,6 @@ def open(path: str | Path) -> xarray.Dataset:
     change that is met later, as values are read, raises StorageError too. Warns, with
     pbdkit.PbdkitWarning, of a file without a seal, which is first read once in another process.
     """
-    import_module("pbdkit.accessor")  # gives every dataset its `pbd`
     file = Path(path)
     left = _output_of(file)
     if not left:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,7 +81,6 @@ class MemorySink(Sink):
         """The dataset as in the file."""
         import xarray
 
-        import_module("pbdkit.accessor")  # gives every dataset its `pbd`
         variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
         coordinates = [c.name for c in self._columns if c.coordinate]
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)

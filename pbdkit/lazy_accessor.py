@@ -1,0 +1,60 @@
+"""Give every xarray.Dataset its `pbd` as soon as xarray is imported, without importing it."""
+
+from __future__ import annotations
+
+import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
+    import xarray
+
+    from pbdkit.accessor import PbdAccessor
+
+LIBRARY = "xarray"
+
+
+def register_accessor() -> None:
+    """Register `pbd` now if xarray is imported, and otherwise when it is."""
+    if LIBRARY in sys.modules:
+        _register(sys.modules[LIBRARY])
+    else:
+        sys.meta_path.insert(0, AccessorFinder())
+
+
+class AccessorFinder:
+    """Find xarray as the other finders do, and register the accessor after it was executed."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return the specification of xarray, and None for every other module."""
+        if name != LIBRARY:
+            return None
+        others = [finder for finder in sys.meta_path if finder is not self]
+        specs = (finder.find_spec(name, path, target) for finder in others)
+        spec = next((found for found in specs if found is not None), None)
+        if spec is None or spec.loader is None:
+            return spec
+        execute = spec.loader.exec_module
+
+        def execute_and_register(module: ModuleType) -> None:
+            execute(module)
+            _register(module)
+            sys.meta_path.remove(self)
+
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        return spec
+
+
+def _register(library: ModuleType) -> None:
+    library.register_dataset_accessor("pbd")(_accessor_of)
+
+
+def _accessor_of(dataset: xarray.Dataset) -> PbdAccessor:
+    from pbdkit.accessor import PbdAccessor
+
+    return PbdAccessor(dataset)
