@@ -114,8 +114,8 @@ def _plot_set_up(
     from pbdkit.drawing.picture import plot_experiment
     from pbdkit.errors import ExperimentError
 
-    size, dpi = look.pop("size"), look.pop("dpi")
-    words = {"filled": "field", "times": "time"}
+    figsize, dpi = look.pop("figsize"), look.pop("dpi")
+    words = {"filled": "field", "times": "time", "vmin": "range", "vmax": "range", "cmap": "map"}
     if asked := [words.get(k, k) for k, value in look.items() if value not in (None, False, ())]:
         raise ExperimentError(
             f"--{asked[0]}: is for results; {name} is an experiment, of which the set-up is drawn; "
@@ -125,7 +125,7 @@ def _plot_set_up(
     path = output or Path(f"{experiment.name.replace('/', '-')}-setup.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
-    axes = plot_experiment(experiment, size=size, dpi=dpi)
+    axes = plot_experiment(experiment, figsize=figsize, dpi=dpi)
     from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
     save(path, figure_of(axes))

@@ -105,7 +105,7 @@ def draw_on_axes(scene: Scene, look: Look, ax: Axes | None) -> Axes:
         ax.legend(handles=_handles(meanings), fontsize="small")
         return ax
     page = Page(
-        Panels((left, right, bottom, top), [title], "", labels), look.dpi, look.size, alone=True
+        Panels((left, right, bottom, top), [title], "", labels), look.dpi, look.figsize, alone=True
     )
     page.arrange(None, None)
     ax = page.axes[0]
