@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
@@ -14,6 +14,7 @@ from pbdkit.drawing.curve import curve
 from pbdkit.drawing.history import history
 from pbdkit.drawing.movie import animate, animation
 from pbdkit.drawing.picture import plot
+from pbdkit.results.carried import experiment_of
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.physical import in_physical_units
 from pbdkit.results.sites import indices_of, rows_at
@@ -21,6 +22,9 @@ from pbdkit.results.sites import indices_of, rows_at
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from pbdkit.experiment.model import Experiment
+    from pbdkit.interfaces import Component
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -64,6 +68,14 @@ class PbdAccessor:
     history = _method(history)
     curve = _method(curve)
     crack = _method(crack)
+
+    def experiment(self, components: Iterable[type[Component]] = ()) -> Experiment:
+        """Return the experiment that the dataset carries, which `pbdkit.rerun` runs again.
+
+        `components` are classes from Python, where it was run with such. Raises ExperimentError
+        where the dataset carries none.
+        """
+        return experiment_of(self._dataset, components)
 
     def at(self, **index: int) -> xarray.Dataset:
         """What stands at site indices: ``at(i=3, j=4)`` is one particle, as ``sel(particle=...)``

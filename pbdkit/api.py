@@ -8,9 +8,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import DivergedError, PbdkitWarning
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import with_setting
+from pbdkit.experiment.settings import Settings, with_settings
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
@@ -37,31 +37,65 @@ Given = Experiment | Mapping[str, Any] | str | Path
 """An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
 
-def load(
-    name: str | Path, *, components: Components = (), settings: Iterable[str] = ()
-) -> Experiment:
-    """The experiment in a YAML file, or the shipped one of that name, e.g. "paper/a".
+def load(name: str | Path, *, components: Components = (), settings: Settings = ()) -> Experiment:
+    """Return the experiment in a YAML file, or the shipped one of that name.
 
-    `settings` are changes such as "rule.K=-0.002"; `components` are classes from Python that the
-    experiment may name besides the installed ones. Raises ExperimentError and PluginError.
+    Parameters
+    ----------
+    name : str or path
+        A file, or the name of a shipped experiment, e.g. "paper/a".
+    components : iterable of classes
+        Classes from Python that the experiment may name besides the installed ones.
+    settings : mapping, or iterable of str
+        Values to change: ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or ``["steps=20",
+        "rule.relaxation=0.3"]``.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the file or a setting is wrong, or a plugin is missing or broken.
     """
-    source = read_experiment(str(name))
-    for setting in settings:
-        source = with_setting(source, setting, Experiment.defaults())
+    if not isinstance(name, str | Path):
+        raise ExperimentError(
+            f"load: expected a file or the name of a shipped experiment, {_but_got(name)}"
+        )
+    source = with_settings(read_experiment(str(name)), settings, Experiment.defaults())
     return Experiment.build(source, components)
 
 
-def run(experiment: Given, *, components: Components = (), progress: bool = True) -> xarray.Dataset:
-    """Runs an experiment and returns its dataset; nothing is written.
+def run(
+    experiment: Given,
+    *,
+    components: Components = (),
+    settings: Settings = (),
+    progress: bool = True,
+) -> xarray.Dataset:
+    """Run an experiment and return its dataset.
 
-    `experiment` may also be a dict, a file or the name of a shipped experiment. Raises
-    ExperimentError for a wrong experiment, PluginError for a missing or broken plugin, and
-    DivergedError, with what was recorded before, when the run leaves the finite numbers, has no
-    equilibrium, or comes apart on the way to one (status "separated"). Warns, with
-    pbdkit.PbdkitWarning, of what `pbdkit run` warns of: what is doubtful in the scene or can
-    diverge, and a last state that is inside out.
+    Parameters
+    ----------
+    experiment : Experiment, mapping, str or path
+        An experiment, a dict of its parts, a file or the name of a shipped one.
+    components, settings
+        As in `load`.
+    progress : bool
+        Show how far the run is.
+
+    Raises
+    ------
+    ExperimentError, PluginError
+        Where the experiment is wrong, or a plugin is missing or broken.
+    DivergedError
+        With what was recorded before, where the run leaves the finite numbers, has no equilibrium,
+        or comes apart on the way to one (status "separated").
+
+    Warns
+    -----
+    PbdkitWarning
+        As `pbdkit run` does, of what is doubtful in the scene or can diverge, and of a last state
+        that is inside out.
     """
-    return _run(as_experiment(experiment, components), progress)
+    return _run(as_experiment(experiment, components, settings), progress)
 
 
 def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
@@ -84,13 +118,15 @@ def _warn(texts: Iterable[str]) -> None:
         warnings.warn(text, PbdkitWarning, stacklevel=4)
 
 
-def analyse(experiment: Given, *, components: Components = ()) -> Analysis:
+def analyse(experiment: Given, *, components: Components = (), settings: Settings = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
-    return Analysis(tuned(build_scene(as_experiment(experiment, components))))
+    return Analysis(tuned(build_scene(as_experiment(experiment, components, settings))))
 
 
-def identify(experiment: Given, *, components: Components = ()) -> Identity:
+def identify(
+    experiment: Given, *, components: Components = (), settings: Settings = ()
+) -> Identity:
     """What the experiment's rule is physically, on its lattice and neighbours: diffusion or an
     elastic body, with its constants, from the rule's answer to plane waves.
 
@@ -99,7 +135,7 @@ def identify(experiment: Given, *, components: Components = ()) -> Identity:
     """
     from pbdkit.identity.identification import identified
 
-    first = next(iter(as_experiment(experiment, components).materials().values()))
+    first = next(iter(as_experiment(experiment, components, settings).materials().values()))
     return identified(tuned(build_scene(first)))
 
 
@@ -229,11 +265,38 @@ def fit_strength(
         raise DivergedError(str(error)) from None
 
 
-def as_experiment(given: Given, components: Components) -> Experiment:
-    """The experiment that is given in one of these ways."""
+def as_experiment(given: Given, components: Components, settings: Settings = ()) -> Experiment:
+    """Return the experiment that is given in one of these ways, with the settings."""
     if isinstance(given, Experiment):
         Registry(components)  # what is handed over is checked, needed or not
-        return given
-    if isinstance(given, Mapping):
-        return Experiment.build(Source(data=dict(given)), components)
-    return load(given, components=components)
+        given.refuse_unvalidated()
+        return given.with_settings(settings) if settings else given
+    if isinstance(given, str | Path):
+        return load(given, components=components, settings=settings)
+    if _is_dataset(given) or not isinstance(given, Mapping):
+        raise ExperimentError(f"expected an experiment, {_but_got(given)}")
+    source = with_settings(Source(data=dict(given)), settings, Experiment.defaults())
+    return Experiment.build(source, components)
+
+
+def _is_dataset(given: Any) -> bool:
+    return hasattr(given, "data_vars")
+
+
+def _but_got(given: Any) -> str:
+    """Return what was given in place of an experiment, and what takes or makes it."""
+    if _is_dataset(given):
+        return (
+            "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and "
+            "`ds.pbd.experiment()` returns it"
+        )
+    if isinstance(given, Experiment | Mapping):
+        return f"got {_kind(given)}, which needs no loading: `pbdkit.run` takes it as it is"
+    return (
+        f"got {_kind(given)}; give a file, the name of a shipped experiment as 'paper/a', a dict "
+        "of its parts, or a pbdkit.Experiment"
+    )
+
+
+def _kind(given: Any) -> str:
+    return "a class" if isinstance(given, type) else f"an object of type {type(given).__name__}"

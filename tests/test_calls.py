@@ -58,3 +58,105 @@ def test_one_limit_of_the_colours_leaves_the_other_to_the_values(ds):
     bar = ds.pbd.plot("pe1", vmax=7.0).figure.axes[1]
     lowest = float(ds.pe1.isel(time=-1).min())
     assert max(bar.get_xlim(), bar.get_ylim(), key=max) == pytest.approx((lowest, 7.0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"steps": 20, "solver": {"relaxation": 0.25}, "leaders": {0: {"until": 7}}},
+        {"steps": 20, "solver.relaxation": 0.25, "leaders.0.until": 7},
+        ["steps=20", "solver.relaxation=0.25", "leaders.0.until=7"],
+    ],
+)
+def test_settings_are_maps_or_texts_and_leave_all_else(settings):
+    plain = pbdkit.load("paper/a")
+    changed = pbdkit.load("paper/a", settings=settings)
+    assert (changed.steps, changed.solver.relaxation, changed.leaders[0].until) == (20, 0.25, 7)
+    assert (changed.rule, changed.leaders[1:]) == (plain.rule, plain.leaders[1:])
+    assert plain.with_settings(settings) == changed
+    assert pbdkit.analyse("paper/a", settings=settings).scene.experiment.steps == 20
+
+
+def test_a_map_with_a_type_replaces_the_part_and_a_component_does_too():
+    rule = {"type": "distance-weighted"}
+    other = pbdkit.load("paper/a", settings={"rule": rule}).rule
+    assert other.type == "distance-weighted"
+    assert pbdkit.load("paper/a", settings={"rule": other}).rule == other
+
+
+def test_a_dataset_returns_its_experiment(ds):
+    assert ds.pbd.experiment() == pbdkit.load("paper/a", settings=SMALL)
+
+
+def test_copies_with_other_parts_are_validated_when_they_run():
+    experiment = pbdkit.load("modelling/composite-plate")
+    again = experiment.model_copy(update={"seed": 3})
+    assert again.as_written()["seed"] == 3
+    assert not again.is_as_validated
+    wrong = experiment.record.model_copy(update={"every": -1})
+    for update, place in (({"steps": -5}, "steps: "), ({"record": wrong}, "record.every: ")):
+        with pytest.raises(pbdkit.ExperimentError, match=f"^{place}.*, got -"):
+            pbdkit.analyse(experiment.model_copy(update=update))
+
+
+LIST = "as {'steps': 20}, or a list of texts, as ['steps=20']"
+RESULT = (
+    "got a dataset, which is a result: `pbdkit.rerun(ds)` runs its experiment again, and `ds.pbd"
+)
+MISTAKES = {
+    "settings: key": (lambda ds: load(settings={"stepz": 20}), "settings: stepz", "'steps'"),
+    "settings: value": (lambda ds: load(settings={"steps": -2}), "settings: steps", "equal to 1"),
+    "settings: leader": (
+        lambda ds: load(settings={"leaders": {9: {"until": 3}}}), "'9' is no position in",
+    ),
+    "settings: text": (lambda ds: load(settings="steps"), "setting steps: expected PATH=VALUE"),
+    "settings: number": (lambda ds: load(settings=5), "settings: expected a map", LIST, "got 5"),
+    "settings: list": (lambda ds: load(settings=[5]), "got 5 in the list", LIST),
+    "run of a dataset": (lambda ds: pbdkit.run(ds), "expected an experiment", RESULT),
+    "identify of a dataset": (lambda ds: pbdkit.identify(ds), RESULT),
+    "sweep of a dataset": (lambda ds: pbdkit.sweep(ds), RESULT),
+    "load of a dataset": (lambda ds: pbdkit.load(ds), "load: expected a file or the name", RESULT),
+    "load of a dict": (lambda ds: pbdkit.load({}), "`pbdkit.run` takes it as it is"),
+    "run of a number": (lambda ds: pbdkit.run(5), "of type int", "shipped experiment as 'paper/a'"),
+    "run of a class": (lambda ds: pbdkit.run(pbdkit.FollowerRule), "got a class; give a file"),
+    "rerun of a file": (lambda ds: pbdkit.rerun("a.nc"), "pbdkit.open('a.nc') returns that of"),
+    "open of a dataset": (lambda ds: pbdkit.open(ds), "open: expected the path of a result"),
+    "concat of one": (lambda ds: pbdkit.concat(ds), "expected a list", "write concat([a, b])"),
+    "compare with a file": (lambda ds: ds.pbd.compare("b.nc"), "pbdkit.open('b.nc') returns that"),
+    "variable misspelt": (lambda ds: ds.pbd.plot("pe_1"), "'pe_1' cannot be drawn", "mean 'pe1'?"),
+    "variable not recorded": (
+        lambda ds: ds.pbd.plot("stress_xx"), "'stress_xx' was not recorded", "{type: stress,",
+    ),
+    "curve not recorded": (lambda ds: ds.pbd.curve("contact"), "add {type: contact"),
+    "component not recorded": (lambda ds: ds.pbd.plot("u_x"), "add {type: displacement}"),
+    "time first": (lambda ds: ds.pbd.plot(4, "pe1"), "color: expected the name", "as time=400"),
+    "variable as time": (lambda ds: ds.pbd.plot("pe1", "pe1"), "time: expected a recorded step"),
+    "no such step": (lambda ds: ds.pbd.plot("pe1", 3), "step 3 was not", "recorded: 2 and 4"),
+    "no such map": (lambda ds: ds.pbd.plot("pe1", cmap="virdis"), "'virdis'", "mean 'viridis'?"),
+    "one size": (lambda ds: ds.pbd.plot(figsize=5), "figsize: expected a width and a height in in"),
+    "limit": (lambda ds: ds.pbd.plot("pe1", vmin="a"), "vmin: expected a finite number, got 'a'"),
+    "limits": (lambda ds: ds.pbd.plot("pe1", vmin=2, vmax=1), "2 (vmin), is not below the upper"),
+    "file first": (lambda ds: ds.pbd.animate("a.gif", "pe1"), "write animate('pe1', file='a.gif')"),
+    "no file": (lambda ds: ds.pbd.animate("pe1"), "write animate('pe1', file='movie.mp4')"),
+    "no particle": (lambda ds: ds.pbd.history("pe1"), "write history('pe1', particle=67), or i=4"),
+    "particle first": (lambda ds: ds.pbd.history(67), "history: expected the name", "particle=67"),
+}  # fmt: skip
+
+
+def load(**more):
+    return pbdkit.load("paper/a", **more)
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_answered_with_place_cause_and_remedy(ds, name):
+    call, *words = MISTAKES[name]
+    with pytest.raises(pbdkit.PbdkitError) as caught:
+        call(ds)
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+def test_the_beginning_of_names_suggests_all_of_them(ds):
+    for draw in (ds.assign(heat_in=ds.pe1, heat_out=ds.pe1).pbd.plot, ds.assign(heat_in=ds.time,
+                 heat_out=ds.time).pbd.curve):  # fmt: skip
+        with pytest.raises(pbdkit.ExperimentError, match="mean 'heat_in' or 'heat_out'"):
+            draw("heat")

@@ -180,7 +180,7 @@ WRONG = {
     "no command at all": (2, ["qqqqqq"], "there is no command 'qqqqqq'; `pbdkit` alone lists them"),
     "unknown command": (2, ["rnu"], "there is no command 'rnu'; did you mean 'run'?"),
     "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
-    "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "--set steps=0: steps: "),
+    "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "setting steps=0: steps: "),
     "unknown type": (2, ["run", "e.json", "--set", "rule.type=x"], "unknown type 'x'"),
     "missing plugin": (3, ["run", "e.json", "--set", "rule.type=no:x"], "no, which is not installed"),
     "output is a folder": (2, ["run", "e.json", "-o", "."], ".: is a folder"),
@@ -240,7 +240,7 @@ UNSET = {
 def test_a_wrong_setting(call: Call, setting: str, message: str) -> None:
     result = call("run", "e.json", "--set", setting)
     assert (result.code, left()) == (2, [])
-    assert result.err.startswith(f"pbdkit: --set {setting}")
+    assert result.err.startswith(f"pbdkit: setting {setting}")
     assert message in result.err
 
 

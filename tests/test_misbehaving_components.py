@@ -112,7 +112,7 @@ def test_what_a_component_refuses_is_about_the_experiment(
 ) -> None:
     install("pbdkit-odd", rule("odd").replace("strength: float = 1.0", new), "0.3")
     result = call("run", "e.json", ODD)
-    expected = f"pbdkit: --set rule={{type: odd}}: {message}\n"
+    expected = f"pbdkit: setting rule={{type: odd}}: {message}\n"
     assert (result.code, result.err) == (2, expected)
 
 

@@ -102,7 +102,7 @@ def _settings(context: click.Context, begun: str) -> Iterator[str]:
 
 def _data(context: click.Context) -> dict[str, Any]:
     from pbdkit.experiment.model import Experiment
-    from pbdkit.experiment.settings import with_setting
+    from pbdkit.experiment.settings import with_settings
     from pbdkit.experiment.shipped import read_experiment
     from pbdkit.experiment.source import Source
 
@@ -110,8 +110,7 @@ def _data(context: click.Context) -> dict[str, Any]:
     name = context.params.get("experiment") or next(iter(context.args), None)
     defaults = Experiment.defaults()
     source = read_experiment(name) if name else Source(data={})
-    for setting in context.params.get("settings") or ():
-        source = with_setting(source, setting, defaults)
+    source = with_settings(source, context.params.get("settings") or (), defaults)
     return {**defaults, **source.data}
 
 

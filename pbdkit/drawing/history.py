@@ -47,6 +47,11 @@ def history(
     Raises ExperimentError for what is not there, for more than 200 lines, and where matplotlib is
     missing.
     """
+    if not isinstance(name, str | None):
+        raise ExperimentError(
+            f"history: expected the name of a variable first, such as 'u', got {name!r}; a "
+            "particle is given as particle=67"
+        )
     if bond is not None:
         drawn = [_of_bond(dataset, name or "strain", bond)]
     else:

@@ -32,6 +32,7 @@ from pbdkit.experiment.parts import fault, open_part, report
 from pbdkit.experiment.record import Record
 from pbdkit.experiment.renewal import announce, renewed
 from pbdkit.experiment.sampling import sampled
+from pbdkit.experiment.settings import Settings, with_settings
 from pbdkit.experiment.solvers import AnySolver, Stepping
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
@@ -125,6 +126,7 @@ class Experiment(Strict):
         return self.record.next_after(step, self.steps)
 
     _source: Source = PrivateAttr(default_factory=Source)
+    _validated: dict[str, Any] = PrivateAttr(default_factory=dict)
     _registry: Registry = PrivateAttr()
 
     def __init__(self, **parts: Any) -> None:
@@ -161,6 +163,36 @@ class Experiment(Strict):
         experiment = type(self).__new__(type(self))
         experiment._validate(parts, self._registry, Source())
         return experiment
+
+    def with_settings(self, settings: Settings) -> Self:
+        """Return the experiment with some values changed, validated as a whole.
+
+        Parameters
+        ----------
+        settings : mapping, or iterable of str
+            ``{"steps": 20, "rule": {"relaxation": 0.3}}`` changes these values and leaves all
+            others; a map with a `type` replaces the whole part. ``["steps=20"]`` does the same.
+
+        Raises
+        ------
+        ExperimentError
+            For a path that leads nowhere, and a value that is not right.
+        """
+        source = Source(self._source.name, self.as_written(), {}, self._source.folder)
+        changed = with_settings(source, settings, self.defaults())
+        experiment = type(self).__new__(type(self))
+        experiment._validate(changed.data, self._registry, changed)
+        return experiment
+
+    @property
+    def is_as_validated(self) -> bool:
+        """Whether its parts are those that were validated: `model_copy` replaces them unseen."""
+        return all(self._validated.get(name) is part for name, part in self.__dict__.items())
+
+    def refuse_unvalidated(self) -> None:
+        """Raise ExperimentError where it is a copy with a part that is not right."""
+        if not self.is_as_validated:
+            self.of_parts(self.model_dump(mode="json", by_alias=True, warnings=False))
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
@@ -222,7 +254,7 @@ class Experiment(Strict):
     def as_written(self) -> dict[str, Any]:
         """What can be changed and built again. With `units` that is what it was made of, whose
         lengths may name a unit, where that holds plain values; else all of it in lattice units."""
-        if self.units and self._source.data is not None:
+        if self.units and self._source.data is not None and self.is_as_validated:
             with suppress(TypeError, ValueError):
                 return dict(json.loads(json.dumps(self._source.data)))
         return self.model_dump(mode="json", by_alias=True)
@@ -245,5 +277,5 @@ class Experiment(Strict):
             raise report(error, source) from None
         except PluginError as error:
             raise PluginError(source.message(error.where, str(error)), error.where) from None
-        self._registry, self._source = registry, source
+        self._registry, self._source, self._validated = registry, source, {**self.__dict__}
         announce(retired, source, vars(self))

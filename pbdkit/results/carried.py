@@ -12,6 +12,7 @@ from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
 from pbdkit.registry.registry import GIVEN
 from pbdkit.registry.retired import refuse_retired
+from pbdkit.results.older_layout import refuse_no_dataset
 from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def experiment_of(
 ) -> Experiment:
     """The experiment that a dataset carries. Raises ExperimentError where there is none, or where
     it wants components that are not there."""
+    refuse_no_dataset(dataset)
     parts = carried(dataset, "experiment")
     if not parts:
         raise ExperimentError("the dataset carries no experiment: pbdkit did not make it")

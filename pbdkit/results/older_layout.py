@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbdkit.components.diagnostics import CrackPath
+from pbdkit.errors import ExperimentError
 from pbdkit.results import layout
 from pbdkit.results.layout import INDICES, OF_BODY, OF_FRAME
 from pbdkit.scene.raster import FRAME
@@ -16,12 +18,24 @@ if TYPE_CHECKING:
     import xarray
 
 
+def refuse_no_dataset(given: Any) -> None:
+    """Raise ExperimentError where a file, or anything else, is given in place of a dataset."""
+    if not hasattr(given, "data_vars"):
+        opening = f"pbdkit.open({str(given)!r})" if isinstance(given, str | Path) else ""
+        raise ExperimentError(
+            f"expected a dataset of pbdkit, got an object of type {type(given).__name__}; "
+            f"{opening or 'pbdkit.open(file)'} returns that of a file, pbdkit.run(...) a new one"
+        )
+
+
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
     """The dataset itself, or an older one with the names of now: indices and roles of particles,
     and bonds by number, which were places from 0; all of the body counts as inside its outline.
 
-    What was measured stays as it was: frame points hold 0 in what is NaN there now.
+    What was measured stays as it was: frame points hold 0 in what is NaN there now. Raises
+    ExperimentError for what is no dataset.
     """
+    refuse_no_dataset(dataset)
     found, dims = dataset.variables, {name: v.dims for name, v in dataset.variables.items()}
     new: dict[str, Any] = {}
     if dims.get("site") == ("particle", "index") and "i" not in found:

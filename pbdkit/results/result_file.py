@@ -35,6 +35,10 @@ def open(path: str | Path) -> xarray.Dataset:
     change that is met later, as values are read, raises StorageError too. Warns, with
     pbdkit.PbdkitWarning, of a file without a seal, which is first read once in another process.
     """
+    if not isinstance(path, str | Path):
+        raise ExperimentError(
+            f"open: expected the path of a result, got an object of type {type(path).__name__}"
+        )
     file = Path(path)
     left = _output_of(file)
     if not left:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import with_setting
+from pbdkit.experiment.settings import with_settings
 from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.registry.retired import refuse_retired
@@ -180,9 +180,7 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
     if not isinstance(file, str) or not Path(file).is_file():
         return
     try:
-        source = read_experiment(file)
-        for setting in settings:
-            source = with_setting(source, setting, Experiment.defaults())
+        source = with_settings(read_experiment(file), settings, Experiment.defaults())
         now = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
         now = None

@@ -30,6 +30,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     """
     import xarray
 
+    if hasattr(runs, "data_vars"):
+        raise ExperimentError("concat: expected a list of datasets, got one; write concat([a, b])")
     each = [in_this_layout(run) for run in runs]
     experiments = [carried(run, "experiment") for run in each]
     if not all(experiments) or not each:

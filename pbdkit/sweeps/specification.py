@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from itertools import combinations
 from math import prod
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     Field,
     ValidationError,
@@ -23,6 +21,7 @@ from pbdkit.experiment.kinds import SWEEP, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import brief, fault, report
 from pbdkit.experiment.schema import DIALECT
+from pbdkit.experiment.settings import plain
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import Source, read_file, read_text
 from pbdkit.interfaces.component import Strict
@@ -56,20 +55,9 @@ class Range(Strict):
         return [int(v) for v in values] if whole and all(v % 1 == 0 for v in values) else values
 
 
-def _plain(value: Any) -> Any:
-    """The value as a file would hold it: Python users give arrays and components too."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", by_alias=True)
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    return [_plain(inner) for inner in value] if isinstance(value, (list, tuple)) else value
-
-
 def _listed(value: Any) -> tuple[Any, ...]:
     """The values of one parameter."""
-    value = _plain(value)
+    value = plain(value)
     if isinstance(value, dict):
         value = Range.model_validate(value).values()
     if not isinstance(value, list) or not value:
