@@ -66,6 +66,13 @@ def plugins(session: nox.Session) -> None:
 
 
 @nox.session
+def installs(session: nox.Session) -> None:
+    """Commands work without extras, or name the one that they need: in environments that the script
+    makes, a bare one and one an extra."""
+    session.run("python", "tests/installs.py")
+
+
+@nox.session
 def gpu(session: nox.Session) -> None:
     """Kernels for GPUs are compiled as far as that goes without one. The compiler takes half a
     gigabyte, which other environments are spared."""

@@ -104,6 +104,20 @@ def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile,
         list(measure(str(file), (), None, lambda _: None))
 
 
+def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, tmp_path, tensile):
+    """The measuring process itself finds no numba."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.util as util\nfind = util.find_spec\n"
+        "util.find_spec = lambda name, *more: None if name == 'numba' else find(name, *more)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
+    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [FOUR[0], FOUR[2]])
+    file = tmp_path / "e.json"
+    file.write_text(json.dumps(tensile))
+    _, other = measure(str(file), (), None, lambda _: None)
+    assert "numba is not installed: pip install 'pbdkit[fast]'" in other.reason
+
+
 def sheet(**parts):
     base = {
         "name": "sheet",

@@ -154,6 +154,13 @@ def test_the_sampler_draws_from_it(fit):
     assert again.sample.draws.tobytes() == sample.draws.tobytes()
 
 
+def test_a_sampler_that_is_missing_is_named_before_the_fit(fit, monkeypatch):
+    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda library: None)
+    monkeypatch.setattr("pbdkit.fitting.calling.solved", None)
+    with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[sample\]'"):
+        pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
+
+
 def test_the_right_model_foretells_best(tmp_path):
     """An orthotropic plate: the isotropic rule foretells left-out points worse."""
     rule = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3}

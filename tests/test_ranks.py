@@ -406,6 +406,20 @@ def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, c
     assert not Path("tensile.nc").exists()
 
 
+def test_without_an_mpi_library_the_message_names_one(monkeypatch, tmp_path, call):
+    """mpi4py installs without, and looks for one when it is imported."""
+    (tmp_path / "mpi4py").mkdir()
+    (tmp_path / "mpi4py" / "__init__.py").write_text("")
+    (tmp_path / "mpi4py" / "MPI.py").write_text("raise RuntimeError('cannot load MPI library')")
+    for module in [name for name in sys.modules if name.split(".")[0] == "mpi4py"]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PMI_SIZE", "2")
+    done = call("run", "e.json")
+    assert done.code == 2
+    assert "mpi4py finds no MPI library; install one, for instance by pip install mpich" in done.err
+
+
 class Alone:
     COMM_WORLD = SimpleNamespace(size=1)
 

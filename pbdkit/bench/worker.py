@@ -30,7 +30,7 @@ from pbdkit.runs.tuning import tuned
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.choice import choose, make_engine, obstacle
 from pbdkit.stepping.state import State, initial_state
 
 Floats = NDArray[np.floating[Any]]
@@ -80,7 +80,8 @@ def _step(job: Job) -> Job:
     """Set-up, and for each number of steps `at`: the seconds to there, the best of several runs;
     the largest distance from the truth in `sizes`, the largest displacements."""
     experiment, at = load(job["experiment"], settings=job["settings"]), job["at"]
-    imports = _import(*[COMPILED] * (experiment.stepping.engine == "compiled"))
+    compiles = experiment.stepping.engine == "compiled" and not obstacle()
+    imports = _import(*[COMPILED] * compiles)
     begun = _clock()
     scene = tuned(build_scene(experiment))
     built = _clock() - begun

@@ -22,7 +22,7 @@ from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import Problem, Unknown
 from pbdkit.fitting.profile import profiled
 from pbdkit.fitting.resting_field import FieldObservation
-from pbdkit.fitting.sampling import sampled
+from pbdkit.fitting.sampling import refuse_no_sampler, sampled
 from pbdkit.fitting.specification import Fit
 from pbdkit.interfaces.component import Component
 from pbdkit.stepping.state import Floats
@@ -61,6 +61,8 @@ def _placed(error: ExperimentError, experiment: Experiment) -> ExperimentError:
 
 
 def _fitted(fit: Fit, experiment: Experiment, components: Components) -> Fitted:
+    if fit.sampler:
+        refuse_no_sampler()
     problem, solution = _solved(problem_of(fit, experiment, components=components), fit)
     names = [*fit.unknown]
     profiles = {

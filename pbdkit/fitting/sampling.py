@@ -49,9 +49,13 @@ class Sample:
         return np.asarray(self.deviation * np.sqrt(self.memory / len(self.draws)))
 
 
-def sampled(problem: Problem, solution: Solution, *, walkers: int, steps: int, seed: int) -> Sample:
-    """By so many walkers, so many steps each. Raises ExperimentError where emcee is missing."""
+def refuse_no_sampler() -> None:
+    """Raises ExperimentError where emcee is missing."""
     refuse_without("emcee", "sample", "the sampler needs emcee")
+
+
+def sampled(problem: Problem, solution: Solution, *, walkers: int, steps: int, seed: int) -> Sample:
+    """By so many walkers, so many steps each."""
     import emcee
 
     low, high = (bound[: len(problem.unknowns)] for bound in problem.bounds())

@@ -21,15 +21,21 @@ def launched() -> Iterator[Processes]:
     """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
     and this one alone where it was not.
 
-    Raises ExperimentError where mpi4py is missing, or belongs to another launcher.
+    Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
+    launcher.
     """
     size = max(int(os.environ.get(name, 1)) for name in SIZES)
     if RANK not in os.environ and size == 1:
         yield Processes()
         return
     refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
-    from mpi4py import MPI
-
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:
+        raise ExperimentError(
+            "mpi4py finds no MPI library; install one, for instance by pip install mpich, and "
+            f"start the processes by its mpiexec ({str(error).splitlines()[0]})"
+        ) from None
     if MPI.COMM_WORLD.size == 1:
         if size > 1:
             raise ExperimentError(
