@@ -85,6 +85,7 @@ if TYPE_CHECKING:
         StoresEnergy as StoresEnergy,
         TearsCells as TearsCells,
         Torn as Torn,
+        TouchingRows as TouchingRows,
         TurnsParticles as TurnsParticles,
         Variable as Variable,
         Vector as Vector,
@@ -110,8 +111,8 @@ _HOME = {
         "FrameMap FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows "
         "LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles "
         "Quantity Remembered Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot "
-        "Softens SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn TurnsParticles "
-        "Variable Vector dot length squared_length where"
+        "Softens SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn TouchingRows "
+        "TurnsParticles Variable Vector dot length squared_length where"
     ),
     "pbdkit.pages.report": "report",
     "pbdkit.registry.discovery": "hookimpl",

@@ -1,5 +1,6 @@
 """docs/extending tells of every interface, hook and public name, and its examples conform."""
 
+import ast
 import importlib
 import inspect
 import os
@@ -156,6 +157,44 @@ def test_the_table_of_properties_is_whole():
 @pytest.mark.parametrize("name", [*pbdkit.__all__, *pbdkit.testing.__all__])
 def test_every_public_name_is_told(name):
     assert name in in_code((PAGES / "api.md").read_text())
+
+
+def names_in_documentation():
+    """(module, name) of the tables of public names, of `pbdkit.NAME` on the pages for authors, and
+    of the directives of the reference."""
+    module, found = "", set()
+    for line in (PAGES / "api.md").read_text().splitlines():
+        if header := re.match(r"\| of `([\w.]+)` \|", line):
+            module = header[1]
+        elif module and line.startswith("| `"):
+            found |= {(module, name) for name in re.findall(r"`(\w+)`", line.split("|")[1])}
+    for page in PAGES.glob("*.md"):
+        written = re.findall(r"\bpbdkit\.([A-Z]\w+)", page.read_text())
+        found |= {("pbdkit", name) for name in written}
+    reference = PAGES.parent / "reference.md"
+    for what, name in re.findall(r"^\.\. (\w+):: ([\w.]+)$", reference.read_text(), re.M):
+        module = name if what == "currentmodule" else module
+        found |= {(module, name)} - {(name, name)}
+    return sorted(found)
+
+
+@pytest.mark.parametrize(("module", "name"), names_in_documentation())
+def test_documented_names_are_imported_from_where_the_documentation_says(module, name):
+    assert name in importlib.import_module(module).__all__
+    assert getattr(importlib.import_module(module), name) is not None
+
+
+def test_the_public_names_are_one_list():
+    """For Python, for type checkers, and of what authors exchange with pbdkit."""
+    tree = ast.parse(Path(pbdkit.__file__).read_text())
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and n.test.id == "TYPE_CHECKING")
+    imports = (n for n in block.body if isinstance(n, ast.ImportFrom) and n.module != "typing")
+    checked = {name.asname: node.module for node in imports for name in node.names}
+    assert checked == pbdkit._MODULE_OF
+    public = {name for name, module in checked.items() if module == "pbdkit.interfaces"}
+    assert public == {*pbdkit.interfaces.__all__} - {"INTERFACES"}
+    for name, module in checked.items():
+        assert getattr(pbdkit, name) is getattr(importlib.import_module(module), name)
 
 
 def test_every_hook_is_told_with_its_signature():
