@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import wraps
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import xarray
 
@@ -15,6 +15,7 @@ from pbdkit.drawing.history import history
 from pbdkit.drawing.movie import animate, animation
 from pbdkit.drawing.picture import plot
 from pbdkit.results.carried import experiment_of
+from pbdkit.results.members import member
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.physical import in_physical_units
 from pbdkit.results.sites import indices_of, rows_at
@@ -76,6 +77,13 @@ class PbdAccessor:
         where the dataset carries none.
         """
         return experiment_of(self._dataset, components)
+
+    def member(self, **choice: Any) -> xarray.Dataset:
+        """Return the part of a sweep in which parameters have these values: ``member(steel=3)``.
+
+        A member alone has its experiment too. Raises ExperimentError for what no member has.
+        """
+        return member(self._dataset, choice)
 
     def at(self, **index: int) -> xarray.Dataset:
         """What stands at site indices: ``at(i=3, j=4)`` is one particle, as ``sel(particle=...)``

@@ -195,6 +195,7 @@ def sweep(
     together: Mapping[str, Any] | None = None,
     replicates: int = 1,
     keep: Mapping[str, Any] | None = None,
+    names: Mapping[str, str] | None = None,
     folder: str | Path | None = None,
     workers: int | None = None,
     client: Any = None,
@@ -213,6 +214,7 @@ def sweep(
 
     given = as_experiment(experiment, ())
     parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
+    parts["names"] = names or {}
     return called(given, parts | {"replicates": replicates}, folder, workers, client, progress)
 
 

@@ -161,7 +161,7 @@ def test_plain_concatenation_of_runs():
 def test_concatenated_runs_carry_what_differs():
     runs = [torn(0.2), torn(1.2), torn(2.2, name="other", leaders=[HELD])]
     whole = pbdkit.concat(runs)
-    assert whole.fracture_cracks_0_1_1.values.tolist() == [0.2, 1.2, 2.2]
+    assert whole.cracks_0_1_1.values.tolist() == [0.2, 1.2, 2.2]
     assert whole.name.values.tolist() == ["small", "small", "other"]
     assert whole.leaders.dims == ("run",)
     assert json.loads(whole.leaders.values[2])[0]["motion"] == {"type": "hold"}

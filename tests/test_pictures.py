@@ -278,7 +278,7 @@ def test_bonds_that_are_not_there_are_refused(tensile):
 
 def test_what_has_no_places_is_refused(torn):
     with pytest.raises(ExperimentError, match="keep the variable `position`"):
-        torn.drop_vars("position").pbd.plot()
+        torn.drop_vars(["position", "reference"]).pbd.plot()
     with pytest.raises(ExperimentError, match="no particle has a place in what is to be drawn"):
         torn.assign(position=torn.position * np.nan).pbd.plot()
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import PATH, result_argument
+from pbdkit.cli.options import PATH, at_option, result_argument
 from pbdkit.errors import ExperimentError
 
 if TYPE_CHECKING:
@@ -36,8 +36,11 @@ HISTORY = "history"
 @click.option("--group", type=int, help="Forces of this leader group.")
 @click.option("--load", type=int, help="Forces of this load.")
 @click.option("--obstacle", type=int, help="Forces of this obstacle.")
+@at_option
 @click.option("--force", is_flag=True, help="Replace an existing picture.")
-def curve(file: Path, kind: str | None, output: Path | None, force: bool, **asked: Any) -> None:
+def curve(
+    file: Path, kind: str | None, output: Path | None, at: dict[str, str], force: bool, **asked: Any
+) -> None:
     """Draw what changes in the course of a result: a curve, histories, the crack.
 
     \b
@@ -60,7 +63,7 @@ def curve(file: Path, kind: str | None, output: Path | None, force: bool, **aske
     path = output or file.with_name(f"{file.stem}-{_named(kind, asked)}.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
-    with reading(file, sweeps=True) as dataset:
+    with reading(file, sweeps=True, at=at) as dataset:
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
         save(path, figure_of(_drawn(dataset, kind, **asked)))

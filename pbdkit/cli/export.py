@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pbdkit.cli.options import PATH, result_argument
+from pbdkit.cli.options import PATH, at_option, result_argument
 
 if TYPE_CHECKING:
     import xarray
@@ -20,8 +20,9 @@ SUFFIX = ".vtkhdf"
 @click.command()
 @result_argument("file")
 @click.option("-o", "--output", type=PATH, help="A .vtkhdf file; beside OUT.nc if not said.")
+@at_option
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-def export(file: Path, output: Path | None, force: bool) -> None:
+def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> None:
     """Write a result as VTKHDF, which ParaView opens: every recorded step with all variables.
 
     Particles are vertices, bonds lines, and the cells of the lattice triangles and quads; the cell
@@ -40,7 +41,7 @@ def export(file: Path, output: Path | None, force: bool) -> None:
     refuse_output(path, force=force)
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
-    with reading(file) as dataset:
+    with reading(file, at=at) as dataset:
         write(dataset, path, _scene_of(dataset), replace=force)
     click.echo(f"{path} written")
 

@@ -63,6 +63,25 @@ set_option = click.option(
     shell_complete=completed_by("settings"),
     help="Change a value, e.g. rule.K=-0.002 or leaders.1.until=20.",
 )
+
+
+def _choice(
+    context: click.Context, option: click.Parameter, given: tuple[str, ...]
+) -> dict[str, str]:
+    """The values by name. Raises click.BadParameter."""
+    for text in given:
+        if not all(text.partition("=")):
+            raise click.BadParameter(f"'{text}': expected NAME=VALUE, for instance steel=3")
+    return dict(text.split("=", 1) for text in given)
+
+
+at_option = click.option(
+    "--at",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=_choice,
+    help="Of a sweep, the member with this parameter; again for one more.",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 verbose_option = click.option("--verbose", is_flag=True, help="Say all that is known.")
 

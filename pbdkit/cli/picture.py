@@ -10,7 +10,14 @@ from typing import Any
 
 import click
 
-from pbdkit.cli.options import PATH, color_option, result_argument, set_option, times_option
+from pbdkit.cli.options import (
+    PATH,
+    at_option,
+    color_option,
+    result_argument,
+    set_option,
+    times_option,
+)
 
 LOOK = [
     color_option,
@@ -64,6 +71,7 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @result_argument("file", metavar="OUT.nc|EXPERIMENT")
 @click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
 @times_option
+@at_option
 @set_option
 @look_options
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
@@ -73,6 +81,7 @@ def plot(
     file: Path,
     output: Path | None,
     times: tuple[float, ...],
+    at: dict[str, str],
     settings: tuple[str, ...],
     force: bool,
     **look: Any,
@@ -89,7 +98,9 @@ def plot(
     from pbdkit.results.result_file import reading
 
     if is_experiment(file):
-        _plot_set_up(str(file), output, settings, force=force, look={"times": times} | look)
+        _plot_set_up(
+            str(file), output, settings, force=force, look={"times": times, "at": at} | look
+        )
         return
     refuse_other_file(file)
     if settings:
@@ -97,7 +108,7 @@ def plot(
     path = output or file.with_suffix(".png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
-    with reading(file) as dataset:
+    with reading(file, at=at) as dataset:
         time = times if len(times) > 1 else times[0] if times else None
         axes = draw(dataset, time=time, **look)
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
@@ -116,7 +127,9 @@ def _plot_set_up(
 
     figsize, dpi = look.pop("figsize"), look.pop("dpi")
     words = {"filled": "field", "times": "time", "vmin": "range", "vmax": "range", "cmap": "map"}
-    if asked := [words.get(k, k) for k, value in look.items() if value not in (None, False, ())]:
+    if asked := [
+        words.get(k, k) for k, value in look.items() if value not in (None, False, (), {})
+    ]:
         raise ExperimentError(
             f"--{asked[0]}: is for results; {name} is an experiment, of which the set-up is drawn; "
             f"`pbdkit run {name}` makes a result of it"
@@ -134,6 +147,7 @@ def _plot_set_up(
 @click.command()
 @result_argument("file")
 @click.option("-o", "--output", type=PATH, help="MP4 or GIF; default OUT.mp4.")
+@at_option
 @look_options
 @click.option("--fps", type=float, default=25.0, show_default=True, help="Steps a second.")
 @click.option(
@@ -141,7 +155,7 @@ def _plot_set_up(
 )
 @click.option("--dpi", type=int, default=120, show_default=True, help="Pixels an inch.")
 @force_option
-def animate(file: Path, output: Path | None, force: bool, **look: Any) -> None:
+def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **look: Any) -> None:
     """Make a movie of a result: every recorded step, with the same colours all along."""
     from pbdkit.cli.output import refuse_output, refuse_unwritable
     from pbdkit.drawing.movie import animate as write
@@ -155,6 +169,6 @@ def animate(file: Path, output: Path | None, force: bool, **look: Any) -> None:
     refuse_no_movie(path)
     refuse_output(path, force=force)
     refuse_unwritable(None, path)
-    with reading(file) as dataset, progress_bar(sys.stderr.isatty()) as show:
+    with reading(file, at=at) as dataset, progress_bar(sys.stderr.isatty()) as show:
         write(dataset, file=path, show=show, **look)
     click.echo(f"{path} written")

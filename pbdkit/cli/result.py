@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import json_option, result_argument
+from pbdkit.cli.options import at_option, json_option, result_argument
 
 if TYPE_CHECKING:
     from pbdkit.results.explanation import Explained, Standing
@@ -94,8 +94,9 @@ def _duration(seconds: float) -> str:
 @click.command()
 @result_argument("file")
 @click.option("--bond", nargs=2, type=int, metavar="A B", help="The bond between two numbers.")
+@at_option
 @json_option
-def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
+def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
     """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
     is, or was, from breaking, and what happened around it."""
     from pbdkit.cli.waiting import waiting
@@ -103,7 +104,7 @@ def explain(file: Path, bond: tuple[int, int] | None, as_json: bool) -> None:
     from pbdkit.results.explanation import Explained
     from pbdkit.results.result_file import reading
 
-    with waiting(f"reading {file}", silent=as_json), reading(file) as dataset:
+    with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
         explained = Explained(dataset, scene_of(dataset, "explain"))
         found = _of_one(explained, *bond) if bond else _of_all(explained)
         words = _bond_in_words(found) if bond else _run_in_words(found)

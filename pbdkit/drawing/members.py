@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.drawing.panel import Line
 from pbdkit.drawing.series import OF_A_RUN
-from pbdkit.sweeps.grid import TEXT, type_alone
+from pbdkit.results.members import TEXT, type_alone
 
 if TYPE_CHECKING:
     import xarray

@@ -18,6 +18,7 @@ from pbdkit.drawing.quantity import Quantity, quantity_of
 from pbdkit.errors import ExperimentError
 from pbdkit.results.layout import OF_BODY, as_step, broken_by
 from pbdkit.results.sites import rows_of
+from pbdkit.scene.raster import FRAME
 
 if TYPE_CHECKING:
     import xarray
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 BLOCK_BYTES = 2**26
 """So much is read of a file at a time."""
+UNKNOWN = FRAME + 1
+"""The kind of a particle of the body where kinds were not kept: it has no colour."""
 MEASURED = 50_000
 """The distance of particles is measured in bodies of up to so many, and else from their area."""
 
@@ -96,9 +99,11 @@ class Recording:
         self._dataset = of_one_run(dataset)
         self.quantity: Quantity | None = None
         if color is not None:
-            self.quantity = quantity_of(self._dataset, color)
-        self.title = plain(dataset.attrs.get("title", ""))
-        self._length_units = counted_in(dataset["position"].attrs)
+            has_kinds = "kind" in dataset.variables
+            drawable = self._dataset if has_kinds else self._dataset.drop_vars("kind")
+            self.quantity = quantity_of(drawable, color)
+        self.title = plain(self._dataset.attrs.get("title", ""))
+        self._length_units = counted_in(self._dataset["position"].attrs)
         self.steps = self._dataset["time"].values
 
     @property
@@ -188,8 +193,7 @@ class Recording:
 def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
     """The dataset, with a time even where it was one of several. Raises ExperimentError where its
     positions are not those of one run in the plane."""
-    if "position" not in dataset.variables:
-        raise ExperimentError("there are no positions to draw: keep the variable `position`")
+    dataset = _with_positions(dataset)
     position = dataset["position"]
     others = [str(d) for d in position.dims if d not in ("time", "particle", "axis")]
     if others:
@@ -213,3 +217,20 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
     if not there.sizes["time"]:
         raise ExperimentError("no step was recorded")
     return there
+
+
+def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
+    """The dataset itself, or where positions were not kept, at rest. Raises ExperimentError where
+    the places at rest are not there either."""
+    if "position" in dataset.variables:
+        return dataset
+    if "reference" not in dataset.variables or "role" not in dataset.variables:
+        raise ExperimentError("there are no positions to draw: keep the variable `position`")
+    unknown = np.where(dataset["role"] == OF_BODY, UNKNOWN, FRAME)
+    added = {"position": dataset["reference"]}
+    if "kind" not in dataset.variables:
+        added["kind"] = dataset["role"].copy(data=unknown)
+    if "time" in dataset.dims:
+        added = {name: one.expand_dims(time=dataset["time"]) for name, one in added.items()}
+    title = f"{dataset.attrs.get('title', '')}, drawn at rest"
+    return dataset.assign(added).assign_attrs(title=title)

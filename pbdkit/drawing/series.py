@@ -113,7 +113,7 @@ def _over(found: xarray.DataArray, dataset: xarray.Dataset, dim: str) -> Any:
     )
     said = found.attrs | {"long_name": f"{found.attrs.get('long_name', found.name)}, {what}"}
     role = dataset.get("role") if dim == "particle" else None
-    body = ... if role is None or role.dims != (dim,) else role.values == OF_BODY
+    body = slice(None) if role is None or role.dims != (dim,) else role.values == OF_BODY
 
     def reduced(part: xarray.DataArray) -> xarray.DataArray:
         whole = part.transpose(..., dim)

@@ -11,8 +11,9 @@ from pbdkit.pages.page import page
 from pbdkit.pages.run_content import RunContent
 from pbdkit.pages.speed import speed
 from pbdkit.pages.sweep_content import SweepContent
+from pbdkit.results.members import SWEEP
 from pbdkit.results.older_layout import in_this_layout
-from pbdkit.results.result_file import SWEEP, reading
+from pbdkit.results.result_file import reading
 
 if TYPE_CHECKING:
     import xarray

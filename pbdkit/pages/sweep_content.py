@@ -19,8 +19,9 @@ from pbdkit.pages.run_content import leaders_of, reference_of
 from pbdkit.pages.sweep_numbers import numbers
 from pbdkit.pages.thinning import Thinning, thinned
 from pbdkit.results.carried import carried, scene_of
+from pbdkit.results.members import STATUS, TEXT, type_alone
 from pbdkit.scene.scene import Scene
-from pbdkit.sweeps.grid import CASE, MESSAGE, STATUS, TEXT, type_alone
+from pbdkit.sweeps.grid import CASE, MESSAGE
 from pbdkit.sweeps.worker import KEPT
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from pbdkit.pages.naming import meaning_of, units_of
 from pbdkit.pages.packing import packed
-from pbdkit.sweeps.grid import MESSAGE, STATUS
+from pbdkit.results.members import STATUS
+from pbdkit.sweeps.grid import MESSAGE
 from pbdkit.sweeps.joining import FILL
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,13 @@ from xarray.backends import StoreBackendEntrypoint
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
+from pbdkit.results.members import SWEEP, choices, member
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.other_files import refuse_other_file
 from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
 
-SWEEP = "sweep"
-"""The attribute that only datasets of sweeps have."""
 UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
 
 
@@ -104,18 +103,21 @@ def _output_of(file: Path) -> Path | None:
 
 
 @contextmanager
-def reading(path: str | Path, *, sweeps: bool = False) -> Iterator[xarray.Dataset]:
+def reading(
+    path: str | Path, *, sweeps: bool = False, at: Mapping[str, str] | None = None
+) -> Iterator[xarray.Dataset]:
     """The dataset of a run in a result file, or with `sweeps` of either, to be read from in the
-    block.
+    block; `at` chooses among the members of a sweep.
 
     Raises ExperimentError for that of a sweep otherwise, what `open` does, and StorageError for
     whatever reading and using its values raises: files are sound when written.
     """
-    with open(path) as dataset:
+    with open(path) as whole:
+        dataset = _chosen(whole, path, at) if at else whole
         if SWEEP in dataset.attrs and not sweeps:
             raise ExperimentError(
-                f"{path}: holds all members of a sweep, and this looks at one run; in Python, "
-                "pbdkit.open(...) and isel pick what is to be drawn"
+                f"{path}: holds all members of a sweep, and this looks at one run; choose one with "
+                f"--at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE) ({choices(dataset)})"
             )
         try:
             yield dataset
@@ -128,6 +130,13 @@ def reading(path: str | Path, *, sweeps: bool = False) -> Iterator[xarray.Datase
         except Exception as error:
             told = f"{type(error).__name__}: {error}"
             raise StorageError(f"{path}: is damaged, or was changed: {one_line(told)}") from error
+
+
+def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) -> xarray.Dataset:
+    try:
+        return member(dataset, at)
+    except ExperimentError as error:
+        raise ExperimentError(f"{path}: --at {error}") from None
 
 
 def _fault(dataset: xarray.Dataset) -> str | None:

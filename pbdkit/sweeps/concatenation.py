@@ -45,8 +45,10 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     said = {name: [str(run.attrs.get(name, "")) for run in each] for name in _attributes(each)}
     taken = {dim, *map(str, whole.variables), *map(str, whole.dims), *said, *reserved_names()}
     names = names_of([*changed], taken)
-    along = {names[path]: values_along(_numbers(values)) for path, values in changed.items()}
-    return whole.assign_coords({n: (dim, values) for n, values in {**along, **said}.items()})
+    along: dict[str, Any] = {n: (dim, values) for n, values in said.items()}
+    for path, values in changed.items():
+        along[names[path]] = (dim, values_along(_numbers(values)), {"long_name": path})
+    return whole.assign_coords(along)
 
 
 def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, list[Any]]]:

@@ -11,9 +11,10 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
+from pbdkit.results.members import STATUS
 from pbdkit.scene.memory import machine_memory
 from pbdkit.sweeps.content import Variable, unpacked
-from pbdkit.sweeps.grid import MESSAGE, STATUS, Dimension
+from pbdkit.sweeps.grid import MESSAGE, Dimension
 from pbdkit.sweeps.member import Member
 from pbdkit.sweeps.worker import KEPT, Report
 
@@ -52,7 +53,7 @@ def joined(grid: list[Dimension], members: Iterable[Member], report_of: Reports)
         MESSAGE: (dims, message.astype(str), {"long_name": "why it failed, or what it warned of"}),
     }
     variables |= {name: (ds, arrays[name], attributes) for name, ds, attributes in frame.described}
-    along = {n: (d.name, values) for d in grid for n, values in d.coordinates.items()}
+    along = {n: (d.name, *one) for d in grid for n, one in d.coordinates.items()}
     return xarray.Dataset(variables, along).set_coords(frame.coordinates)
 
 

@@ -60,7 +60,7 @@ class Asked:
         """The dimensions."""
         diagnosed = (v for d in experiment.diagnostics for v in d.variables())
         taken = reserved_names() | {n for v in diagnosed for n in (v.name, *v.dims)}
-        return dimensions(self.sweep, experiment.seed, taken)
+        return dimensions(self.sweep, experiment, taken)
 
     def members(
         self, grid: list[Dimension], show: Callable[[float], None]

@@ -24,7 +24,7 @@ from pbdkit.experiment.schema import DIALECT
 from pbdkit.experiment.settings import plain
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.component import Strict, did_you_mean
 
 MOST_MEMBERS = 100_000
 """Each takes about a millisecond to be validated, and some kilobytes while the sweep goes on."""
@@ -88,7 +88,8 @@ class Keep(Strict):
 
 class Sweep(Strict):
     """Members are the product of the values in `vary`, of the lists in `together`, which are gone
-    through at once, and of the replicates, which differ in their seed."""
+    through at once, and of the replicates, which differ in their seed. `names` are those that
+    parameters have in the dataset, by their paths."""
 
     version: Version = 1
     experiment: Base
@@ -96,6 +97,20 @@ class Sweep(Strict):
     together: dict[str, Values] = Field(default_factory=dict)
     replicates: Annotated[int, Field(ge=1, le=MOST_MEMBERS)] = 1
     keep: Keep = Field(default_factory=Keep)
+    names: dict[str, Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]] = Field(
+        default_factory=dict
+    )
+
+    @model_validator(mode="after")
+    def _of_parameters(self) -> Self:
+        varied = [*self.vary, *self.together]
+        for path in self.names:
+            if path not in varied:
+                hint = did_you_mean(path, varied)
+                raise fault(f"'{path}' is not varied{hint} ({', '.join(varied)})", key="names")
+        if len({*self.names.values()}) < len(self.names):
+            raise fault("two parameters have the same name", key="names")
+        return self
 
     @model_validator(mode="after")
     def _together(self) -> Self:

@@ -116,10 +116,14 @@ class KeptSink(Sink):
 
 
 def kept_columns(columns: list[Column], wanted: set[str] | None) -> dict[str, Column]:
-    """The columns of that name, and the labels along each of their dimensions."""
+    """Return the columns of that name, the labels along each of their dimensions, and of what
+    particles have the places at rest."""
     chosen = [c for c in columns if wanted is None or c.name in wanted]
-    labels = {(dim,) for column in chosen for dim in column.dims}
-    return {c.name: c for c in columns if c in chosen or (c.coordinate and c.dims in labels)}
+    dims = {dim for column in chosen for dim in column.dims}
+    if "particle" in dims:
+        dims.add("axis")
+    labels = [c for c in columns if c.coordinate and c.dims and {*c.dims} <= dims]
+    return {c.name: c for c in columns if c in chosen or c in labels}
 
 
 def run_members(jobs: list[Job]) -> list[Report]:

@@ -1,0 +1,121 @@
+"""Names of the parameters of a sweep, and one member chosen among all."""
+
+import numpy as np
+import pytest
+
+import pbdkit
+
+PLATE = {
+    "name": "plate",
+    "units": {"length": "1 mm", "youngs_modulus": "70 GPa", "thickness": "1 mm"},
+    "lattice": {"type": "square", "a": 1.0},
+    "body": {"type": "rectangle", "width": 8.0, "height": 4.0},
+    "regions": {"steel": {"type": "rectangle", "width": 4.0, "height": 4.0}},
+    "neighbours": {"type": "chebyshev"},
+    "rule": {"type": "elastic", "poisson_ratio": {"otherwise": 0.3, "steel": 0.25}},
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+        {"select": {"edge": "right"},
+         "motion": {"type": "displace", "displacement": [0.01, 0.0]}},
+    ],
+    "steps": 1,
+    "solver": {"type": "equilibrium"},
+    "diagnostics": [{"type": "displacement"}],
+}  # fmt: skip
+VARY = {
+    "rule.poisson_ratio.otherwise": [0.2, 0.3],
+    "rule.poisson_ratio.steel": [0.1, 0.2, 0.3],
+    "body.width": ["7 mm", "8 mm"],
+}
+
+
+@pytest.fixture(scope="module")
+def swept():
+    keep = {"variables": ["u"], "times": "last"}
+    names = {"body.width": "span"}
+    return pbdkit.sweep(PLATE, vary=VARY, keep=keep, names=names, workers=1, progress=False)
+
+
+def test_parameters_have_names_units_and_their_paths(swept):
+    assert swept.status.dims == ("poisson_ratio", "steel", "span")
+    said = {name: swept[name].attrs for name in swept.status.dims}
+    assert [one["long_name"] for one in said.values()] == [*VARY]
+    assert (said["span"]["units"], swept.span.values.tolist()) == ("mm", [7.0, 8.0])
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["rule.nu.otherwise", "rule.E.otherwise"], ["nu", "E"]),
+        (["rule.nu.steel", "rule.E.steel"], ["nu_steel", "E_steel"]),
+        (["leaders.0.until", "leaders.1.until"], ["leaders_0_until", "leaders_1_until"]),
+        (["fracture.thresholds.0"], ["thresholds_0"]),
+        (["rule.time"], ["rule_time"]),
+        (["steps"], ["steps"]),
+        (["rule.type", "fracture.type"], ["rule", "fracture"]),
+    ],
+)
+def test_automatic_names_are_the_shortest_that_mean_something(paths, names):
+    from pbdkit.sweeps.grid import names_of
+
+    assert [*names_of(paths, {"time"}).values()] == names
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ({"body.widht": "span"}, "names: 'body.widht' is not varied; did you mean 'body.width'?"),
+        ({"body.width": "time"}, "names: body.width: results have a 'time' already; give another"),
+        ({"body.width": "2a"}, "names.body.width: "),
+        ({"body.width": "w", "rule.poisson_ratio.steel": "w"}, "two parameters have the same name"),
+    ],
+)
+def test_wrong_names_are_refused(names, said):
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        pbdkit.sweep(PLATE, vary=VARY, names=names, workers=1, progress=False)
+    assert said in str(caught.value)
+
+
+def test_a_member_is_the_run_that_its_parameters_make(swept):
+    one = swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=7)
+    again = pbdkit.rerun(one, progress=False)
+    last = again.u.isel(time=-1)
+    np.testing.assert_array_equal(one.u.isel(time=-1).dropna("particle", how="all"), last)
+    assert one.attrs["title"] == "sweep of plate, poisson_ratio=0.3, steel=0.2, span=7"
+    assert swept.pbd.member(steel=0.2).status.dims == ("poisson_ratio", "span")
+
+
+def test_maps_are_drawn_at_rest_where_positions_were_not_kept(swept):
+    ax = swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=8).pbd.plot("u_x")
+    assert "drawn at rest" in ax.get_title()
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        ({"steel": 9}, "steel=9: no member has this value; there are 0.1, 0.2, 0.3"),
+        (
+            {"stel": 1},
+            "stel: is no parameter of this sweep; did you mean 'steel'? (",
+        ),
+    ],
+)
+def test_what_no_member_has_is_said(swept, choice, said):
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        swept.pbd.member(**choice)
+    assert said in str(caught.value)
+
+
+def test_commands_choose_a_member(swept, call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    swept.to_netcdf("s.nc")
+    refused = call("plot", "s.nc", "--color", "u_x")
+    assert refused.code == 2
+    assert "choose one with --at NAME=VALUE" in refused.err
+    assert "steel: 0.1, 0.2, 0.3; span: 7, 8" in refused.err
+    choice = ["--at", "steel=0.2", "--at", "poisson_ratio=0.3", "--at", "span=7"]
+    assert call("plot", "s.nc", "--color", "u_x", "--dpi", "50", *choice).code == 0
+    assert call("curve", "s.nc", "--y", "u_x", *choice[:2]).code == 0
+    wrong = call("explain", "s.nc", "--at", "steel=4")
+    assert (wrong.code, "--at steel=4: no member has this value" in wrong.err) == (2, True)
+    assert "expected NAME=VALUE" in call("plot", "s.nc", "--at", "steel").err
