@@ -105,7 +105,8 @@ def names_of(paths: list[str], taken: Set[str]) -> dict[str, str]:
     """Return a name for each path: its last word, or as many of the last words, with `_` between
     them, as are needed for a name that no other path has, and nothing else.
 
-    `otherwise` and `type` at the end count for nothing. A name does not begin with a position in a list.
+    `otherwise` and `type` at the end count for nothing. A name does not begin with a position in
+    a list.
     """
     tails = {path: _tails(path) for path in paths}
     names: dict[str, str] = {}
