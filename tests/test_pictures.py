@@ -17,6 +17,7 @@ from matplotlib.text import Text
 
 from pbdkit.drawing import compare, plot
 from pbdkit.drawing.mesh import cells_of, outline, whole
+from pbdkit.drawing.outline import distance_from
 from pbdkit.drawing.pixels import Grid
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -341,6 +342,88 @@ def test_fields_end_at_the_outline_and_scales_are_of_what_lies_inside():
     assert drawn(5.0, 6.8)  # between the outline at 6.6 and the next line of particles
     assert drawn(2.1, 4.0)
     assert not drawn(5.0, 4.0)
+
+
+CHEBYSHEV = {"type": "chebyshev", "shells": 1}
+PLATE = {"type": "rectangle", "width": 12.3, "height": 8.0, "origin": [-0.2, 0.0]}
+NOTCH = {"type": "polygon", "vertices": [[7.4, -1.0], [9.8, -1.0], [8.55, 5.3]]}
+CLIPPED = {
+    "hole": (CHEBYSHEV, SQUARE, [PLATE, {"type": "disc", "radius": 2.3, "centre": [3.6, 4.4]}]),
+    "notch": (WHOLE, {"type": "hexagonal", "a": 0.8}, [PLATE, NOTCH]),
+    "dogbone": (CHEBYSHEV, SQUARE, [{"type": "dogbone", "length": 24.0, "width": 9.0,
+                "gauge_length": 10.0, "gauge_width": 5.6, "radius": 8.0}]),
+}  # fmt: skip
+
+
+FILLET = 8.0 * np.arccos(1 - 1.7 / 8.0), np.sqrt(8.0**2 - 6.3**2)
+LENGTHS = {
+    "hole": 2 * (12.3 + 8.0) + 2 * np.pi * 2.3,
+    "notch": 2 * (12.3 + 8.0) - 5.3 / 6.3 * 2.4 + np.hypot(1.15, 6.3) * 5.3 / 6.3
+    + np.hypot(1.25, 6.3) * 5.3 / 6.3,
+    "dogbone": 2 * (9.0 + 10.0 + 2 * FILLET[0] + (14.0 - 2 * FILLET[1])),
+}  # fmt: skip
+PLAIN = {"name": "plain", "lattice": SQUARE, "rule": {"type": "barycentre"}, "steps": 1}
+
+
+def cut_body(name):
+    neighbours, lattice, parts = CLIPPED[name]
+    given = {"rule": {"type": "elastic", "poisson_ratio": 0.3}, "frame": {"type": "natural"},
+             "fracture": {"type": "none"}}  # fmt: skip
+    body = {"type": "difference", "of": parts} if len(parts) > 1 else parts[0]
+    return pulled(name, lattice, body, neighbours, **given), body
+
+
+def bent(x):
+    """Places where a body is stretched, sheared and turned, and the way back."""
+    a = np.array([[1.3, 0.25], [-0.35, 0.9]])
+    return x @ a.T + [3.0, -1.0], lambda y: (y - [3.0, -1.0]) @ np.linalg.inv(a).T
+
+
+@pytest.mark.parametrize("name", CLIPPED)
+def test_fields_end_at_the_deformed_outline(name):
+    ds, body = cut_body(name)
+    assert not ds.inside.all()
+    moved, back = bent(ds.reference.values)
+    ds = ds.isel(time=[0]).assign(position=ds.position.isel(time=[0]).copy(data=moved[None]))
+    ax = plot(ds, color="reference_x", filled=True, size=(8, 6), dpi=60)
+    image = np.asarray(image_of(ax).get_array().filled(np.nan))
+    left, right, low, high = image_of(ax).get_extent()
+    pixel = (right - left) / image.shape[1]
+    x = left + pixel * (np.arange(image.shape[1]) + 0.5)
+    y = low + (high - low) / image.shape[0] * (np.arange(image.shape[0]) + 0.5)
+    at = back(np.stack(np.meshgrid(x, y), axis=-1))
+    shape = pbdkit.Experiment(**PLAIN | {"body": body}).body
+    distance = distance_from(shape, at)
+    clear = np.abs(distance) > 4 * pixel  # the distance of a dogbone is along y
+    np.testing.assert_array_equal(np.isfinite(image)[clear], distance[clear] < 0)
+    shown = clear & (distance < 0)
+    np.testing.assert_allclose(image[shown], at[shown][:, 0], atol=3 * pixel)
+    assert (~clear).mean() < 0.1
+
+
+@pytest.mark.parametrize("name", CLIPPED)
+def test_the_outline_at_rest_is_that_of_the_body(name):
+    ds, body = cut_body(name)
+    ax = plot(ds, 0, "reference_x", outline=True, dpi=50)
+    sides = np.array(
+        [c for c in ax.collections if isinstance(c, LineCollection)][-1].get_segments()
+    )
+    shape = pbdkit.Experiment(**PLAIN | {"body": body}).body
+    away = np.abs(distance_from(shape, sides.reshape(-1, 2)))
+    assert np.quantile(away, 0.98) < 0.01
+    assert away.max() < 0.1  # a corner within a part of a cell
+    length = np.hypot(*(sides[:, 1] - sides[:, 0]).T).sum()
+    # Of the notch a cell at its tip is left out, as it would connect both sides.
+    assert length == pytest.approx(LENGTHS[name], rel=0.02)
+
+
+def test_a_value_that_is_missing_beyond_the_outline_has_no_jumps_between_cells():
+    ds, _ = cut_body("hole")
+    values = np.where(ds.inside, ds.reference[:, 0], np.nan)
+    ds = ds.isel(time=[0]).assign(seen=("particle", values))
+    image = np.asarray(image_of(plot(ds, color="seen", filled=True)).get_array().filled(np.nan))
+    jumps = np.abs(np.diff(image, axis=0))
+    assert np.nanmax(jumps) < 0.1
 
 
 def test_axes_are_drawn_into(torn):

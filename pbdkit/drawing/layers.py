@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.drawing.figures import figure_of
 from pbdkit.drawing.palette import OF_KINDS, Palette
-from pbdkit.drawing.pixels import Grid
+from pbdkit.drawing.pixels import Cut, Grid
 from pbdkit.drawing.recording import Body, Snapshot
 from pbdkit.drawing.scale import Scale
 
@@ -35,9 +35,9 @@ class Layer(ABC):
 
 
 class Field(Layer):
-    """A quantity of particles over whole cells, as pixels; particles in none are dots of a size in
-    points, and a pixel where that is next to nothing. A corner beyond the outline that has no value
-    takes the mean of the others of its cell."""
+    """A quantity of particles over whole cells up to the outline, as pixels; particles in none are
+    dots of a size in points, and a pixel where that is next to nothing. A corner beyond the outline
+    that has no value takes the mean of the cells that meet there."""
 
     def __init__(self, ax: Axes, body: Body, grid: Grid, scale: Scale, size: float) -> None:
         self._body, self._grid = body, grid
@@ -49,19 +49,17 @@ class Field(Layer):
     def show(self, now: Snapshot) -> None:
         """The mean of what lies in a pixel."""
         assert now.values is not None
-        cells = self._body.whole_cells(self._body.cells, now.broken)
-        valued = np.isfinite(now.values)
-        if not valued[self._body.inside].all():
-            fillable = (valued | self._body.beyond)[cells].all(axis=1)
-            cells = cells[fillable & valued[cells].any(axis=1)]
-        alone = _alone(cells, self._body.inside & valued)
+        body, values = self._body, now.values.astype(np.float32)
+        chosen = body.whole_cells(body.cells, now.broken)
+        if not np.isfinite(values[body.inside]).all():
+            values = _filled(values, body.cells[chosen], body.beyond)
+            chosen = chosen[np.isfinite(values)[body.cells[chosen]].all(axis=1)]
+        alone = _alone(body.cells[chosen], body.inside & ~body.beyond & np.isfinite(values))
         self._alone.set_offsets(now.position[alone])
         self._alone.set_array(now.values[alone])
-        cells = _with(cells, alone)
-        values = now.values.astype(np.float32)[cells]
-        if not np.isfinite(values).all():
-            values = np.where(np.isfinite(values), values, np.nanmean(values, axis=1)[:, None])
-        self._image.set_data(self._grid.mean(self._grid.places(now.position)[cells], values))
+        cells = _with(body.cells[chosen], alone)
+        corners, cut = self._grid.places(now.position)[cells], _cut(body, chosen, len(alone))
+        self._image.set_data(self._grid.mean(corners, values[cells], cut))
 
 
 class BondField(Layer):
@@ -97,20 +95,22 @@ class Classes(Layer):
 
     def show(self, now: Snapshot) -> None:
         """That of the nearest particle; of several in a pixel, the one on top."""
-        cells = self._body.whole_cells(self._body.cells_with_frame, now.broken)
-        ranks = self._palette.ranks(now)
-        there = np.isfinite(ranks)
-        cells = cells[there[cells].all(axis=1)]
-        cells = _with(cells, _alone(cells, there))
+        body, ranks = self._body, self._palette.ranks(now)
+        chosen, there = body.whole_cells(body.cells_with_frame, now.broken), np.isfinite(ranks)
+        chosen = chosen[there[body.cells_with_frame[chosen]].all(axis=1)]
+        alone = _alone(body.cells_with_frame[chosen], there & ~body.beyond)
+        cells = _with(body.cells_with_frame[chosen], alone)
+        # Where cells are cut the body is all there is: both kinds of cells are the same.
+        cut = _cut(body, chosen, len(alone)) if body.inside.all() else None
         corners = self._grid.places(now.position)[cells]
-        self._image.set_data(self._grid.latest(corners, ranks[cells]))
+        self._image.set_data(self._grid.latest(corners, ranks[cells], cut))
 
 
 class Dots(Layer):
-    """A dot at each particle, in the colour of its value or its class."""
+    """A dot at each particle, in the colour of its value or its class; none at those `hidden`."""
 
-    def __init__(self, ax: Axes, size: float, colours: Scale | Palette) -> None:
-        self._colours = colours
+    def __init__(self, ax: Axes, size: float, colours: Scale | Palette, hidden: Array) -> None:
+        self._colours, self._hidden = colours, hidden
         edge: dict[str, Any] = {"edgecolors": INK, "linewidths": 0.08 * size}
         self._dots: PathCollection = ax.scatter([], [], size**2, zorder=3, **edge)
         if isinstance(colours, Scale):
@@ -122,7 +122,7 @@ class Dots(Layer):
         palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
         ranks = palette.ranks(now)
         order = np.argsort(ranks, kind="stable")
-        order = order[np.isfinite(ranks[order])]
+        order = order[np.isfinite(ranks[order]) & ~self._hidden[order]]
         self._dots.set_offsets(now.position[order])
         if isinstance(self._colours, Scale):
             assert now.values is not None
@@ -202,6 +202,26 @@ def _image(ax: Axes, grid: Grid, scale: Scale) -> AxesImage:
         norm=scale.norm, extent=grid.box, origin="lower", aspect="equal", zorder=0,
         interpolation_stage="data",
     )  # fmt: skip
+
+
+def _filled(values: Array, cells: Array, beyond: Array) -> Array:
+    """The values, with those missing beyond the outline: each the mean of the cells that meet
+    there, of which each counts the mean of its known corners."""
+    known = np.isfinite(values)
+    some = cells[(beyond & ~known)[cells].any(axis=1) & known[cells].any(axis=1)]
+    means = np.nanmean(values[some], axis=1)
+    corners = some.ravel()
+    count = np.bincount(corners, minlength=len(values))
+    total = np.bincount(corners, np.repeat(means, some.shape[1]), len(values))
+    taken = beyond & ~known & (count > 0)
+    return np.where(taken, total / np.maximum(count, 1), values).astype(np.float32)
+
+
+def _cut(body: Body, chosen: Array, alone: int) -> Cut | None:
+    """What the outline cuts off the chosen cells, with some after them that are not cut."""
+    if body.cut is None:
+        return None
+    return Cut(body.cut, np.append(body.cut.row[chosen], np.full(alone, -1)))
 
 
 def _alone(cells: Array, chosen: Array) -> Array:

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from pbdkit.drawing.labels import counted_in, label, plain
 from pbdkit.drawing.look import is_number
-from pbdkit.drawing.mesh import cells_of, whole
+from pbdkit.drawing.mesh import cells_of, outline, whole
+from pbdkit.drawing.outline import CutCells, outline_at_rest, shape_of
 from pbdkit.drawing.quantity import Quantity, quantity_of
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.body import Body as Shape
 from pbdkit.results.layout import OF_BODY, as_step, broken_by
 from pbdkit.results.sites import rows_of
 from pbdkit.scene.raster import FRAME
@@ -37,7 +39,8 @@ class Body:
     """What does not change: `reference` (particle, axis), `site` (particle, index), `number`
     (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
     each bond (bond, 2), and when each broke (bond,), -1 where it did not. Of the body `beyond` are
-    corners of cut cells that lie beyond its outline."""
+    corners of cut cells that lie beyond its outline, `shape`, which is None where there are none or
+    it is not known."""
 
     reference: Array
     site: Array
@@ -46,6 +49,7 @@ class Body:
     ends: Array
     broken_step: Array
     beyond: Array
+    shape: Shape | None
 
     @cached_property
     def cells(self) -> Array:
@@ -69,11 +73,25 @@ class Body:
         width, height = np.ptp(x, axis=0) if len(x) else (0.0, 0.0)
         return float(np.sqrt(width * height / max(1, len(x)))) or 1.0
 
+    @cached_property
+    def cut(self) -> CutCells | None:
+        """Those of `cells` that the outline cuts; None where there are none."""
+        if self.shape is None:
+            return None
+        return CutCells.of(self.shape, self.cells, self.reference, self.beyond)
+
+    @cached_property
+    def outline(self) -> Array:
+        """The outline at rest, as sides (side, end, axis)."""
+        if self.shape is None or self.cut is None:
+            return np.asarray(self.reference[outline(self.cells, len(self.reference))])
+        return outline_at_rest(self.shape, self.cut, self.cells, self.reference)
+
     def whole_cells(self, cells: Array, broken: Array) -> Array:
-        """Those without a broken bond along a side."""
+        """The numbers of those without a broken bond along a side."""
         if not broken.any():
-            return cells
-        return np.asarray(cells[whole(cells, self.ends[broken], len(self.reference))])
+            return np.arange(len(cells))
+        return np.flatnonzero(whole(cells, self.ends[broken], len(self.reference)))
 
 
 @dataclass(frozen=True)
@@ -136,7 +154,8 @@ class Recording:
         beyond = np.zeros(len(rows), bool)
         if "inside" in dataset.variables:
             beyond = inside & ~dataset["inside"].values[rows].astype(bool)
-        return Body(reference, site, numbers, inside, ends, broken, beyond)
+        shape = shape_of(dataset) if beyond.any() else None
+        return Body(reference, site, numbers, inside, ends, broken, beyond, shape)
 
     def row(self, time: float | None) -> int:
         """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""

@@ -26,7 +26,6 @@ from pbdkit.drawing.layers import (
 )
 from pbdkit.drawing.look import Look
 from pbdkit.drawing.manner import DETAILED, MANY_BONDS, manner_of
-from pbdkit.drawing.mesh import outline
 from pbdkit.drawing.page import Page
 from pbdkit.drawing.palette import OF_KINDS, Palette, palette_of
 from pbdkit.drawing.pixels import Grid
@@ -141,10 +140,10 @@ class Sheet:
             width = 2.0 * manner.line
             yield BondField(ax, body, grid, scale) if many else BondValues(ax, body, width, scale)
         if self._look.outline:
-            draw_outline(ax, body.reference[outline(body.cells, len(body.reference))])
+            draw_outline(ax, body.outline)
         if manner.dots:
             colours = {"values": scale, "classes": self._palette}.get(manner.dots)
-            yield Dots(ax, manner.dot, colours or OF_KINDS)
+            yield Dots(ax, manner.dot, colours or OF_KINDS, body.beyond & manner.filled)
 
     def _grid(self, ax: Axes) -> Grid:
         """The pixels of a field, finer than those of the picture where cells are few."""
