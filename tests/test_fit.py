@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -341,6 +342,8 @@ def test_the_command_writes_what_python_returns(call, tmp_path):
     assert 215e3 < found["youngs_modulus"]["value"] < 227e3
     assert found["residual_over_noise"] < 1.2
     assert "rule.poisson_ratio: 0.3" in result.out
+    assert re.search(r"^Young's modulus: 2\d{5} ± \d+ MPa$", result.out, re.M)
+    assert "times the noise of 0.0003 mm, over" in result.out
 
 
 WRONG = {

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import re
 
 import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.drawing.fit import draw_fit
 from pbdkit.fitting.calling import problem_of
 from pbdkit.fitting.specification import described_fit
 from pbdkit.fitting.tracks import TracksObservation
@@ -114,6 +116,31 @@ def test_a_curve_of_force_tells_youngs_modulus_too(measured, against):
     assert known.youngs_modulus is None
     error = {id(f): f.values["rule.poisson_ratio"].error for f in (found, known)}
     assert error[id(known)] <= error[id(found)]
+
+
+def test_with_units_forces_are_newtons_and_the_modulus_is_in_mpa(measured, tmp_path):
+    rows = np.loadtxt(measured / "curve.csv", delimiter=",", skiprows=1)
+    write(tmp_path / "newtons.csv", ["displacement", "force"], rows * [1.0, 2.0])
+    unknown = {"rule.poisson_ratio": TOLD["rule.poisson_ratio"]}
+    given = curve(measured) | {"file": str(tmp_path / "newtons.csv")}
+    given |= {"noise": 2.0 * given["noise"]} if "noise" in given else {}
+    found = pbdkit.fit(
+        {
+            "experiment": bar(units={"length": "2 mm"}),
+            "unknown": unknown,
+            "measured": given,
+        }
+    )
+    modulus = found.youngs_modulus
+    assert modulus.value == pytest.approx(MODULUS, abs=4 * modulus.error)
+    assert re.search(r"^Young's modulus: [\d.]+ ± [\d.]+ MPa$", "\n".join(found.lines()), re.M)
+    assert modulus.as_dict()["unit"] == "MPa"
+    assert " N, over " in str(found.met[0])
+    axes = draw_fit(found).subfigs[0].axes
+    assert axes[0].get_title() == "force on group 1 (N)"
+    assert axes[0].get_xlabel() == "displacement of group 1 (mm)"
+    seen = axes[0].lines[0].get_xydata()
+    np.testing.assert_allclose(seen, rows * 2.0)
 
 
 def test_two_measurements_tell_more_than_each(measured):

@@ -145,8 +145,28 @@ def test_units_make_labels_no_longer_than_there_is_room(monkeypatch):
     assert faults(figure_of(axes), monkeypatch) == []
     assert axes.get_title() == "modelling/strip, step 1"
     said = " ".join(" ".join(text.split()) for text, _ in drawn_texts(axes.figure, monkeypatch))
-    assert "x (lattice unit of 1.25 mm)" in said
+    assert "x (mm)" in said
+    left, right = axes.get_xlim()
+    assert (left, right) == pytest.approx((0.0, 100.0), abs=6.0)
     assert "stress, xx component (MPa)" in said
+
+
+def test_pictures_are_in_the_units_of_the_user():
+    plate = pbdkit.run(pbdkit.load("modelling/composite-plate", settings=["units.length=0.5 mm"]),
+                       progress=False)  # fmt: skip
+    drawn, again = (
+        plot(ds, color="u_x", filled=True, dpi=80) for ds in (plate, plate.pbd.physical())
+    )
+    assert figure_of(drawn).texts[0].get_text() == "x (mm)"
+    (bar,) = [ax for ax in figure_of(drawn).axes if ax is not drawn]
+    assert bar.get_ylabel() == "displacement, along x (mm)"
+    image, same = image_of(drawn), image_of(again)
+    assert image.get_clim()[1] == pytest.approx(float(plate.u_mm.sel(axis="x").max()))
+    np.testing.assert_allclose(image.get_extent(), same.get_extent())
+    holes = [np.isnan(one.get_array().filled(np.nan)) for one in (image, same)]
+    np.testing.assert_array_equal(*holes)
+    middle = np.mean(image.get_extent()[:2])
+    assert middle == pytest.approx(30.0, abs=0.5)  # of 60 mm
 
 
 def image_of(ax):

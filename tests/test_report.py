@@ -1,6 +1,7 @@
 """The page of a result: what it holds, and what it does in a browser."""
 
 import gzip
+import io
 import json
 import re
 from base64 import b64decode
@@ -11,6 +12,7 @@ import pytest
 from browser import until
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 import pbdkit
 from pbdkit.experiment.source import read_text
@@ -73,6 +75,61 @@ def click_at(page, dataset, place):
 def number_beside(page, name):
     row = page.locator("aside tr").filter(has=page.get_by_role("cell", name=name, exact=True))
     return float(row.locator("td").nth(1).inner_text().split()[0])
+
+
+@pytest.fixture(scope="module")
+def hole(tmp_path_factory):
+    """A plate with a hole that cuts cells, and its page."""
+    given = ["lattice.a=0.1", "diagnostics=[{type: stress, youngs_modulus: 1.0}]"]
+    dataset = pbdkit.run(pbdkit.load("material/hole", settings=given), progress=False)
+    return dataset, written(dataset, tmp_path_factory.mktemp("hole"))
+
+
+def test_a_page_holds_where_the_outline_is_if_it_cuts_cells(hole, sheet):
+    held = RunContent(hole[0]).within(LIMIT)["run"]["lattice"]
+    away = 0.5 - np.hypot(*(hole[0].reference.values - 1.0).T)
+    edges = np.abs(hole[0].reference.values - 1.0).max(axis=1) - 1.0
+    np.testing.assert_allclose(unpacked(held["beyond"]), np.maximum(away, edges), atol=1e-6)
+    assert "beyond" not in RunContent(sheet[0]).within(LIMIT)["run"]["lattice"]
+
+
+def test_a_page_is_in_the_units_of_the_user():
+    settings = ["units.length=0.5 mm", "fracture={type: strain, failure: 0.5}"]
+    dataset = pbdkit.run(
+        pbdkit.load("modelling/composite-plate", settings=settings), progress=False
+    )
+    run = RunContent(dataset).within(LIMIT)["run"]
+    lattice, bonds = run["lattice"], run["bonds"]
+    reference = dataset.reference_mm.values
+    assert lattice["length"] == "mm"
+    assert lattice["spacing"] == pytest.approx(0.5)
+    assert lattice["box"][0] == pytest.approx(reference[:, 0].min(), abs=0.1)
+    assert lattice["box"][2] == pytest.approx(60.0, abs=0.1)
+    np.testing.assert_allclose(
+        unpacked(lattice["u"])[1::2], dataset.u_mm[-1].values.ravel(), rtol=1e-6
+    )
+    rest = unpacked(bonds["rest"], "<f8").reshape(-1, 2)
+    assert np.hypot(*rest.T).min() == pytest.approx(0.5)
+    (curve,) = [c for c in run["curves"] if c["title"].startswith("mean displacement of")]
+    assert curve["y_label"] == "mm"
+
+
+def test_a_field_of_a_page_ends_at_the_outline(page, hole):
+    dataset, path = hole
+    opened(page, path)
+    page.get_by_label("Colour").select_option("stress_xx")
+    page.get_by_label("Fill").check()
+    show_step(page, 0)
+    image = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"))
+    low, high = dataset.position.values.min((0, 1)), dataset.position.values.max((0, 1))
+    size = np.array(image.shape[1::-1])
+    scale = (size / (high - low + 0.2)).min()
+    turn = np.linspace(0, 2 * np.pi, 60)
+    for radius, empty in ((0.46, True), (0.54, False)):
+        at = 1.0 + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        x, y = ((at - (low + high) / 2) * scale * (1, -1) + size / 2).round().astype(int).T
+        is_white = (image[y, x] == 255).all(axis=1)
+        assert is_white.mean() > 0.9 if empty else is_white.mean() < 0.1
 
 
 def test_the_slider_and_the_keys_move_the_lattice(page, sheet):
@@ -325,10 +382,12 @@ def test_the_experiment_shown_is_the_one_that_was_run(name):
 
 @given(st.lists(st.floats(-(2.0**90), 2.0**90, width=32)))
 def test_packed_arrays_are_the_arrays(values):
-    made = packed(values, "f4")
+    np.testing.assert_array_equal(unpacked(packed(values, "f4")), np.float32(values))
+
+
+def unpacked(made, kind="<f4"):
     places = np.frombuffer(gzip.decompress(b64decode(made["data"])), np.uint8)
-    found = places.reshape(4, -1).T.copy().view("<f4").ravel()
-    np.testing.assert_array_equal(found, np.float32(values))
+    return places.reshape(np.dtype(kind).itemsize, -1).T.copy().view(kind).ravel()
 
 
 def test_scripts_need_nothing_else():

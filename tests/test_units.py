@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.drawing.labels import counted_in
+from pbdkit.drawing.labels import in_its_units
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import units as units_module
@@ -117,7 +117,7 @@ def test_variables_say_both_scales(bar: Any) -> None:
     assert bar.position.attrs["units"] == "lattice unit"
     said = bar.pe1.attrs
     assert (said["physical_units"], said["physical_factor"]) == ("mm^2", 0.0625)
-    assert counted_in(bar.position.attrs) == "lattice unit of 0.25 mm"
+    assert in_its_units(bar.position.attrs) == (0.25, "mm")
     own = bar.reaction.attrs
     assert own["lattice_units"] == "youngs_modulus * thickness * lattice unit"
     assert own["lattice_factor"] == pytest.approx(1 / (206e3 * 3.05 * 0.25))
@@ -279,3 +279,25 @@ def test_pint_is_imported_where_an_experiment_has_units_only() -> None:
     for name, there in (("material/bar", "False"), ("modelling/strip", "True")):
         command = [sys.executable, "-c", look.format(name)]
         assert subprocess.run(command, capture_output=True, text=True).stdout.strip() == there
+
+
+def test_check_says_forces_as_the_file_does(call: Any) -> None:
+    for load, told in {
+        "{select: {edge: right}, force: [2 kN, 0.0]}": "force [2, 0] kN",
+        "{select: {edge: right}, force: [20 N, 0.0]}": "force [20, 0] N",
+        "{select: {edge: right}, body_force: [0.0, -0.5 N/mm^2]}": "body force [0, -0.5] N/mm²",
+    }.items():
+        assert told in call("check", "modelling/composite-plate", "--set", f"loads.0={load}").out
+
+
+def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
+    given = ["paper/a", "--set", "units={length: 2 mm}"]
+    told = call("check", *given, "--verbose").out
+    assert "moves by 0.7 mm a step and leaves the body 4.09 mm behind" in told
+    assert "more than a bond (2 mm)" in told
+    assert "mm behind equilibrium if the leaders' fastest steps went on" in told
+
+
+def test_units_that_are_those_wanted_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pbdkit.interfaces.units._registry", lambda: pytest.fail("pint is used"))
+    assert Units(length="2.5 mm", youngs_modulus="3000 MPa").length_mm == 2.5

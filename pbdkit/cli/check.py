@@ -12,11 +12,13 @@ import click
 import numpy as np
 
 from pbdkit.cli.options import experiment_argument, json_option, set_option, verbose_option
+from pbdkit.interfaces.units import BODY_FORCE, FORCE, in_lengths
 
 if TYPE_CHECKING:
     from pbdkit.experiment.leaders import Driven, LeaderGroup
     from pbdkit.experiment.loads import Load
     from pbdkit.experiment.model import Experiment
+    from pbdkit.interfaces.units import Units
     from pbdkit.prediction.forecast import Forecast
     from pbdkit.scene.scene import Scene
 
@@ -75,8 +77,9 @@ def _who(scene: Scene, found: Forecast, most: int | None) -> Iterator[Row]:
     moving = (f"{_words(*one)} {_motion(one[2])}" for one in groups if one not in held)
     yield from _listed("leaders", moving, most)
     each = scene.loads.each if scene.loads else ()
+    units = scene.experiment.units
     loads = ((f"loads.{n}", len(one.rows), one.load) for n, one in enumerate(each))
-    yield from _listed("loads", (f"{_words(*one)} {_force(one[2])}" for one in loads), most)
+    yield from _listed("loads", (f"{_words(*one)} {_force(one[2], units)}" for one in loads), most)
     obstacles = enumerate(barrier.group for barrier in scene.barriers)
     yield from _listed("obstacles", (f"obstacles.{n} {_motion(one)}" for n, one in obstacles), most)
     yield from _listed("regions", _in_regions(scene), most)
@@ -139,10 +142,16 @@ def _when(group: Driven) -> str:
     return f" along {axes}" * bool(axes) + begins + f" until step {until}" * (until is not None)
 
 
-def _force(load: Load) -> str:
-    force = ", ".join(f"{one:.6g}" for one in load.force_at(max(load.from_, 1)).tolist())
-    kind = "force" if load.force else "body force"
-    return f"{kind} [{force}]"
+def _force(load: Load, units: Units | None) -> str:
+    """As an experiment writes it: in N or kN, and N/mm², where it has the units for that."""
+    force, counted = load.force_at(max(load.from_, 1)), ""
+    quantity = FORCE if load.force else BODY_FORCE
+    if units and not units.lacks(quantity):
+        force, counted = force * units.scale(quantity), f" {quantity.unit}".replace("^2", "²")
+        if load.force and np.abs(force).max() >= 1e3:
+            force, counted = force / 1e3, f" k{FORCE.unit}"
+    listed = ", ".join(f"{one:.6g}" for one in force.tolist())
+    return f"{'force' if load.force else 'body force'} [{listed}]{counted}"
 
 
 def _in_regions(scene: Scene) -> Iterator[str]:
@@ -209,6 +218,8 @@ def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
         told = ", ".join(f"{t} in {n}" for t, n in found.steps_to.items() if n is not None)
         yield from [("steps", f"settle to {told}")] if told else []
     if found.lag is not None:
-        reached = "" if found.lag_reached is None else f", {found.lag_reached:.4g} when they end"
-        told = f"{found.lag:.4g} lattice units behind equilibrium if the leaders' fastest steps"
+        size, counted = in_lengths(experiment.units)
+        end = found.lag_reached
+        reached = "" if end is None else f", {size * end:.4g} when they end"
+        told = f"{size * found.lag:.4g} {counted} behind equilibrium if the leaders' fastest steps"
         yield "lag", f"{told} went on{reached}"

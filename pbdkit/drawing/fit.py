@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.interfaces.units import LENGTH
 from pbdkit.registry.extras import refuse_no_matplotlib
 
 if TYPE_CHECKING:
@@ -65,29 +66,36 @@ def _curve_size(count: int) -> tuple[float, float]:
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     field, information = fitted.field(n), fitted.information(n)
     noise, most = fitted.met[n].noise, max(t.max() for t in information.values())
+    factor, unit = fitted.met[n].factor, fitted.met[n].unit
+    counted = f" ({unit})" if unit else ""
     wide, count = _is_wide(fitted, n), 3 + len(information)
     shape = (count, 2) if wide else (2, count)
     axes = figure.subplots(*shape, sharex=True, sharey=True)
     area = float(np.prod(np.ptp(field.points, axis=0)) / np.ptp(field.points, axis=0)[0] ** 2)
     size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(area / len(field.points)))
     for column, name in enumerate(("ux", "uy")):
-        measured, left = field.measured[:, column], field.residual[:, column]
+        measured, left = factor * field.measured[:, column], factor * field.residual[:, column]
         shown = [
-            (f"{name} measured", measured, (measured.min(), measured.max()), "viridis"),
-            (f"{name} fitted", measured - left, (measured.min(), measured.max()), "viridis"),
-            (f"{name} residual / noise", left / noise, (-WITHIN, WITHIN), "RdBu_r"),
+            (f"{name} measured{counted}", measured, (measured.min(), measured.max()), "viridis"),
+            (
+                f"{name} fitted{counted}",
+                measured - left,
+                (measured.min(), measured.max()),
+                "viridis",
+            ),
+            (f"{name} residual / noise", left / (factor * noise), (-WITHIN, WITHIN), "RdBu_r"),
         ]
         for path, told in information.items():
             share = told.reshape(2, -1)[column] / most
             shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
         own = axes[:, column] if wide else axes[column]
         for ax, (title, values, limits, colours) in zip(own, shown, strict=True):
-            _scatter(ax, field.points, values, limits, colours, size)
+            _scatter(ax, factor * field.points, values, limits, colours, size)
             ax.set_title(title, fontsize=9)
     for ax in axes[-1]:
-        ax.set_xlabel("x (lattice unit)", fontsize=9)
+        ax.set_xlabel(f"x ({unit or LENGTH.lattice})", fontsize=9)
     for ax in axes[:, 0]:
-        ax.set_ylabel("y (lattice unit)", fontsize=9)
+        ax.set_ylabel(f"y ({unit or LENGTH.lattice})", fontsize=9)
 
 
 def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
@@ -97,25 +105,41 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     axes = grid.ravel()
     for ax in axes[count:]:
         ax.remove()
-    order = np.argsort(numbers.along)
-    axes[0].plot(numbers.along, numbers.measured, "o", color="0.7", markersize=4, label="measured")
-    axes[0].plot(
-        numbers.along[order], numbers.fitted[order], **_line(numbers.joined), label="fitted"
+    factor, along, what, over = _in_units(fitted, n)
+    measured, predicted, order = (
+        factor * numbers.measured,
+        factor * numbers.fitted,
+        np.argsort(along),
     )
+    axes[0].plot(along, measured, "o", color="0.7", markersize=4, label="measured")
+    axes[0].plot(along[order], predicted[order], **_line(numbers.joined), label="fitted")
     axes[0].legend(fontsize=8)
-    axes[1].plot(numbers.measured, numbers.fitted, ".", markersize=3)
-    axes[1].axline((float(numbers.measured[0]),) * 2, slope=1.0, color="0.6", linewidth=0.8)
-    axes[2].plot(numbers.along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
+    axes[1].plot(measured, predicted, ".", markersize=3)
+    axes[1].axline((float(measured[0]),) * 2, slope=1.0, color="0.6", linewidth=0.8)
+    axes[2].plot(along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
     axes[2].axhline(0.0, color="0.6", linewidth=0.8)
-    titles = [numbers.what, "fitted over measured", "residual / noise"]
+    titles = [what, "fitted over measured", "residual / noise"]
     most = max(t.max() for t in information.values())
     for ax, (path, told) in zip(axes[3:], information.items(), strict=False):
-        ax.plot(numbers.along, told / most, ".", markersize=3)
+        ax.plot(along, told / most, ".", markersize=3)
         titles.append(f"tells {path}")
     for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
         ax.set_title(title, fontsize=9)
-        ax.set_xlabel("measured" if k == 1 else numbers.over, fontsize=9)
+        ax.set_xlabel("measured" if k == 1 else over, fontsize=9)
         ax.tick_params(labelsize=8)
+
+
+def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
+    """Of tracks or a curve: by what its numbers are multiplied, what they go over, and what both
+    are, in the units of the experiment where it has some."""
+    numbers, met = fitted.numbers(n), fitted.met[n]
+    units = fitted.problem.observations[n].experiment.units
+    if units is None:
+        return 1.0, numbers.along, numbers.what, numbers.over
+    over_time = numbers.over.startswith("time")
+    along = numbers.along if over_time else units.length_mm * numbers.along
+    over = numbers.over if over_time else f"{numbers.over} ({LENGTH.unit})"
+    return met.factor, along, f"{numbers.what} ({met.unit})", over
 
 
 def _line(joined: bool) -> dict[str, Any]:

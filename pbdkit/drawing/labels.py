@@ -27,14 +27,6 @@ def signed(units: str) -> str:
     return "" if units == "1" else units
 
 
-def counted_in(attributes: Mapping[Any, Any]) -> str:
-    """The units of a variable, those of the lattice with what they are."""
-    units = str(attributes.get("units", ""))
-    if FACTOR not in attributes:
-        return units
-    return f"{units} of {attributes[FACTOR]:g} {attributes[UNITS]}"
-
-
 def in_its_units(attributes: Mapping[Any, Any]) -> tuple[float, str]:
     """By what the values of a variable are multiplied to be in mm and so on, and those units, as
     far as it says them; else 1 and its own."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from pbdkit.drawing.labels import in_its_units
 from pbdkit.drawing.mesh import outline
 from pbdkit.experiment.body import Body as Shape
 from pbdkit.experiment.body import Sites
@@ -38,6 +39,12 @@ def shape_of(dataset: xarray.Dataset) -> Shape | None:
     except (KeyError, ValidationError):
         return None
     return None if any(box.in_sites for box in shape.boxes()) else shape
+
+
+def lattice_unit(dataset: xarray.Dataset) -> float:
+    """Return what a lattice unit is in the units in which lengths of a dataset are drawn."""
+    lengths = dataset["position"].attrs
+    return float(in_its_units(lengths)[0] / lengths.get("lattice_factor", 1.0))
 
 
 @dataclass(frozen=True)

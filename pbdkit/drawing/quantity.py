@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.drawing.labels import counted_in
+from pbdkit.drawing.labels import in_its_units
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.results.layout import INDICES, broken_by, makers_of
@@ -25,13 +25,14 @@ PLACES = ("position", "reference", "number", "particle", "site", *INDICES)
 @dataclass(frozen=True)
 class Quantity:
     """Values of each `owner`, particle or bond, out of the variable `variable`: its component
-    number `component`, or the length where it is a vector and that is None. `words` has the
-    meanings of whole numbers that stand for words.
+    number `component`, or the length where it is a vector and that is None, times `factor` in its
+    `units`. `words` has the meanings of whole numbers that stand for words.
     """
 
     variable: str
     owner: str
     meaning: str
+    factor: float
     units: str
     vector: bool
     component: int | None
@@ -59,7 +60,7 @@ class Quantity:
             found = np.repeat(found[None], part.sizes["time"], axis=0)
         if self.variable == "broken_step":  # -1 where it is whole, as it was at earlier steps
             found = np.where(broken_by(found, part["time"].values[:, None]), found, np.nan)
-        return found
+        return found if self.factor == 1.0 else self.factor * found
 
 
 def axes_of(dataset: xarray.Dataset) -> list[str]:
@@ -101,7 +102,7 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> Quantity:
         variable,
         "bond" if "bond" in chosen.dims else "particle",
         meaning,
-        counted_in(chosen.attrs),
+        *in_its_units(chosen.attrs),
         vector,
         component,
         words,

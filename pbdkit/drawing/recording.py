@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.drawing.labels import counted_in, label, plain
+from pbdkit.drawing.labels import in_its_units, label, plain
 from pbdkit.drawing.look import is_number
 from pbdkit.drawing.mesh import cells_of, outline, whole
-from pbdkit.drawing.outline import CutCells, outline_at_rest, shape_of
+from pbdkit.drawing.outline import CutCells, lattice_unit, outline_at_rest, shape_of
 from pbdkit.drawing.quantity import Quantity, quantity_of
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.body import Body as Shape
@@ -40,7 +40,8 @@ class Body:
     (particle,), which are of the body and not of the frame (particle,), the rows of both ends of
     each bond (bond, 2), and when each broke (bond,), -1 where it did not. Of the body `beyond` are
     corners of cut cells that lie beyond its outline, `shape`, which is None where there are none or
-    it is not known."""
+    it is not known. A lattice unit is `unit` in the units of lengths; those of the
+    shape are lattice units."""
 
     reference: Array
     site: Array
@@ -50,6 +51,7 @@ class Body:
     broken_step: Array
     beyond: Array
     shape: Shape | None
+    unit: float
 
     @cached_property
     def cells(self) -> Array:
@@ -78,14 +80,15 @@ class Body:
         """Those of `cells` that the outline cuts; None where there are none."""
         if self.shape is None:
             return None
-        return CutCells.of(self.shape, self.cells, self.reference, self.beyond)
+        return CutCells.of(self.shape, self.cells, self.reference / self.unit, self.beyond)
 
     @cached_property
     def outline(self) -> Array:
         """The outline at rest, as sides (side, end, axis)."""
         if self.shape is None or self.cut is None:
             return np.asarray(self.reference[outline(self.cells, len(self.reference))])
-        return outline_at_rest(self.shape, self.cut, self.cells, self.reference)
+        at_rest = self.reference / self.unit
+        return self.unit * outline_at_rest(self.shape, self.cut, self.cells, at_rest)
 
     def whole_cells(self, cells: Array, broken: Array) -> Array:
         """The numbers of those without a broken bond along a side."""
@@ -107,7 +110,8 @@ class Snapshot:
 
 
 class Recording:
-    """The recorded steps of a dataset, with the quantity of that name, if any.
+    """The recorded steps of a dataset, with the quantity of that name, if any; in mm and so on
+    where the dataset says its scale.
 
     Raises ExperimentError for a dataset of several runs, for space that is no plane, and for a
     quantity that cannot be drawn. Only what is asked for is read.
@@ -121,7 +125,7 @@ class Recording:
             drawable = self._dataset if has_kinds else self._dataset.drop_vars("kind")
             self.quantity = quantity_of(drawable, color)
         self.title = plain(self._dataset.attrs.get("title", ""))
-        self._length_units = counted_in(self._dataset["position"].attrs)
+        self._factor, self._length_units = in_its_units(self._dataset["position"].attrs)
         self.steps = self._dataset["time"].values
 
     @property
@@ -148,14 +152,16 @@ class Recording:
             ends, broken = ends[self._bonds], np.full(len(self._bonds), -1.0)
         if "broken_step" in dataset and len(ends):
             broken = np.nan_to_num(dataset["broken_step"].values[self._bonds], nan=-1.0)
-        reference = dataset["reference"].transpose("particle", "axis").values[rows]
+        reference = self._factor * dataset["reference"].transpose("particle", "axis").values[rows]
         site = np.stack([dataset[name].values[rows] for name in "ij"], axis=1).astype(np.int64)
         inside = dataset["role"].values[rows] == OF_BODY
         beyond = np.zeros(len(rows), bool)
         if "inside" in dataset.variables:
             beyond = inside & ~dataset["inside"].values[rows].astype(bool)
         shape = shape_of(dataset) if beyond.any() else None
-        return Body(reference, site, numbers, inside, ends, broken, beyond, shape)
+        return Body(
+            reference, site, numbers, inside, ends, broken, beyond, shape, lattice_unit(dataset)
+        )
 
     def row(self, time: float | None) -> int:
         """Where a step lies; None is the last. Raises ExperimentError where it was not recorded."""
@@ -197,7 +203,7 @@ class Recording:
                 broken = broken_by(body.broken_step, math.ceil(step) if is_last else step)
                 yield Snapshot(
                     as_step(step),
-                    position[n][self._rows],
+                    self._factor * position[n][self._rows],
                     np.nan_to_num(kind[n][self._rows]).astype(np.int8),
                     None if values is None else values[n][self._owners],
                     broken,

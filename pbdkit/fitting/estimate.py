@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,24 +13,27 @@ from pbdkit.fitting.least_squares import TELLS, Solution
 from pbdkit.fitting.problem import Problem
 from pbdkit.fitting.resting_field import FieldSeen
 from pbdkit.fitting.specification import Force
+from pbdkit.interfaces.units import STRESS
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A value with its standard error. `told` is False where the data cannot tell it: then it says
-    nothing. `on_bound`: it stands on a bound, beyond which it might fit better."""
+    nothing. `on_bound`: it stands on a bound, beyond which it might fit better. `unit` is that of
+    both, empty where the experiment has no units."""
 
     value: float
     error: float
     told: bool = True
     on_bound: bool = False
+    unit: str = ""
 
     def __str__(self) -> str:
         if not self.told:
             return "the data cannot tell it"
         digits = max(0, 1 - int(np.floor(np.log10(self.error)))) if self.error > 0.0 else 6
         text = f"{self.value:.{min(digits, 12)}f} ± {self.error:.{min(digits, 12)}f}"
-        return text + (", on its bound" if self.on_bound else "")
+        return text + f" {self.unit}" * bool(self.unit) + ", on its bound" * self.on_bound
 
     def as_dict(self) -> dict[str, Any]:
         """In plain values; none of what the data cannot tell."""
@@ -38,12 +41,17 @@ class Estimate:
 
 
 def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) -> Estimate | None:
-    """What curves tell of it, else what follows from a force; None where there is neither."""
-    count = len(problem.unknowns)
+    """What curves tell of it, else what follows from a force; None where there is neither. In MPa
+    where the experiment has units."""
+    count, units = len(problem.unknowns), problem.observations[0].experiment.units
+    unit = STRESS.unit if units else ""
     if problem.with_modulus:
         value, error = float(solution.z[count]), float(solution.errors[count])
-        return Estimate(value, error, told=error < TELLS * abs(value))
-    return _of_force(force, problem, solution) if force else None
+        return Estimate(value, error, told=error < TELLS * abs(value), unit=unit)
+    if force is None:
+        return None
+    found, size = _of_force(force, problem, solution), units.length_mm if units else 1.0
+    return replace(found, value=found.value / size, error=found.error / size, unit=unit)
 
 
 def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:

@@ -20,6 +20,7 @@ from pbdkit.fitting.resting_field import FieldObservation
 from pbdkit.fitting.sampling import Sample
 from pbdkit.fitting.specification import Fit
 from pbdkit.fitting.tracks import TracksObservation
+from pbdkit.interfaces.units import FORCE, LENGTH
 from pbdkit.stepping.state import Floats
 
 
@@ -50,7 +51,8 @@ class FittedNumbers:
 @dataclass(frozen=True)
 class Met:
     """How well one measurement is met: its kind, the noise of its numbers, how much larger its
-    residuals are, how many numbers count, and how many rows are left out for which reason."""
+    residuals are, how many numbers count, and how many rows are left out for which reason. The
+    noise times `factor` is in `unit`, where the experiment has units."""
 
     kind: str
     noise: float
@@ -58,11 +60,14 @@ class Met:
     numbers: int
     left_out: int
     left_out_because: str = ""
+    factor: float = 1.0
+    unit: str = ""
 
     def __str__(self) -> str:
+        noise = f"{self.factor * self.noise:.3g} {self.unit}".rstrip()
         text = (
-            f"residual of the {self.kind}: {self.ratio:.2f} times the noise of {self.noise:.3g}, "
-            f"over {self.numbers} numbers"
+            f"residual of the {self.kind}: {self.ratio:.2f} times the noise of {noise}, over "
+            f"{self.numbers} numbers"
         )
         if not self.left_out:
             return text
@@ -247,4 +252,15 @@ def _met(observation: Observation, residuals: Floats, loss: Loss) -> Met:
         len(residuals),
         observation.left_out,
         observation.left_out_because,
+        *unit_of(observation),
     )
+
+
+def unit_of(observation: Observation) -> tuple[float, str]:
+    """By what the numbers of an observation are multiplied to be in its experiment's units, and
+    these: forces are given in N, lengths in lattice units; 1 and nothing without units."""
+    units = observation.experiment.units
+    if units is None:
+        return 1.0, ""
+    is_force = isinstance(observation, CurveObservation)
+    return (1.0, FORCE.unit) if is_force else (units.length_mm, LENGTH.unit)

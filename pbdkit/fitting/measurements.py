@@ -160,6 +160,7 @@ class MeasuredCurve(Measured):
     or over time, counted in steps, where it is measured `against` that.
 
     Forces are those of a body of this `thickness`. Without `youngs_modulus` that is found too.
+    Where the experiment has units, these are N, mm and MPa.
     """
 
     type: Literal["curve"] = "curve"
@@ -173,6 +174,7 @@ class MeasuredCurve(Measured):
     def observation(self, experiment: Experiment, modes: int) -> CurveObservation:
         """Of its run, over thickness and modulus, as far as they are known."""
         scale = self.thickness * (self.youngs_modulus or 1.0)
+        scale *= experiment.units.length_mm if experiment.units else 1.0
         found = CurveObservation.of(
             experiment,
             self.rows[:, 0],

@@ -32,7 +32,8 @@ Bounds = Annotated[Pair, AfterValidator(_two)]
 
 class Force(Strict):
     """What a leader group carries, and how thick the body is: Young's modulus follows, in the unit
-    of the force over those of thickness and lattice."""
+    of the force over those of thickness and lattice. Where the experiment has units, these are N,
+    mm and MPa."""
 
     group: Annotated[int, Field(ge=0)]
     value: Pair

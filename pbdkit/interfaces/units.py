@@ -114,6 +114,11 @@ class Units(Strict):
         unit, meaning = ("MPa", "stress") if name == "youngs_modulus" else ("mm", "length")
         return None if text is None else magnitude(text, unit, meaning)
 
+    @property
+    def length_mm(self) -> float:
+        """A lattice unit in mm."""
+        return magnitude(self.length, LENGTH.unit, LENGTH.meaning)
+
     def lacks(self, quantity: Quantity) -> list[str]:
         """What the quantity would need besides."""
         return [n for n in type(self).model_fields if getattr(quantity, n) and not getattr(self, n)]
@@ -175,6 +180,11 @@ def is_needed(field: FieldInfo) -> bool:
     return field.is_required() or any(m.otherwise is None for m in given)
 
 
+def in_lengths(units: Units | None) -> tuple[float, str]:
+    """What a lattice unit is in mm and that unit; without units 1 and lattice units."""
+    return (units.length_mm, LENGTH.unit) if units else (1.0, f"{LENGTH.lattice}s")
+
+
 def given_by_units(part: Component) -> list[str]:
     """The parameters of a part that `units` gives."""
     fields = type(part).model_fields.items()
@@ -194,11 +204,14 @@ def of_one_material(part: Component, info: ValidationInfo) -> Component:
 
 
 def magnitude(text: str, unit: str, meaning: str) -> float:
-    """The number of that unit. Raises PydanticCustomError for what is none, and without pint."""
+    """The number of that unit. Raises PydanticCustomError for what is none, and, where another unit
+    is given, without pint."""
     found = TEXT.fullmatch(text)
     number, given = found.groups() if found else (text, "")
     if len(text) > LONGEST or not UNIT.fullmatch(given):
         raise _fault(f"{text[:LONGEST]!r} is no number with a unit, as in 1 {unit}")
+    if given == unit:
+        return float(number)
     pint, registry = _registry()
     try:
         return float(registry.Quantity(float(number), registry.parse_units(given)).m_as(unit))

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.drawing.outline import lattice_unit
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.fracture_model import breaking_order
+from pbdkit.pages.naming import factor_of
 from pbdkit.pages.packing import packed
 from pbdkit.pages.thinning import Rows
 from pbdkit.results.explanation import Explained, Standing
@@ -104,10 +106,15 @@ class Bonds:
 
 def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | None:
     """All that the dataset has; of one that has no table of bonds those of its scene, unless
-    neighbours are found anew. None where neither knows any.
+    neighbours are found anew. None where neither knows any. Lengths are in the units of the page.
 
     Raises ExperimentError where dataset and scene do not go together.
     """
+    found = _in_lattice_units(dataset, scene)
+    return found and replace(found, rest=lattice_unit(dataset) * found.rest)
+
+
+def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | None:
     if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
@@ -151,7 +158,8 @@ def _told(dataset: xarray.Dataset) -> Bonds | None:
     ends = dataset["bond_ends"].values
     if not len(ends) or "reference" not in dataset.variables:
         return None
-    reference = dataset["reference"].values
+    reference = factor_of(dataset["reference"]) * dataset["reference"].values
+    reference /= lattice_unit(dataset)
     shell = dataset["shell"].values if "shell" in dataset.variables else np.ones(len(ends))
     whole = _whole(ends, reference[ends[:, 1] - 1] - reference[ends[:, 0] - 1], shell)
     return replace(broken_as(whole, dataset), model="not known")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.pages.naming import meaning_of, units_of
+from pbdkit.pages.naming import factor_of, meaning_of, units_of
 from pbdkit.pages.packing import packed
 from pbdkit.results.physical import TWIN_OF
 
@@ -88,7 +88,7 @@ def _lines(dataset: xarray.Dataset, name: str, along: str) -> Iterator[tuple[str
     """The values of each place along the other dimensions, with what it is called."""
     variable = dataset[name].transpose(..., along)
     others = [str(dim) for dim in variable.dims[:-1]]
-    values = np.asarray(variable.values, float)
+    values = factor_of(variable) * np.asarray(variable.values, float)
     for place in product(*(range(variable.sizes[dim]) for dim in others)):
         words = [_word(dataset, dim, n) for dim, n in zip(others, place, strict=True)]
         yield ", ".join(words), values[place]

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.drawing.mesh import cells_of, triangles_of
-from pbdkit.pages.naming import meaning_of, units_of
+from pbdkit.drawing.outline import distance_from, lattice_unit, shape_of
+from pbdkit.pages.naming import factor_of, meaning_of, units_of
 from pbdkit.pages.packing import packed
 from pbdkit.pages.thinning import Rows, Thinning
 from pbdkit.results.layout import OF_BODY
@@ -46,15 +47,22 @@ def bytes_a_particle(dataset: xarray.Dataset) -> int:
 
 
 def read(variable: xarray.DataArray, steps: Rows) -> Iterator[Array]:
-    """The values at each of the steps, (particle, ...)."""
+    """The values at each of the steps, (particle, ...), in the units of the page."""
+    factor = factor_of(variable)
     if "time" not in variable.dims:
-        yield np.asarray(variable.values)
+        yield in_units(variable.values, factor)
         return
     variable = variable.transpose("time", "particle", ...)
     if variable.nbytes <= AT_ONCE:
-        yield from np.asarray(variable.values)[steps]
+        each = iter(variable.values[steps])
     else:
-        yield from (np.asarray(variable.isel(time=row).values) for row in steps.tolist())
+        each = (variable.isel(time=row).values for row in steps.tolist())
+    yield from (in_units(values, factor) for values in each)
+
+
+def in_units(values: Any, factor: float) -> Array:
+    """Return the values times a factor; as they are where that is 1."""
+    return np.asarray(values) if factor == 1.0 else factor * np.asarray(values)
 
 
 def resting(
@@ -63,7 +71,7 @@ def resting(
     """What does not move: names, reference, triangles.
 
     `reference` (particle, axis) is where displacements are counted from, `spacing` the distance of
-    neighbours there.
+    neighbours there, both in the units of the page.
     """
     rows, role = shown.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
@@ -76,7 +84,17 @@ def resting(
         "reference": packed(reference[rows], "f8"),
         "labels": {name: packed(values, "i4") for name, values in labels.items()},
         "triangles": packed(_triangles(reference[rows], sites, role[rows] == OF_BODY), "i4"),
-    }
+    } | _outline(dataset, reference, rows)
+
+
+def _outline(dataset: xarray.Dataset, reference: Array, rows: Rows) -> dict[str, Any]:
+    """How far particles lie beyond the outline of the body, negative inside, where it cuts cells:
+    there fields end. In lattice units."""
+    if "inside" not in dataset.variables or dataset["inside"].ndim != 1:
+        return {}
+    if dataset["inside"].values.all() or (shape := shape_of(dataset)) is None:
+        return {}
+    return {"beyond": packed(distance_from(shape, reference[rows] / lattice_unit(dataset)), "f4")}
 
 
 def moving(dataset: xarray.Dataset, reference: Array, shown: Thinning) -> dict[str, Any]:

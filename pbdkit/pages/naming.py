@@ -1,10 +1,10 @@
-"""What variables are called in pages, and what they are counted in."""
+"""What variables are called in pages, and in which units they are."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pbdkit.drawing.labels import counted_in, signed
+from pbdkit.drawing.labels import in_its_units, signed
 
 if TYPE_CHECKING:
     import xarray
@@ -16,5 +16,10 @@ def meaning_of(variable: xarray.DataArray) -> str:
 
 
 def units_of(variable: xarray.DataArray) -> str:
-    """Its units, those of the lattice with what they are; nothing of plain numbers."""
-    return signed(counted_in(variable.attrs))
+    """Its units in a page, mm and so on where it says its scale; nothing of plain numbers."""
+    return signed(in_its_units(variable.attrs)[1])
+
+
+def factor_of(variable: xarray.DataArray) -> float:
+    """By what its values are multiplied to be in these."""
+    return in_its_units(variable.attrs)[0]

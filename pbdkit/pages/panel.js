@@ -20,11 +20,11 @@ export class LatticePanel {
     this.#controls();
     const left = make("div", { className: "body" }, this.choices, this.canvas, this.time, this.scale);
     place.append(make("div", { className: "lattice" }, left, this.beside));
-    const { box, spacing, triangles } = run.lattice, bonds = run.bonds?.ends ?? [];
+    const { box, spacing, triangles, beyond } = run.lattice, bonds = run.bonds?.ends ?? [];
     const shape = (box[2] - box[0] + spacing) / (box[3] - box[1] + spacing);
     this.canvas.style.aspectRatio = Math.min(Math.max(shape, 0.75), 4);
     const rows = { bonds: Uint32Array.from(bonds), triangles: Uint32Array.from(triangles) };
-    this.view = new LatticeView(this.canvas, { count: run.count, spacing, ...rows });
+    this.view = new LatticeView(this.canvas, { count: run.count, spacing, beyond, ...rows });
     this.tears = new Tears(run);
     this.canvas.addEventListener("click", (event) => this.#click(event));
     this.view.fit(box);

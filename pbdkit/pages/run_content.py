@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.drawing.outline import lattice_unit
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.pages.bonds import Bonds, bonds_of
 from pbdkit.pages.curves import curves, fewer_points
-from pbdkit.pages.lattice import bytes_a_particle, moving, resting, spacing_of
+from pbdkit.pages.lattice import bytes_a_particle, in_units, moving, resting, spacing_of
+from pbdkit.pages.naming import factor_of
 from pbdkit.pages.origin import experiment_text, facts, file_name, title_of
 from pbdkit.pages.settling import settling
 from pbdkit.pages.thinning import thinned
@@ -113,11 +115,11 @@ def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
 
 
 def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.float64]:
-    """Where displacements are counted from, (particle, axis): the reference, or the first recorded
-    step where nobody knows it."""
+    """Where displacements are counted from, (particle, axis), in the units of the page: the
+    reference, or the first recorded step where nobody knows it."""
     if "reference" in dataset.variables and dataset["reference"].ndim == 2:
-        return np.asarray(dataset["reference"].values)
+        return in_units(dataset["reference"].values, factor_of(dataset["reference"]))
     if scene is not None and scene.raster.count == dataset.sizes["particle"]:
-        return np.asarray(scene.raster.reference())
+        return in_units(scene.raster.reference(), lattice_unit(dataset))
     first = dataset["position"].isel(time=0, missing_dims="ignore")
-    return np.asarray(first.transpose("particle", "axis").values)
+    return in_units(first.transpose("particle", "axis").values, factor_of(first))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.pages.naming import meaning_of, units_of
+from pbdkit.pages.naming import factor_of, meaning_of, units_of
 from pbdkit.pages.packing import packed
 from pbdkit.results.members import STATUS
 from pbdkit.sweeps.grid import MESSAGE
@@ -23,7 +23,8 @@ Array = NDArray[Any]
 def _known(variable: xarray.DataArray) -> Array:
     """With NaN where a member has nothing."""
     values = np.asarray(variable.values, float)
-    return np.where(values == variable.attrs.get(FILL, np.nan), np.nan, values)
+    known = np.where(values == variable.attrs.get(FILL, np.nan), np.nan, values)
+    return factor_of(variable) * known
 
 
 def numbers(dataset: xarray.Dataset, grid: list[str]) -> Iterator[dict[str, Any]]:

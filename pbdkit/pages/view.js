@@ -13,11 +13,12 @@ const REACH = 12; // so many pixels from where the mouse is a particle or a bond
 
 export class LatticeView {
   /**
-   * `bonds` are two rows of particles a bond, `triangles` three a triangle: values fill them.
+   * `bonds` are two rows of particles a bond, `triangles` three a triangle: values fill them, up to
+   * where `beyond`, the distance of particles from an outline, becomes positive.
    * `spacing` is the distance of neighbours at rest. Throws Error without WebGL2.
    */
-  constructor(canvas, { count, bonds, spacing, triangles = null }) {
-    Object.assign(this, { canvas, count, bonds, spacing, triangles });
+  constructor(canvas, { count, bonds, spacing, triangles = null, beyond = null }) {
+    Object.assign(this, { canvas, count, bonds, spacing, triangles, beyond });
     this.positions = new Float32Array(2 * count);
     this.kinds = new Uint8Array(count).fill(1);
     this.values = null;
@@ -50,7 +51,7 @@ export class LatticeView {
   setTriangles(triangles) { this.triangles = triangles; this.stale.add("triangles"); }
   setColours(by) { this.by = by; }
   /** Whether values fill the triangles, if there are any. */
-  setFilled(filled) { this.fills = filled; }
+  setFilled(filled) { this.fills = filled; this.stale.add("values"); }
   select(row) { this.selected.particle = row; }
   selectBond(row) { this.selected.bond = row; }
 
@@ -210,6 +211,7 @@ export class LatticeView {
     this.buffers = {};
     this.sizes = {};
     this.stale = new Set(["positions", "values", "map", "kinds", "bonds", "triangles"]);
+    if (this.beyond) this.#attribute(3, "beyond", Float32Array.from(this.beyond), 1);
   }
 
   #listen() {
@@ -259,7 +261,22 @@ export class LatticeView {
       const level = factor ? (this.values[n] - low) * factor : 0.5;
       levels[n] = Number.isNaN(this.values[n]) ? -1 : Math.min(Math.max(level, 0), 1);
     }
+    if (this.beyond && this.fills) this.#fillBeyond(levels);
     return levels;
+  }
+
+  /** Gives particles beyond the outline that have none the mean level of their triangles. */
+  #fillBeyond(levels) {
+    const sums = new Float32Array(this.count), counts = new Uint16Array(this.count);
+    const missing = (row) => levels[row] < 0 && this.beyond[row] > 0;
+    for (let n = 0; n < this.triangles.length; n += 3) {
+      const corners = this.triangles.subarray(n, n + 3);
+      const known = corners.filter((row) => levels[row] >= 0);
+      if (!known.length || !corners.some(missing)) continue;
+      const mean = known.reduce((sum, row) => sum + levels[row], 0) / known.length;
+      for (const row of corners.filter(missing)) [sums[row], counts[row]] = [sums[row] + mean, counts[row] + 1];
+    }
+    for (let row = 0; row < this.count; row++) if (counts[row]) levels[row] = sums[row] / counts[row];
   }
 
   #attribute(place, name, values, size) {

@@ -236,7 +236,7 @@ class Analysis:
             )
         found += self._edges_near_the_bound()
         bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
-        late = self.trailing.late(bond) if self.trailing else []
+        late = self.trailing.late(bond, self.scene.experiment.units) if self.trailing else []
         return [*found, *late, *self.left_out]
 
     def _edges_near_the_bound(self) -> list[str]:

@@ -31,6 +31,7 @@ from pbdkit.analysis.spectrum import excess
 from pbdkit.equilibrium.system import ACCURACY, StuckError, System, solved
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.motions import Oscillation
+from pbdkit.interfaces.units import Units, in_lengths
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
@@ -63,15 +64,23 @@ class Lag:
         """What is reached, as far as that is known."""
         return self.steady if self.reached is None else self.reached
 
-    def late(self, bond: float) -> list[str]:
-        """A warning where the body is left behind its equilibrium by more than a bond."""
+    def late(self, bond: float, units: Units | None = None) -> list[str]:
+        """A warning where the body is left behind its equilibrium by more than a bond; in mm where
+        there are units."""
         if self.size <= bond:
             return []
+        mm, word = in_lengths(units) if units else (1.0, "")
+        speed, behind, length, slower = (
+            f"{mm * number:.{digits}g} {word}".rstrip()
+            for number, digits in (
+                *((self.speed, 4), (self.size, 3), (bond, 3)),
+                (self.speed * bond / self.steady, 2),
+            )
+        )
         return [
-            f"leaders: in steps {self.first} to {self.last} the fastest moves by "
-            f"{self.speed:.4g} a step and leaves the body {self.size:.3g} behind its "
-            f"equilibrium, more than a bond ({bond:.3g}): its speed decides how far bonds stretch; "
-            f"move by less than {self.speed * bond / self.steady:.2g} a step, or take "
+            f"leaders: in steps {self.first} to {self.last} the fastest moves by {speed} a step "
+            f"and leaves the body {behind} behind its equilibrium, more than a bond ({length}): "
+            f"its speed decides how far bonds stretch; move by less than {slower} a step, or take "
             "solver: {type: equilibrium}"
         ]
 

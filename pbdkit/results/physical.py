@@ -116,6 +116,8 @@ def in_physical_units(dataset: xarray.Dataset) -> xarray.Dataset:
     for name, variable in found.variables.items():
         said: dict[Any, Any] = dict(variable.attrs)
         if UNITS in said and FACTOR in said:
-            said["units"], factor = said.pop(UNITS), float(said.pop(FACTOR))
+            factor = float(said.pop(FACTOR))
+            said |= {"units": said.pop(UNITS), "lattice_units": said["units"]}
+            said["lattice_factor"] = 1.0 / factor
             found[name] = (variable.dims, variable.values * factor, said)
     return found.set_coords([name for name in dataset.coords if name in found.variables])
