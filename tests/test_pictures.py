@@ -405,7 +405,7 @@ def test_fields_end_at_the_deformed_outline(name):
     assert not ds.inside.all()
     moved, back = bent(ds.reference.values)
     ds = ds.isel(time=[0]).assign(position=ds.position.isel(time=[0]).copy(data=moved[None]))
-    ax = plot(ds, color="reference_x", filled=True, size=(8, 6), dpi=60)
+    ax = plot(ds, color="reference_x", filled=True, figsize=(8, 6), dpi=60)
     image = np.asarray(image_of(ax).get_array().filled(np.nan))
     left, right, low, high = image_of(ax).get_extent()
     pixel = (right - left) / image.shape[1]
@@ -424,7 +424,7 @@ def test_fields_end_at_the_deformed_outline(name):
 @pytest.mark.parametrize("name", CLIPPED)
 def test_the_outline_at_rest_is_that_of_the_body(name):
     ds, body = cut_body(name)
-    ax = plot(ds, 0, "reference_x", outline=True, dpi=50)
+    ax = plot(ds, "reference_x", 0, outline=True, dpi=50)
     sides = np.array(
         [c for c in ax.collections if isinstance(c, LineCollection)][-1].get_segments()
     )
