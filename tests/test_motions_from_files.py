@@ -135,6 +135,8 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
     [
         (TABLE, "step,ux\n1,0\n", r"yaml:9:27: leaders\.0\.motion\.file: .*data\.csv:1: "
                                   "needs columns step, ux, uy, .* no 'uy'"),
+        (TABLE, "step;ux;uy\n1;0,1;0\n", "separated by ';': save it with commas between columns"),
+        (TABLE, "step\tux\tuy\n1\t0\t0\n", "separated by tabs: save it with commas"),
         (TABLE, "step,ux,uy\n", "holds no row"),
         (TABLE, "step,ux,uy\n1,a,0\n", r"data\.csv:2: column 'ux' needs a finite number, got 'a'"),
         (TABLE, "step,ux,uy\n1,0\n", "column 'uy' needs a finite number, got nothing"),

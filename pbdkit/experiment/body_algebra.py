@@ -89,10 +89,6 @@ def _hull(boxes: list[Box]) -> Box:
     return Box(tuple(low), tuple(np.max([box.high for box in boxes], axis=0)))
 
 
-AnyBody = Annotated[
-    SerializeAsAny[Body],
-    closed_part(
-        Body, Grid, Rectangle, Disc, Ring, Polygon, Dogbone, Union, Intersection, Difference
-    ),
-]
+BODIES = (Grid, Rectangle, Disc, Ring, Polygon, Dogbone, Union, Intersection, Difference)
+AnyBody = Annotated[SerializeAsAny[Body], closed_part(Body, *BODIES)]
 Bodies = Annotated[tuple[AnyBody, ...], Field(strict=False, min_length=1)]

@@ -77,7 +77,7 @@ def _rows(path: Path, names: Sequence[str]) -> Iterator[list[float]]:
             if header.count(name) != 1:
                 found = f"two '{name}'" if name in header else f"no '{name}'"
                 text = f"needs columns {', '.join(names)}, named in its first line; there are"
-                hint = did_you_mean(name, {*header} - {*names})
+                hint = _separators(header) or did_you_mean(name, {*header} - {*names})
                 raise fault(f"{path}:1: {text} {found}{hint}", key="file")
         count = 0
         for row in lines:
@@ -87,6 +87,17 @@ def _rows(path: Path, names: Sequence[str]) -> Iterator[list[float]]:
             yield [_number(row, name, f"{path}:{lines.line_num}") for name in names]
         if not count:
             raise fault(f"{path}: holds no row of numbers below its first line", key="file")
+
+
+def _separators(header: list[str]) -> str:
+    """A hint where something else than commas stands between the columns."""
+    for separator, name in ((";", "';'"), ("\t", "tabs")):
+        if any(separator in column for column in header):
+            return (
+                f"; the columns of this file are separated by {name}: save it with commas between "
+                "columns, and points in numbers"
+            )
+    return ""
 
 
 def _number(row: Mapping[str, Any], name: str, place: str) -> float:

@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.experiment.body_algebra import AnyBody
+from pbdkit.experiment.body_algebra import BODIES, AnyBody
 from pbdkit.experiment.clashes import clashes_of
 from pbdkit.experiment.cuts import Cut
 from pbdkit.experiment.initial import AnyInitial
@@ -33,7 +33,7 @@ from pbdkit.experiment.record import Record
 from pbdkit.experiment.renewal import announce, renewed
 from pbdkit.experiment.sampling import sampled
 from pbdkit.experiment.settings import Settings, with_settings
-from pbdkit.experiment.solvers import AnySolver, Stepping
+from pbdkit.experiment.solvers import AnySolver, Equilibrium, Stepping
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import (
     INTERFACES,
@@ -45,14 +45,25 @@ from pbdkit.interfaces import (
     Lattice,
     NeighbourMetric,
 )
-from pbdkit.interfaces.component import Strict
+from pbdkit.interfaces.component import Strict, as_values
 from pbdkit.interfaces.course import Course
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.units import Scales, Units, given_by_units, of_one_material
+from pbdkit.registry.blame import blaming
 from pbdkit.registry.registry import Registry
 
+
+def _declares_variables(part: Diagnostic) -> Diagnostic:
+    with blaming(part, "when asked what it measures"):
+        as_values(part.variables(), "variables")
+    return part
+
+
 AnyDiagnostic = Annotated[
-    SerializeAsAny[Diagnostic], open_part(Diagnostic), AfterValidator(of_one_material)
+    SerializeAsAny[Diagnostic],
+    open_part(Diagnostic),
+    AfterValidator(of_one_material),
+    AfterValidator(_declares_variables),
 ]
 
 
@@ -90,6 +101,20 @@ class Experiment(Strict):
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
     solver: AnySolver = _default("stepping")
+
+    @classmethod
+    def found_elsewhere(cls, key: str) -> str:
+        """Return the part that has the key."""
+        registry, closed = Registry(), {"body": BODIES, "solver": (Stepping, Equilibrium)}
+        known = {**closed, "record": (Record,)} | {
+            field: tuple(registry.spellings(interface, installed=False))
+            for field, interface in INTERFACES.items()
+        }
+        for field, classes in known.items():
+            if key != "type" and any(key in each.known_keys() for each in classes):
+                below = f"{{{key}: ...}}" if field != "diagnostics" else f"[{{{key}: ...}}]"
+                return f"write it under `{field}`, as in `{field}: {below}`"
+        return ""
 
     @model_validator(mode="after")
     def _together(self) -> Self:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -59,7 +60,8 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
         key = context.get("key", ())
         return (*where, *(key if isinstance(key, tuple) else (key,))), context["text"]
     if fault["type"] in PLAIN:
-        return where, PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
+        text = PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
+        return where, text + _decimal_commas(fault)
     message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
     if fault["type"] == "value_error":
         return where, message
@@ -71,7 +73,28 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
         hint = did_you_mean(given, re.findall(r"'([^']*)'", context["expected"]))
     if fault["type"] == "float_type" and isinstance(given, str) and TEXT.fullmatch(given):
         hint = "; this takes a plain number, and no unit"
+    if fault["type"] in ("float_type", "int_type") and isinstance(given, str):
+        hint = hint or _meant_number(given)
     return where, f"{message}, got {brief(given)}{hint}"
+
+
+def _meant_number(text: str) -> str:
+    """What to write in place of a text that is a number but for its way of writing."""
+    number = text.strip().replace(",", ".", 1)
+    share = number.endswith("%")
+    with suppress(ValueError):
+        value = float(number.rstrip("% ")) / (100.0 if share else 1.0)
+        return f"; write {value:g}" + ", without quotes" * (not share and "," not in text)
+    return ""
+
+
+def _decimal_commas(fault: Any) -> str:
+    """A hint where whole numbers are twice as many as can be: ``[0,01, 0,0]``."""
+    given, most = fault["input"], fault.get("ctx", {}).get("max_length")
+    if fault["type"] != "too_long" or not isinstance(given, (list, tuple)):
+        return ""
+    doubled = len(given) == 2 * most and all(type(value) is int for value in given)
+    return "; decimals have a point and no comma, as in 0.01" if doubled else ""
 
 
 def _bound(context: Any) -> float:

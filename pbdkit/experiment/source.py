@@ -114,7 +114,28 @@ def parsed(text: str, source: Source) -> Any:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ExperimentError(f"{source.name}{place}: not valid YAML: {what}") from None
+        raise ExperimentError(
+            f"{source.name}{place}: not valid YAML: {what}{_remedy(error)}"
+        ) from None
+
+
+def _remedy(error: YAMLError) -> str:
+    """What to write instead, of the frequent faults."""
+    what, within = (str(getattr(error, name, "") or "") for name in ("problem", "context"))
+    mark = getattr(error, "context_mark", None)
+    place = f" at {mark.line + 1}:{mark.column + 1}" if mark else ""
+    if "\\t" in what:
+        return "; indent with spaces, not with tabs"
+    if "flow sequence" in within or "flow mapping" in within:
+        bracket = "[" if "sequence" in within else "{"
+        return f"; the '{bracket}'{place} is not closed, or a comma is missing before"
+    if "quoted scalar" in within:
+        return f"; the quotation mark{place} is not closed"
+    if "mapping values" in what:
+        return "; put a text with a colon in quotes, and begin each key on a line of its own"
+    if "block" in what or "block" in within:
+        return f"; indent all entries alike that belong together, as those that begin{place}"
+    return ""
 
 
 class _Scanner(Scanner):

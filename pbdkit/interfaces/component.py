@@ -53,6 +53,12 @@ class Strict(BaseModel):
     """Keys that are looked for here, and what says the same."""
 
     @classmethod
+    def found_elsewhere(cls, key: str) -> str:
+        """Return what to write in place of a key that is not known here; empty where there is
+        nothing."""
+        return cls._elsewhere.get(key, "")
+
+    @classmethod
     def known_keys(cls) -> list[str]:
         """The keys that an experiment may write here."""
         return [field.alias or name for name, field in cls.model_fields.items()]
@@ -66,12 +72,22 @@ class Strict(BaseModel):
             whose = cls.model_fields["type"].default if "type" in cls.model_fields else "here"
             taken = f"known: {', '.join(known)}" if known else f"'{whose}' takes nothing"
             hint = did_you_mean(str(unknown[0]), known)
-            if (told := cls._elsewhere.get(str(unknown[0]))) is not None:
+            if told := cls.found_elsewhere(str(unknown[0])) or _slip(str(unknown[0])):
                 hint = f"; {told}"
             message = f"unknown key{hint} ({taken})"
             key = printable(str(unknown[0]))
             raise PydanticCustomError("key", "{text}", {"text": message, "key": key})
         return data
+
+
+def _slip(key: str) -> str:
+    """What is frequently meant by a key that cannot be one."""
+    name, colon, value = key.partition(":")
+    if colon and name and value:
+        return f"write a space after the colon: `{name}: {value}`"
+    if key.strip().isdecimal():
+        return "decimals have a point and no comma, as in 0.3"
+    return ""
 
 
 def _require_type(schema: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
-from pbdkit.interfaces.component import Component, Strict
+from pbdkit.interfaces.component import Component, Strict, did_you_mean
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
 WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"
@@ -22,6 +23,13 @@ exponents, as a tower of exponents could take for ever."""
 UNIT = re.compile(rf"{WORD}(?:(?:\s*[*/]\s*|\s+){WORD}){{0,5}}")
 PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*[A-Za-zµμ°Å].*$"
 LONGEST = 60
+COMMON = {
+    "mm": ("mm", "cm", "m", "km", "um", "nm", "inch"),
+    "MPa": ("Pa", "kPa", "MPa", "GPa", "N/mm^2"),
+    "N": ("N", "kN", "MN", "mN"),
+    "mJ": ("mJ", "J", "kJ", "N*mm"),
+}
+"""Units that are suggested for misspelt ones, by the unit of the quantity."""
 
 
 @dataclass(frozen=True)
@@ -216,11 +224,17 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
     try:
         return float(registry.Quantity(float(number), registry.parse_units(given)).m_as(unit))
     except pint.UndefinedUnitError:
-        raise _fault(
-            f"'{text}': nobody knows the unit '{given}'; write for instance {unit}"
-        ) from None
+        near = did_you_mean(given, COMMON.get(unit, (unit,))) or f"; write for instance {unit}"
+        raise _fault(f"'{text}': there is no unit '{given}'{near}") from None
     except (pint.PintError, ArithmeticError, ValueError):
-        raise _fault(f"'{text}' is no {meaning}; write for instance {unit}") from None
+        told = f"write for instance {unit}"
+        with suppress(pint.PintError, ArithmeticError, ValueError):
+            if registry.parse_units(f"({given}) * s").is_compatible_with(unit):
+                told = (
+                    "the steps of a run have no duration: write what changes in one step, without "
+                    f"the time, as in 0.01 {unit}"
+                )
+        raise _fault(f"'{text}' is no {meaning}; {told}") from None
 
 
 @cache

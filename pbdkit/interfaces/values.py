@@ -36,6 +36,11 @@ class Remembered:
             raise ValueError(f"'{self.name}' is no name for a variable: letters, digits and _ only")
         if self.dtype not in DTYPES:
             raise ValueError(f"'{self.name}' has the dtype '{self.dtype}', not {', '.join(DTYPES)}")
+        if np.ndim(self.initial):
+            raise ValueError(
+                f"'{self.name}' starts at {self.initial!r}, and is one number: declare one for "
+                f"each component, as {self.name}_x and {self.name}_y"
+            )
 
 
 @dataclass(frozen=True)

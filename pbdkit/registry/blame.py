@@ -14,6 +14,12 @@ from pbdkit.interfaces.component import AnswerError, did_you_mean
 from pbdkit.registry import GROUP
 
 LONGEST = 400
+NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
+"""What authors call the tuples of numbers that their functions are given."""
+NO_REFERENCE = (
+    "`here.X` and `here.centred` are given to rules that declare "
+    "`uses_reference: ClassVar[bool] = True`"
+)
 
 
 def interface_of(component: type[Component]) -> type[Component]:
@@ -34,7 +40,7 @@ def whose(component: type[Component]) -> str:
 
 def blame(component: type[Component], when: str, error: BaseException) -> PluginError:
     """The error to raise where a component's own code has failed."""
-    told = worded(error, component.__module__.split(".")[0])
+    told = worded(error, component.__module__.split(".")[0], component)
     return PluginError(f"{whose(component)} failed {when}: {told}")
 
 
@@ -60,9 +66,12 @@ def blaming(component: Component, when: str, *field: str | int) -> Iterator[None
         raise blame(type(component), when, error) from error
 
 
-def worded(error: BaseException, package: str = "") -> str:
-    """``Type: message`` of whatever foreign code raised, on one line, without control characters,
-    cut where it is long; with `package`, the place in its code where the traceback has one."""
+def worded(
+    error: BaseException, package: str = "", component: type[Component] | None = None
+) -> str:
+    """Return ``Type: message`` of whatever foreign code raised, on one line, without control
+    characters, cut where it is long; with `package`, the place in its code where the traceback has
+    one, and with the `component` whose code it is a remedy that fits."""
     try:
         message = str(error)
     except Exception:  # a plugin's own error class can fail to say what it is
@@ -75,16 +84,26 @@ def worded(error: BaseException, package: str = "") -> str:
         if package and str(frame.f_globals.get("__name__")).split(".")[0] == package:
             # which takes the separators of every system
             place = f" ({PureWindowsPath(frame.f_code.co_filename).name}, line {line})"
-    return one_line(told) + remedy(error) + place
+    return one_line(told) + remedy(error, component) + place
 
 
-def remedy(error: BaseException) -> str:
-    """What elementwise functions are to do instead, where the fault is a frequent one."""
+def remedy(error: BaseException, component: type[Component] | None = None) -> str:
+    """Return what elementwise functions are to do instead, where the fault is a frequent one."""
     if isinstance(error, ValueError) and "truth value of an array" in str(error):
         return "; choose with `pbdkit.where` in the place of `if`, `and` and `or`"
-    if isinstance(error, AttributeError) and type(error.obj).__name__ == "Parameters":
-        return did_you_mean(str(error.name), getattr(error.obj, "_fields", ()))
-    return ""
+    if "'NoneType'" in str(error) and not getattr(component, "uses_reference", True):
+        return f"; {NO_REFERENCE}"
+    if not isinstance(error, AttributeError):
+        return ""
+    name, kind = str(error.name), type(error.obj).__name__
+    if kind in NUMBERS and component and name in component.model_fields:
+        return (
+            f"; `{NUMBERS[kind]}` holds numbers, and the parameter '{name}' is none: make numbers "
+            "of it in `parameters` or `weights`"
+        )
+    known = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
+    there = f"; `{NUMBERS[kind]}` holds {', '.join(known) or 'nothing'}" if kind in NUMBERS else ""
+    return did_you_mean(name, known) or there
 
 
 def one_line(text: str) -> str:

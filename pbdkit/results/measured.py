@@ -10,6 +10,7 @@ import numpy as np
 
 from pbdkit.errors import PluginError
 from pbdkit.interfaces import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
+from pbdkit.interfaces.component import as_values
 from pbdkit.registry.blame import blaming
 from pbdkit.results import layout
 from pbdkit.results.layout import Column, Values, When
@@ -138,7 +139,7 @@ class Measured:
                 continue
             sizes, own = dict(self.sizes), diagnostic.own_dimension
             with blaming(diagnostic, told, "diagnostics", n):
-                found = diagnostic.measure(now)
+                found = as_values(diagnostic.measure(now), "measure")
                 for (variable, factor), value in zip(
                     self.physical.scaled(diagnostic), found, strict=True
                 ):

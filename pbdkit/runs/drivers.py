@@ -8,13 +8,17 @@ from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pbdkit.errors import ExperimentError
+from pbdkit.registry.blame import worded
 from pbdkit.results.progress import StoppedError, Watch
 from pbdkit.results.recorder import Outcome
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.choice import Choice, choose, make_engine
-from pbdkit.stepping.guard import Guard
-from pbdkit.stepping.state import State
+from pbdkit.stepping.guard import EVERY, Guard
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.state import State, initial_state
 
 if TYPE_CHECKING:
     from pbdkit.equilibrium.certificate import Certificate
@@ -178,7 +182,11 @@ class Stepwise(Driver):
 
     def _diverged(self, error: FloatingPointError) -> States:
         step, rule = self.state.step, self.scene.experiment.rule.type
-        reason, self.rejection = f"{error} left all bounds under rule '{rule}'", None
+        cause = self._cause_of_nan()
+        if self.rejection and not cause and np.isfinite(self.state.u).all():
+            cause = ": displacements are finite, but not what is measured of them"
+        reason = f"{error} left all bounds under rule '{rule}'{cause}"
+        self.rejection = None
         if self.kept < step - 1:
             good = self.guard.last_good(
                 self.scene, self._engine, step, self._patience, self.watch.stopping
@@ -192,6 +200,21 @@ class Stepwise(Driver):
                         "leaders' ways"
                     )
         return Outcome("diverged", reason, step)
+
+    def _cause_of_nan(self) -> str:
+        """Where the rule made NaN of numbers, found by stepping once more with numpy; empty where
+        there is no NaN."""
+        if not np.isnan(self.state.u).any():
+            return ""
+        rule, start = type(self.scene.experiment.rule), self.guard.kept
+        start = start.copy() if start else initial_state(self.scene)
+        steps, found = self.state.step - start.step, ""
+        try:
+            if steps <= EVERY:
+                Stepper(self.scene, strict=True).advance(start, steps)
+        except FloatingPointError as error:
+            found = f", from {worded(error, rule.__module__.split('.')[0])}"
+        return f": a displacement is NaN{found}; guard divisions and roots with `pbdkit.where`"
 
 
 class Straight(Driver):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -43,8 +44,13 @@ class Stepper(Engine):
 
     name = "numpy"
 
-    def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
+    def __init__(
+        self, scene: Scene, followers: Followers | None = None, *, strict: bool = False
+    ) -> None:
+        """With `strict` the first operation of the rule that gives NaN raises
+        FloatingPointError."""
         self._scene = scene
+        self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
         self._rule = scene.experiment.rule
         self._fracturing = Fracturing.of(scene)
         self._contact = Contact(scene) if scene.barriers else None
@@ -60,7 +66,7 @@ class Stepper(Engine):
         for _ in range(steps):
             now = self._scene.at(state.step + 1)
             if now is not self._scene and now is not self._now._scene:
-                self._now = Stepper(now)
+                self._now = Stepper(now, strict=self._invalid == "raise")
             state = (self if now is self._scene else self._now)._step(state)
         return state
 
@@ -77,7 +83,8 @@ class Stepper(Engine):
         clamped = self._clamps.turn(state, step)
         kept = [(values, values[clamped]) for values in self._clamps.directions(state)]
         # What leaves the finite numbers is found at recording.
-        with np.errstate(all="ignore"), blaming(self._rule, f"at step {step}"):
+        quiet = np.errstate(all="ignore", invalid=self._invalid)
+        with quiet, blaming(self._rule, f"at step {step}"):
             self._followers.move(u, new, state)
             self._guidance.correct(new, u, step)
         for values, prescribed in kept:
