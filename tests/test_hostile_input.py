@@ -265,7 +265,7 @@ def test_files_in_the_place_of_others_are_recognised(call: Call, tmp_path: Path)
     result = call("run", "m3.nc")
     assert result.code == 2
     assert "m3.nc: is a result, no experiment; `pbdkit plot m3.nc` draws it" in result.err
-    for command in ("explain", "plot"):
+    for command in ("explain", "curve"):
         result = call(command, "e.json")
         assert result.code == 2
         assert "e.json: is an experiment; `pbdkit run e.json` makes a result of it" in result.err
