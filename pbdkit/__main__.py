@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
+from contextlib import suppress
 
 
 def main() -> None:
@@ -21,8 +21,8 @@ def main() -> None:
 
 
 def _end(*_: object) -> None:
-    sys.stderr.write("pbdkit: interrupted\n")
-    sys.stderr.flush()
+    with suppress(OSError):
+        os.write(2, b"pbdkit: interrupted\n")
     os._exit(130)
 
 

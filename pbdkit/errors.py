@@ -89,6 +89,13 @@ class StorageError(PbdkitError):
     exit_status = 6
 
 
+class WriteError(StorageError):
+    """A file could not be written: the earlier one of its name, and all that was read, are sound.
+
+    The message begins with the place, and nothing that reads another file meanwhile changes it.
+    """
+
+
 class PbdkitWarning(UserWarning):
     """A run, or its result, deserves a doubt; the text says which, and the remedy."""
 

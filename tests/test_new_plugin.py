@@ -202,26 +202,27 @@ def test_another_folder(call: Call, tmp_path: Path) -> None:
 
 
 def test_half_a_project_does_not_stay(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    written = Path.write_text
+    synced: list[int] = []
 
-    def full(self: Path, text: str, *encoding: Any) -> int:
-        if self.name == "example.yaml":
+    def full(descriptor: int) -> None:
+        synced.append(descriptor)
+        if len(synced) == 5:
             raise OSError(28, "No space left on device")
-        return written(self, text, *encoding)
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(os, "fsync", full)
     result = call("plugins", "new", "pbdkit-mine")
     message = "pbdkit: pbdkit-mine: cannot be written: No space left on device\n"
-    assert (result.code, result.err, Path("pbdkit-mine").exists()) == (6, message, False)
+    assert (result.code, result.err) == (6, message)
+    assert [path.name for path in Path.cwd().iterdir()] == ["e.json"]
 
 
 def test_a_folder_that_is_closed(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def closed(self: Path) -> None:
+    def closed(self: Path, *_: Any, **more: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", closed)
     result = call("plugins", "new", "pbdkit-mine")
     assert (result.code, result.err) == (
         6,
-        "pbdkit: pbdkit-mine: cannot be made: Permission denied\n",
+        "pbdkit: pbdkit-mine: cannot be written: Permission denied\n",
     )

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.results.destination import Destination
 from pbdkit.results.netcdf_sink import NetcdfSink
 from pbdkit.results.overlapping_sink import LARGE_BYTES, MOST_WAITING, OverlappingSink
 from pbdkit.results.progress import Watch
 from pbdkit.results.sink import KeepingSink
 from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
+from pbdkit.storage.destination import Destination
 
 LARGE = np.zeros(LARGE_BYTES // 8)
 
@@ -147,7 +147,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
         path.write_text("somebody else's")
         return False
 
-    with pytest.raises(pbdkit.StorageError, match="appeared while this run was going on"):
+    with pytest.raises(pbdkit.StorageError, match="appeared while this was going on"):
         record(Run(scene, watch=Watch(appear)), sink)
     assert path.read_text() == "somebody else's"
     (kept,) = (p for p in tmp_path.iterdir() if p != path)
@@ -157,7 +157,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
 
 def test_what_another_run_writes_is_no_leftover_where_nothing_is_locked(tmp_path, monkeypatch):
     """The name of its result begins with this one's."""
-    monkeypatch.setattr("pbdkit.results.destination.lock", lambda file: True)
+    monkeypatch.setattr("pbdkit.storage.destination.lock", lambda file: True)
     with Destination(tmp_path / "x.nc.2", replace=False).temporary() as live:
         left = Destination(tmp_path / "x.nc", replace=False).temporary()
         left.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import traceback
@@ -15,6 +16,7 @@ import click
 
 from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
+from pbdkit.cli.streams import standard_streams
 from pbdkit.scene.memory import refuse_little_memory
 
 COMPLETING = "_PBDKIT_COMPLETE"
@@ -79,6 +81,14 @@ WELCOME = """\
 pbdkit deforms bodies on lattices. Particles follow their neighbours by rules
 instead of forces. A file says what is to be done; the result is a dataset.
 """
+SYSTEM = dict.fromkeys(
+    (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
+)
+SYSTEM |= dict.fromkeys(
+    (errno.EMFILE, errno.ENFILE),
+    "; raise the limit (`ulimit -n`), or let fewer processes work at once",
+)
+"""What the system may refuse whatever is done, which is no bug of pbdkit, and the remedy."""
 MORE = """\
 `pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
 
@@ -109,17 +119,6 @@ class Commands(click.Group):
         for wanted, group in GROUPS.items():
             with formatter.section(wanted):
                 formatter.write_dl([(f"{one.name:<12}", one.does) for one in group])
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Ends quietly where whoever reads the output has had enough of it, as `head` has."""
-        try:
-            return super().invoke(ctx)
-        except (BrokenPipeError, SystemExit) as error:  # rich makes the one of the other
-            cause = error if isinstance(error, BrokenPipeError) else error.__context__
-            if not isinstance(cause, BrokenPipeError):
-                raise
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
 
 
 @with_no_plugins
@@ -152,6 +151,14 @@ def main(arguments: list[str] | None = None) -> None:
     """The program: exits 0 done, 1 a bug of ours, 2 a wrong experiment or call, 3 a missing or
     broken plugin, 4 diverged, 5 part of a sweep failed, 6 storage failed, 130 interrupted, 128
     and the number of another signal."""
+    with standard_streams():
+        code = _exit_status(arguments)
+        exec("")  # after an interrupt in another `exec` Python would end by the signal
+        sys.exit(code)
+
+
+def _exit_status(arguments: list[str] | None) -> int:
+    """Run a command, and report how it failed where it did."""
     given = sys.argv[1:] if arguments is None else arguments
     if debug := "--debug" in given:
         given = [argument for argument in given if argument != "--debug"]
@@ -165,6 +172,7 @@ def main(arguments: list[str] | None = None) -> None:
             if COMPLETING in os.environ:
                 import_module("pbdkit.cli.completion").speak_bash()
             code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
+        sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         where = getattr(error.__cause__, "args", error.args)
         code = _failed(" ".join(["interrupted", *map(str, where)]), 130)
@@ -176,8 +184,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             traceback.print_exc()
         code = _report(error)
-    exec("")  # after an interrupt in another `exec` Python would end by the signal
-    sys.exit(code or 0)
+    return code or 0
 
 
 def _warn_once() -> Callable[..., None]:
@@ -202,6 +209,9 @@ def _report(error: BaseException) -> int:
         return _failed(f"{told}; `pbdkit check` estimates what an experiment needs", 6)
     if any(isinstance(e, KeyboardInterrupt) for e in _contexts(error)):
         return _failed("interrupted", 130)
+    if isinstance(error, OSError) and error.errno in SYSTEM:
+        place = f"{error.filename}: " if error.filename else ""
+        return _failed(f"{place}{error.strerror}{SYSTEM[error.errno]}", 6)
     what = f"a bug in pbdkit, please report it: {type(error).__name__}: {error}"
     return _failed(f"{what} (`pbdkit --debug ...` shows where)", 1)
 

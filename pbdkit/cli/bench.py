@@ -41,9 +41,12 @@ def bench(
     from pbdkit.api import load
     from pbdkit.bench import work_precision
     from pbdkit.bench.measurement import measure, ways
-    from pbdkit.cli.output import refusals_as, refuse_unwritable, save, show_table
+    from pbdkit.cli.output import refuse_output, refuse_unwritable, save, show_table
     from pbdkit.cli.waiting import waiting
+    from pbdkit.storage.destination import write
 
+    for path in filter(None, (picture, json_file)):
+        refuse_output(path, force=True, experiment=Path(experiment))
     refuse_unwritable(picture, json_file)
     changed = (*settings, *([f"steps={steps}"] if steps else ()))
     loaded = load(experiment, settings=changed)
@@ -61,8 +64,7 @@ def bench(
     click.echo("\n".join(work_precision.lines(rows)))
     if json_file:
         figures = work_precision.as_dict(experiment, settings, loaded.steps, rows)
-        with refusals_as(f"{json_file}: cannot be written"):
-            json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        write(json_file, json.dumps(figures, indent=1) + "\n", replace=True)
         click.echo(f"{json_file} written")
     if picture:
-        save(picture, work_precision.picture(rows, title))
+        save(picture, work_precision.picture(rows, title), replace=True)

@@ -66,7 +66,7 @@ def curve(
     with reading(file, sweeps=True, at=at) as dataset:
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
-        save(path, figure_of(_drawn(dataset, kind, **asked)))
+        save(path, figure_of(_drawn(dataset, kind, **asked)), replace=force)
 
 
 def _named(kind: str | None, asked: dict[str, Any]) -> str:

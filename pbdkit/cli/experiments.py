@@ -41,9 +41,9 @@ def init(file: Path | None, origin: str | None) -> None:
     """Write an experiment to start from: a commented one, or a copy of a shipped one.
 
     FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml."""
-    from pbdkit.cli.output import refusals_as
     from pbdkit.errors import ExperimentError
     from pbdkit.experiment.shipped import SUFFIX, shipped_data, shipped_names, shipped_text
+    from pbdkit.storage.destination import write_together
 
     path, text = (
         file or Path(Path(origin or "experiment").name + SUFFIX),
@@ -53,13 +53,11 @@ def init(file: Path | None, origin: str | None) -> None:
         copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
         raise ExperimentError(f"{path}: is a shipped experiment, no file to be written; {copy}")
     data = shipped_data(origin) if origin else []
-    files = {path: text.encode()} | {path.with_name(d.name): d.read_bytes() for d in data}
+    files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
     for each in files:
         if os.path.lexists(each):
             raise ExperimentError(f"{each}: exists and is left as it is; name another file")
-    for each, content in files.items():
-        with refusals_as(f"{each}: cannot be written"), each.open("xb") as written:
-            written.write(content)
+    write_together(files)
     beside = f" with {', '.join(d.name for d in data)}" if data else ""
     click.echo(f"{path} written{beside}; next: pbdkit check {path}, then pbdkit run {path}")
 

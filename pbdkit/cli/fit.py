@@ -20,9 +20,10 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
     """Find the parameters that fit a measured field best, or the strengths of repeated tests, with
     their errors."""
     import pbdkit
-    from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
+    from pbdkit.cli.output import refuse_output, refuse_unwritable, save
     from pbdkit.cli.waiting import waiting
     from pbdkit.fitting.strength_specification import is_strength_fit
+    from pbdkit.storage.destination import write
 
     path = output or Path(Path(file).name or "fit").with_suffix(".json")
     refuse_output(path, force=force, experiment=Path(file))
@@ -34,8 +35,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         raise pbdkit.ExperimentError("a strength fit has no picture; leave --plot out")
     with waiting(f"fitting {file}", silent=quiet):
         found = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
-    with refusals_as(f"{path}: cannot be written"):
-        path.write_text(json.dumps(found.as_dict(), indent=2) + "\n", encoding="utf-8")
+    write(path, json.dumps(found.as_dict(), indent=2) + "\n", replace=force)
     if not quiet:
         for line in found.lines():
             click.echo(line)
@@ -45,4 +45,4 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         from pbdkit.fitting.fitted import Fitted
 
         assert isinstance(found, Fitted)
-        save(picture, draw_fit(found), quiet=quiet)
+        save(picture, draw_fit(found), replace=force, quiet=quiet)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
-import stat
 import sys
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, suppress
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from pbdkit.scene.scene import Scene
-
-KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a pipe", stat.S_IFCHR: "a device"}
-"""What may be at a path and no plain file, by the type that the system gives it."""
-
 
 FORMATS = (".png", ".svg", ".pdf")
 UNLIMITED = 10_000
@@ -53,20 +49,20 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
     """Raises ExperimentError where nothing is to be written there: a name that is no UTF-8, a
     folder, a file without `force`, and, forced or not, what is no plain file, and the experiment
     under this or another name. Raises StorageError where the system does not tell."""
-    try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError:
+    from pbdkit.storage.destination import kind_of
+
+    try:  # in the bytes that the system has, whatever the locale makes of them
+        os.fsencode(path.absolute()).decode()
+    except UnicodeDecodeError:
         shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
         raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
     with refusals_as(f"{str(path)[:80]}..."):
-        try:
-            mode = path.lstat().st_mode
-        except (FileNotFoundError, NotADirectoryError):
-            return
-    if stat.S_ISDIR(mode):
+        kind, there = kind_of(path), os.path.lexists(path)
+    if not there:
+        return
+    if kind == "a folder":
         raise ExperimentError(f"{path}: is a folder; name a file with -o")
-    if not stat.S_ISREG(mode):
-        kind = KINDS.get(stat.S_IFMT(mode), "no plain file")
+    if kind:
         raise ExperimentError(
             f"{path}: is {kind}, which is not replaced; remove it, or name another file with -o"
         )
@@ -123,9 +119,12 @@ def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
             raise StorageError(f"{path}: there is no folder {path.parent}")
 
 
-def save(picture: Path, drawn: Figure, *, quiet: bool = False) -> None:
-    """Writes a figure and says so, unless quiet; StorageError where the system refuses."""
-    with refusals_as(f"{picture}: cannot be written"):
-        drawn.savefig(picture)
+def save(picture: Path, drawn: Figure, *, replace: bool, quiet: bool = False) -> None:
+    """Writes a figure and says so, unless quiet; WriteError where the system refuses."""
+    from pbdkit.storage.destination import write
+
+    content = io.BytesIO()
+    drawn.savefig(content, format=picture.suffix.removeprefix("."))
+    write(picture, content.getvalue(), replace=replace)
     if not quiet:
         click.echo(f"{picture} written")

@@ -113,7 +113,7 @@ def plot(
         axes = draw(dataset, time=time, **look)
         from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
-        save(path, figure_of(axes[0] if isinstance(axes, list) else axes))
+        save(path, figure_of(axes[0] if isinstance(axes, list) else axes), replace=force)
 
 
 def _plot_set_up(
@@ -141,7 +141,7 @@ def _plot_set_up(
     axes = plot_experiment(experiment, figsize=figsize, dpi=dpi)
     from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
 
-    save(path, figure_of(axes))
+    save(path, figure_of(axes), replace=force)
 
 
 @click.command()
@@ -170,5 +170,5 @@ def animate(file: Path, output: Path | None, at: dict[str, str], force: bool, **
     refuse_output(path, force=force)
     refuse_unwritable(None, path)
     with reading(file, at=at) as dataset, progress_bar(sys.stderr.isatty()) as show:
-        write(dataset, file=path, show=show, **look)
+        write(dataset, file=path, show=show, replace=force, **look)
     click.echo(f"{path} written")

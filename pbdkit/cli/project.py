@@ -6,9 +6,7 @@ from __future__ import annotations
 import keyword
 import os
 import re
-import shutil
 import sys
-from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
@@ -16,12 +14,12 @@ from pathlib import Path
 from string import Template
 
 from pbdkit import __version__
-from pbdkit.cli.output import refusals_as
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import INTERFACES
 from pbdkit.registry import BUILTIN
 from pbdkit.registry.discovery import canonical
 from pbdkit.registry.registry import Registry
+from pbdkit.storage.destination import write_folder
 
 PREFIX = f"{BUILTIN}-"
 TAKEN = {*keyword.kwlist, "Literal", "Field"}
@@ -90,15 +88,7 @@ class Project:
             raise ExperimentError(
                 f"{folder}: exists and is left as it is; take another name or --dir"
             )
-        with refusals_as(f"{folder}: cannot be made"):
-            folder.mkdir()
-        with refusals_as(f"{folder}: cannot be written"), ExitStack() as undo:
-            undo.callback(shutil.rmtree, folder, ignore_errors=True)
-            for file, text in texts.items():
-                path = folder / file
-                path.parent.mkdir(exist_ok=True)
-                path.write_text(text, "utf-8")
-            undo.pop_all()
+        write_folder(folder, texts)
         return folder
 
 

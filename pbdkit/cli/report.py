@@ -31,7 +31,7 @@ def report(
     refuse_output(path, force=force)
     refuse_unwritable(None, path)
     with reading(file, sweeps=True, at=at) as dataset:
-        write(dataset, path, bench=bench)
+        write(dataset, path, bench=bench, replace=force)
     size = path.stat().st_size
     click.echo(f"{path} written, {size / 1e6:.2g} MB; open it in a browser")
     if size > BUDGET:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
@@ -20,6 +20,8 @@ from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.registry.blame import one_line
 from pbdkit.registry.extras import refuse_no_matplotlib, refuse_without
 from pbdkit.results.layout import as_step
+from pbdkit.storage.destination import written
+from pbdkit.storage.new_file import NewFile
 
 if TYPE_CHECKING:
     import xarray
@@ -52,6 +54,7 @@ def animate(
     fps: float = 25.0,
     every: int = 1,
     show: Show = silent,
+    replace: bool = True,
     filled: bool | None = None,
     contours: bool = False,
     bonds: bool | None = None,
@@ -79,6 +82,8 @@ def animate(
         Draw each so many recorded steps only, and the last.
     show : callable
         Called with what is done and the share that is done.
+    replace : bool
+        Put it in the place of an earlier file, which stands until the movie is whole.
 
     The other parameters are those of `plot`. Raises ExperimentError as `plot` does, and where what
     writes movies is missing; StorageError where the file cannot be written.
@@ -98,12 +103,12 @@ def animate(
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
     moving = Moving(recording, rows, look, show)
     frames = moving.frames(rows, show)
-    with _appearing(path) as part:
+    with written(path, NewFile, replace=replace) as new:
         if path.suffix == ".gif":
             few = moving.frames(rows[:: max(1, len(rows) // 4)])
-            _write_gif(part, np.concatenate([*few]), frames, fps)
+            _write_gif(new, np.concatenate([*few]), frames, fps)
         else:
-            _write_mp4(part, frames, fps)
+            _write_mp4(new, frames, fps)
 
 
 def _movie_file(color: str | None, file: str | Path | None) -> Path:
@@ -228,21 +233,8 @@ def _told(shown: Iterator[Snapshot], count: int, what: str, show: Show) -> Itera
         show(what, (n + 1) / count)
 
 
-@contextmanager
-def _appearing(path: Path) -> Iterator[Path]:
-    """A file beside that one, which takes its place at the end, and goes where that fails."""
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
-    try:
-        yield part
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
-    """By ffmpeg, in another process, as every player shows it. Raises OSError where that fails."""
+def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
+    """By ffmpeg, in another process, as every player shows it, under the name of the file."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     first = next(frames)
@@ -250,7 +242,7 @@ def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}"]
     coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "veryfast"]
     command = [get_ffmpeg_exe(), "-y", "-v", "error", *given, "-i", "-", *coded,
-               "-movflags", "+faststart", str(path)]  # fmt: skip
+               "-movflags", "+faststart", "-f", "mp4", str(file.disk.name)]  # fmt: skip
     with TemporaryFile() as said:
         with Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said) as ffmpeg:
             assert ffmpeg.stdin is not None
@@ -263,11 +255,12 @@ def _write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> None:
                 ffmpeg.wait()
                 raise
         said.seek(0)
-        if ffmpeg.returncode:
-            raise OSError(0, one_line(said.read().decode(errors="replace")))
+        fault = one_line(said.read().decode(errors="replace"))
+        if fault or ffmpeg.returncode:
+            file.fail(OSError(0, fault or f"ffmpeg ended with status {ffmpeg.returncode}"))
 
 
-def _write_gif(path: Path, few: Frame, frames: Iterator[Frame], fps: float) -> None:
+def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
     """With one palette, that of `few` of them, so that what does not move does not change."""
     from PIL import Image
 
@@ -275,8 +268,9 @@ def _write_gif(path: Path, few: Frame, frames: Iterator[Frame], fps: float) -> N
     colours = np.reshape(palette.getpalette() or [], (-1, 3))
     colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # the page stays white
     palette.putpalette(colours.astype(np.uint8).tobytes())
+    target: Any = file  # all that Pillow needs of one
     drawn = (Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames)
     next(drawn).save(
-        path, save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,
+        target, "GIF", save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,
         optimize=False,
     )  # fmt: skip

@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import StorageError
 from pbdkit.pages.page import page
 from pbdkit.pages.run_content import RunContent
 from pbdkit.pages.speed import speed
@@ -14,6 +13,7 @@ from pbdkit.pages.sweep_content import SweepContent
 from pbdkit.results.members import SWEEP
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.result_file import reading
+from pbdkit.storage.destination import write
 
 if TYPE_CHECKING:
     import xarray
@@ -28,9 +28,14 @@ ATTEMPTS, SMALL = 4, 0.6
 
 
 def report(
-    dataset: xarray.Dataset | str | Path, path: str | Path, *, bench: str | Path | None = None
+    dataset: xarray.Dataset | str | Path,
+    path: str | Path,
+    *,
+    bench: str | Path | None = None,
+    replace: bool = True,
 ) -> Path:
-    """Writes the page of a run or of a sweep, and returns its path; what is there is replaced.
+    """Writes the page of a run or of a sweep, and returns its path. The page appears whole or not
+    at all, with `replace` in the place of an earlier one.
 
     The page has the moving lattice, the histories of particles and bonds, curves, what was
     predicted, what broke, and how to run it again. It takes 5 MB at most: of more steps or
@@ -43,10 +48,7 @@ def report(
     measured = speed(Path(bench)) if bench is not None else None
     with _reading(dataset) as read:
         text = report_text(read, measured)
-    try:
-        Path(path).write_text(text, encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
+    write(Path(path), text, replace=replace)
     return Path(path)
 
 

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.errors import StorageError
-from pbdkit.results.destination import Destination
+from pbdkit.errors import StorageError, WriteError
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.netcdf import NetcdfFile
 from pbdkit.results.sink import KeepingSink
+from pbdkit.storage.destination import Destination
 from pbdkit.storage.file_system import FULL, is_full
 from pbdkit.storage.paged_file import PagedFile
-from pbdkit.storage.seal import BrokenSealError, SealedFile
+from pbdkit.storage.seal import is_whole
 from pbdkit.storage.standing import Standing
 from pbdkit.storage.unfinished import UnfinishedRun
 
@@ -93,7 +93,7 @@ class NetcdfSink(KeepingSink):
         self.unfinished, self._temporary = unfinished, unfinished.records
         file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():
-            self._complete(file, status, settled=_is_whole(unfinished.records))
+            self._complete(file, status, settled=is_whole(file.disk))
 
     def put(self, values: Values) -> None:
         """Into the file, by whole chunks."""
@@ -130,8 +130,8 @@ class NetcdfSink(KeepingSink):
             file.add_group(FINAL_STATE, json.dumps(standing.facts), standing.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
-        """Completes the file, seals and syncs it, checks it where there was a store, and gives it
-        its name; then the store goes."""
+        """Completes the file, seals and syncs it, reads it back, and gives it its name; then the
+        store goes."""
         with self._storing() as file:
             file.finish(attributes)
             file.file.check()
@@ -144,8 +144,6 @@ class NetcdfSink(KeepingSink):
         if not settled:
             file.verify()
             file.settle()
-        if self.unfinished and not settled and not _is_whole(self._temporary):
-            raise StorageError(f"{self._temporary}: the disk gives back what was not written")
         try:
             self._destination.take(self._temporary, status)
         finally:
@@ -178,7 +176,7 @@ class NetcdfSink(KeepingSink):
         except (OSError, RuntimeError, ValueError) as error:
             reason = self._reason(error)
             self.abandon()
-            raise StorageError(f"{path}: cannot be written: {reason}") from None
+            raise WriteError(f"{path}: cannot be written: {reason}") from None
 
     def _reason(self, error: Exception) -> str:
         """The disk's own, where it has one: the library says little."""
@@ -191,16 +189,6 @@ class NetcdfSink(KeepingSink):
         if full or getattr(error, "errno", None) == errno.ENOSPC:
             return FULL
         return str(getattr(error, "strerror", None) or error)
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether a file is sealed, and all in it is as it was written. Raises OSError."""
-    try:
-        with SealedFile(path) as result:
-            result.check()
-            return result.seal is not None
-    except BrokenSealError:
-        return False
 
 
 def reopened(

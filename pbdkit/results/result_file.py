@@ -11,7 +11,7 @@ from typing import Any
 import xarray
 from xarray.backends import StoreBackendEntrypoint
 
-from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError
+from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, WriteError
 from pbdkit.registry.blame import one_line
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.members import SWEEP, choices, member
@@ -110,7 +110,8 @@ def reading(
     block; `at` chooses among the members of a sweep.
 
     Raises ExperimentError for that of a sweep otherwise, what `open` does, and StorageError for
-    whatever reading and using its values raises: files are sound when written.
+    whatever reading and using its values raises: files are sound when written. Another file that
+    cannot be written in the block, a WriteError, is no fault of this one.
     """
     with open(path) as whole:
         dataset = _chosen(whole, path, at) if at else whole
@@ -121,7 +122,7 @@ def reading(
             )
         try:
             yield dataset
-        except BrokenSealError:
+        except (BrokenSealError, WriteError):
             raise
         except (ExperimentError, StorageError) as error:
             raise type(error)(f"{path}: {'; '.join(str(error).splitlines())}") from None

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import StorageError
-from pbdkit.results.destination import Destination
 from pbdkit.results.grid import Grid, grid_of
 from pbdkit.results.layout import broken_by
+from pbdkit.storage.destination import written
+from pbdkit.storage.new_file import NewFile
 
 if TYPE_CHECKING:
     import h5py
@@ -42,23 +42,13 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
     """Writes every recorded step: the particles, the bonds, and of a `scene` the cells between
     them, with all that the dataset knows of them. At most some steps are in memory.
 
-    Raises StorageError where it cannot be written; then nothing stands there.
+    Raises WriteError where it cannot be written; then nothing stands there, or the earlier file.
     """
     import h5py
 
-    destination = Destination(path, replace=replace)
-    try:
-        with destination.temporary() as temporary:
-            name = Path(str(temporary.name))
-            try:
-                with h5py.File(temporary, "w") as file:
-                    _write(file, dataset, grid_of(dataset, scene))
-                destination.take(name, "complete")
-            finally:
-                name.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise StorageError(f"{path}: cannot be written: {reason}") from None
+    grid = grid_of(dataset, scene)
+    with written(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
+        _write(file, dataset, grid)
 
 
 def _write(file: h5py.File, dataset: xarray.Dataset, grid: Grid) -> None:

@@ -9,10 +9,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import ExperimentError
 from pbdkit.experiment.source import MAX_BYTES, MAX_NODES
 from pbdkit.experiment.yaml_text import yaml_text
 from pbdkit.sessions.script import Script
+from pbdkit.storage.destination import write_together
 
 INLINE = 500
 """Knots of a way that are written into the experiment; those of longer ones take a table beside."""
@@ -45,14 +46,7 @@ def saved(script: Script, step: int, output: Path | None) -> Saved:
     if len(text) > MAX_BYTES or _nodes(parts) > MAX_NODES:
         text = "what was done is more than an experiment file may hold"
         raise ExperimentError(f"{text}; go back, and save a part of it")
-    try:
-        for table, content in tables.items():
-            with table.open("x", encoding="utf-8", newline="") as file:
-                file.write(content)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written: {error.strerror}") from None
+    write_together({**tables, path: text})
     return Saved(path, None if tables else text)
 
 

@@ -66,6 +66,14 @@ def is_full(folder: Path) -> bool:
         return False
 
 
+def write_all(file: io.FileIO, data: bytes | bytearray | memoryview) -> None:
+    """Writes all of it: one write may take less than it is given, above all where the disk gets
+    full. Raises OSError."""
+    view = memoryview(data)
+    while view:
+        view = view[file.write(view) :]
+
+
 def sync_folder(folder: Path) -> None:
     """Makes names in a folder last, where the file system can."""
     with suppress(OSError):

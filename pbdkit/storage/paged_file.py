@@ -8,14 +8,16 @@ from bisect import bisect_right
 from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any
 
-from pbdkit.storage.seal import BLOCK, BrokenSealError, Extent, digest, put_seal
+from pbdkit.storage.file_system import write_all
+from pbdkit.storage.new_file import NewFile
+from pbdkit.storage.seal import BLOCK, BrokenSealError, Extent, digest, is_whole, put_seal
 
 PAGE = 4096
 LARGE_BYTES = 2**16
 """What is written in one go and is larger goes to the disk at once."""
 
 
-class PagedFile(io.RawIOBase):
+class PagedFile(NewFile):
     """A file on the disk, and pages in memory that lie over it.
 
     What is large goes to the disk as it comes, behind all that was there at the last `commit`, and
@@ -24,8 +26,6 @@ class PagedFile(io.RawIOBase):
     as it was then, whatever is written afterwards. With `read_only` everything stays in memory.
 
     Extents that are handed over are checked before a byte of them is given out: BrokenSealError.
-    The library never hears of a failing write: it would try again when the process ends, and crash
-    it. `check` raises the first; after it nothing more is written.
     """
 
     def __init__(
@@ -37,7 +37,8 @@ class PagedFile(io.RawIOBase):
         *,
         read_only: bool = False,
     ) -> None:
-        self.disk, self.size = disk, size
+        super().__init__(disk)
+        self.size = size
         self.pages = {number: bytearray(page) for number, page in (pages or {}).items()}
         """By number."""
         self.extents = list(extents)
@@ -50,24 +51,11 @@ class PagedFile(io.RawIOBase):
         """So many of them were there at the last commit."""
         self._unchecked = {extent.start for extent in extents}
         self._append_from, self._place = (2**63 if read_only else size), 0
-        self._fault: OSError | None = None
 
     @property
     def added(self) -> list[Extent]:
         """The extents written since the last commit."""
         return self.extents[self.noted :]
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def writable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """As in any file."""
@@ -123,19 +111,9 @@ class PagedFile(io.RawIOBase):
                     raise BrokenSealError(f"{self.disk.name}: {where} are not what was written")
                 self._unchecked.discard(extent.start)
 
-    def close(self) -> None:
-        """Closes the file on the disk, too."""
-        self.disk.close()
-        super().close()
-
-    def check(self) -> None:
-        """Raises the OSError that was met in writing, if one was."""
-        if self._fault:
-            raise self._fault
-
     def give_up(self) -> None:
         """Nothing more goes to the disk."""
-        self._fault = self._fault or OSError("given up")
+        self.fail(OSError("given up"))
 
     def forget(self) -> None:
         """What was written after the last commit, by a process that was killed. Raises OSError."""
@@ -146,20 +124,18 @@ class PagedFile(io.RawIOBase):
         self._append_from = max(self._append_from, self.size)
         self.noted, self.changed = len(self.extents), set()
 
-    def sync(self) -> None:
-        """Waits until what was written is on the disk. Raises OSError."""
-        self.check()
-        os.fsync(self.disk.fileno())
-
     def settle(self) -> None:
-        """Puts the pages in their places, seals the file and syncs it. Raises OSError."""
+        """Puts the pages in their places, seals the file, syncs it and reads all of it back. Raises
+        OSError where it cannot be written, or is not what was written."""
         self.check()
         for number, page in sorted(self.pages.items()):
             self.disk.seek(number * PAGE)
-            _write_all(self.disk, memoryview(page))
+            write_all(self.disk, page)
         self.disk.truncate(self.size)
         put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
         self.sync()
+        if not is_whole(self.disk):
+            raise OSError(f"{self.disk.name}: the disk gives back what was not written")
 
     def _settled(self, extent: Extent) -> Extent:
         """With the digest that it has now, should a page lie over it."""
@@ -170,12 +146,8 @@ class PagedFile(io.RawIOBase):
         return extent._replace(digest=digest(data))
 
     def _append(self, view: memoryview) -> None:
-        if self._fault is None:
-            try:
-                self.disk.seek(self._place)
-                _write_all(self.disk, view)
-            except OSError as error:
-                self._fault = error
+        self.disk.seek(self._place)
+        self._write_all(view)
         for start in range(0, len(view), BLOCK):
             piece = view[start : start + BLOCK]
             place = self._place + start
@@ -199,9 +171,3 @@ def _overlaps(
         first, last = max(begin, page * PAGE), min(end, (page + 1) * PAGE)
         inside = slice(first - page * PAGE, last - page * PAGE)
         yield page, inside, slice(first - begin, last - begin)
-
-
-def _write_all(disk: io.FileIO, view: memoryview) -> None:
-    """A write may take less than it is given, above all where the disk gets full."""
-    while view:
-        view = view[disk.write(view) :]

@@ -20,6 +20,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
+from pbdkit.storage.file_system import write_all
 
 BLOCK = 2**20
 """Bytes a digest, at most: to read anything, so many are read at most besides."""
@@ -68,8 +69,8 @@ class SealedFile(io.RawIOBase):
     Raises OSError, and BrokenSealError as soon as bytes are asked for that have changed.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._file = path, path.open("rb", buffering=0)
+    def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
+        self.path, self._file = path, file or path.open("rb", buffering=0)
         self.seal = seal_of(self._file)
         """None where the file has none: then all of it is content, and nothing is checked."""
         self._size = self.seal.size if self.seal else os.fstat(self._file.fileno()).st_size
@@ -136,7 +137,7 @@ def put_seal(file: io.FileIO, known: Iterable[Extent] = ()) -> None:
     rows = [(e.stop, e.digest, e.start in values) for e in _gapless(file, size, known)]
     seal = Seal(size, np.array(rows, ROW))
     file.seek(size)
-    file.write(seal.table.tobytes() + seal.foot())
+    write_all(file, seal.table.tobytes() + seal.foot())
 
 
 def _gapless(file: io.FileIO, size: int, known: tuple[Extent, ...]) -> Iterator[Extent]:
@@ -171,6 +172,16 @@ def seal_of(file: io.FileIO) -> Seal | None:
         if found.foot() == foot and whole_table:
             return found
     raise BrokenSealError(f"{file.name}: its seal is not what was written")
+
+
+def is_whole(file: io.FileIO) -> bool:
+    """Whether an open file is sealed, and all in it is as it was written. Raises OSError."""
+    try:
+        with SealedFile(Path(file.name), io.FileIO(os.dup(file.fileno()))) as content:
+            content.check()
+            return content.seal is not None
+    except BrokenSealError:
+        return False
 
 
 def opened(path: Path, mode: str = "r") -> Any:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import uuid
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import ExperimentError
 from pbdkit.registry.registry import GIVEN
 from pbdkit.results.layout import CONVENTIONS, SCHEMA_VERSION
-from pbdkit.storage.seal import put_seal
+from pbdkit.storage.destination import written
+from pbdkit.storage.paged_file import PagedFile
 from pbdkit.sweeps.crew import Crew
 from pbdkit.sweeps.grid import Dimension
 from pbdkit.sweeps.joining import joined
@@ -134,18 +131,14 @@ def _attributes(asked: Asked, versions: dict[str, str]) -> dict[str, str]:
 
 
 def _write(dataset: xarray.Dataset, path: Path) -> None:
-    """Whole and sealed, or not at all; what was there before is replaced. Raises StorageError."""
-    name = f".{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex}.nc"
-    temporary = path.absolute().with_name(name)
-    try:
-        dataset.to_netcdf(temporary, engine="netcdf4")
-        with temporary.open("rb+", buffering=0) as file:
-            put_seal(file)
-            os.fsync(file.fileno())
-        temporary.replace(path.absolute())
-    except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise StorageError(f"{path}: cannot be written: {reason}") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    """Whole and sealed, or not at all; what was there before is replaced. Raises WriteError."""
+    import h5netcdf
+    import h5py
+    from xarray.backends import H5NetCDFStore
+
+    with (
+        written(path, PagedFile, replace=True) as file,
+        h5py.File(file, "w", track_order=True) as content,
+        h5netcdf.File(content, "w") as made,
+    ):
+        dataset.dump_to_store(H5NetCDFStore(made, autoclose=False))
