@@ -108,8 +108,8 @@ class Command:
     same: Callable[[Path, Path], list[str]] = field(
         default=lambda one, other: _same_bytes(one, other)
     )
-    again: Callable[[], list[list[str]]] | None = None
-    """The commands by which one comes to the result after a fault; None: the same once more."""
+    again: Callable[[], list[str]] | None = None
+    """The command by which one comes to the result after a fault that left parts of it."""
 
 
 def _same_bytes(one: Path, other: Path) -> list[str]:
@@ -206,10 +206,9 @@ def _unfinished() -> None:
     assert quietly("run", "e.json", "-o", "out.nc", before=killed)[0] == 9
 
 
-def _go_on() -> list[list[str]]:
+def _go_on() -> list[str]:
     """After a fault of a run: resumed where anything is kept, else run."""
-    kept = Path("out.nc.run").exists()
-    return [["resume", "out.nc"]] if kept else [["run", "e.json", "-o", "out.nc", "--force"]]
+    return ["resume", "out.nc"] if Path("out.nc.run").exists() else [*RUN, "--force"]
 
 
 def _fitting() -> None:
@@ -266,12 +265,16 @@ def commands() -> dict[str, Command]:
         "run": Command([*RUN, "--force"], "out.nc", _earlier_run, lambda: often(1e9), _same_run),
         "store": Command(RUN, "out.nc", _experiment, often, _same_run, _go_on),
         "resume": Command(["resume", "out.nc"], "out.nc", _unfinished, often, _same_run, _go_on),
-        "longer": Command(LONGER, "out.nc", _finished, often, _same_run, lambda: [LONGER]),
-        "sweep": Command(SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep),
+        "longer": Command(LONGER, "out.nc", _finished, often, _same_run, lambda: LONGER),
+        "sweep": Command(
+            SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep, again=lambda: SWEEPING
+        ),
         "fit": Command(FITTING, "out.json", _fitting, _fitted_once()),
         "fit --plot": Command([*FITTING, *PLOTTED], "out.png", _fitting, _fitted_once()),
         "init": Command(["init", "out.yaml"], "out.yaml"),
-        "init --from": Command(["init", "out.yaml", "--from", "materials/specimen"], "out.yaml"),
+        "init --from": Command(
+            ["init", "out.yaml", "--from", "modelling/measured-boundary"], "out.yaml"
+        ),
         "plugins new": Command(["plugins", "new", "pbdkit-mine"], "pbdkit-mine"),
     }
     drawn = {"plot": ("png", "svg", "pdf"), "animate": ("gif", "mp4")}
@@ -346,8 +349,8 @@ class Bench:
             yield from (f"exit {code}, and {text}" for text in self.command.same(output, whole))
         elif earlier.exists() and not output.exists():
             yield "the earlier file is gone"
-        if code == 6:
-            yield from self._gone_on(output, whole)
+        if code == 6 and self.command.again:
+            yield from self._gone_on(self.command.again(), output, whole)
 
     def _left(self) -> list[str]:
         """What is in the folder that the undisturbed command does not leave."""
@@ -356,15 +359,12 @@ class Bench:
         ]
         return sorted(names[0] - names[1])
 
-    def _gone_on(self, output: Path, whole: Path) -> Iterator[str]:
-        """The same once more, or what a message named, comes to the same result."""
-        if self.command.again is None and not (self._start / output).exists() and output.exists():
+    def _gone_on(self, words: list[str], output: Path, whole: Path) -> Iterator[str]:
+        """The next command comes to the same result."""
+        code, said = quietly(*words, before=self.command.before)
+        if code:
+            yield f"then exit {code}: {said[-300:]}"
             return
-        for words in self.command.again() if self.command.again else [self.command.words]:
-            code, said = quietly(*words, before=self.command.before)
-            if code:
-                yield f"then exit {code}: {said[-300:]}"
-                return
         yield from (f"then {text}" for text in self.command.same(output, whole))
         if left := self._left():
             yield f"then left behind: {left}"
@@ -383,27 +383,12 @@ class Bench:
         return len(numbers), findings
 
 
-def _import_everything() -> None:
-    """And draw a picture once, so that what is loaded late is there, too."""
-    import importlib
-    import pkgutil
-
-    import h5netcdf  # noqa: F401
+def _prepare_drawing() -> None:
+    """Make pictures that are the same in every trial."""
     import matplotlib
 
     matplotlib.use("agg")
     matplotlib.rcParams["svg.hashsalt"] = "the same in every trial"
-    import matplotlib.backends.backend_pdf
-    import matplotlib.backends.backend_svg
-    import matplotlib.pyplot as plt
-    import PIL.Image
-    import scipy.sparse.linalg  # noqa: F401
-
-    PIL.Image.init()
-    plt.close(plt.figure())
-    for module in pkgutil.walk_packages(pbdkit.__path__, "pbdkit."):
-        with suppress(ImportError):  # of extras that are not installed
-            importlib.import_module(module.name)
 
 
 def _main() -> None:
@@ -413,7 +398,7 @@ def _main() -> None:
     asked.add_argument("--first", type=int, default=1)
     asked.add_argument("--every", type=int, default=1)
     given = asked.parse_args()
-    _import_everything()
+    _prepare_drawing()
     total = broke = 0
     every = commands()
     for name in given.commands.split(",") if given.commands else every:
@@ -423,7 +408,8 @@ def _main() -> None:
                 count, findings = bench.tried(kind, given.first, given.every)
                 for text in findings:
                     print(f"  {name}, {text}", flush=True)
-                print(f"{name}, {kind}: {count - len(findings)} of {count} held", flush=True)
+                held = f"{count - len(findings)} of {count} held, of {bench.calls} calls"
+                print(f"{name}, {kind}: {held}", flush=True)
                 total, broke = total + count, broke + len(findings)
             os.chdir("/")
     print(f"{total - broke} of {total} held", flush=True)
