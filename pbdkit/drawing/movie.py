@@ -34,7 +34,9 @@ Frame = NDArray[np.uint8]
 """(row, column, red green blue)."""
 FORMATS = (".mp4", ".gif")
 WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
-DPI, FASTEST_GIF, GIF_COLOURS = 120, 50, 128
+DPI, GIF_COLOURS = 120, 128
+SLOWEST, FASTEST, FASTEST_GIF = 0.1, 240, 50
+"""Frames a second, as players show them."""
 FINER = 0.6
 """So many times the pixels of the movie, either way, are those of a field, which is then smooth."""
 NEARLY_WHITE = 240
@@ -90,11 +92,7 @@ def animate(
     """
     path = _movie_file(color, file)
     refuse_no_movie(path)
-    if not 0.1 <= fps <= 240 or (path.suffix == ".gif" and fps > FASTEST_GIF):
-        fastest = FASTEST_GIF if path.suffix == ".gif" else 240
-        raise ExperimentError(f"fps: {fps:g} is not between 0.1 and {fastest}")
-    if every < 1:
-        raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
+    _refuse_speed(path, fps, every)
     look = Look(
         filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
     )  # fmt: skip
@@ -109,6 +107,15 @@ def animate(
             _write_gif(new, np.concatenate([*few]), frames, fps)
         else:
             _write_mp4(new, frames, fps)
+
+
+def _refuse_speed(path: Path, fps: float, every: int) -> None:
+    """Raise ExperimentError for a number of steps that no movie shows."""
+    fastest = FASTEST_GIF if path.suffix == ".gif" else FASTEST
+    if not SLOWEST <= fps <= fastest:
+        raise ExperimentError(f"fps: {fps:g} is not between {SLOWEST:g} and {fastest}")
+    if every < 1:
+        raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
 
 
 def _movie_file(color: str | None, file: str | Path | None) -> Path:
