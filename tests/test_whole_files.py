@@ -192,6 +192,13 @@ def test_links_and_pipes_are_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "mine"
 
 
+def test_the_figures_of_bench_replace_no_link(call: Call) -> None:
+    """Refused before anything is measured."""
+    Path("link.json").symlink_to("e.json")
+    found = call("bench", "e.json", "--json", "link.json")
+    assert (found.code, "is a symbolic link, which is not replaced" in found.err) == (2, True)
+
+
 def test_a_folder_and_files_that_belong_together_appear_whole_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
