@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.experiment.beside import OF_PROGRAM
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import Settings, with_settings
 from pbdkit.experiment.shipped import read_experiment
@@ -37,7 +38,13 @@ Given = Experiment | Mapping[str, Any] | str | Path
 """An experiment, or the dict, the file or the name of a shipped one of which it is made."""
 
 
-def load(name: str | Path, *, components: Components = (), settings: Settings = ()) -> Experiment:
+def load(
+    name: str | Path,
+    *,
+    components: Components = (),
+    settings: Settings = (),
+    allow_outside: bool = False,
+) -> Experiment:
     """Return the experiment in a YAML file, or the shipped one of that name.
 
     Parameters
@@ -49,6 +56,8 @@ def load(name: str | Path, *, components: Components = (), settings: Settings = 
     settings : mapping, or iterable of str
         Values to change: ``{"steps": 20, "rule": {"relaxation": 0.3}}`` or ``["steps=20",
         "rule.relaxation=0.3"]``.
+    allow_outside : bool
+        Whether files that the experiment names, of fields and motions, may lie outside its folder.
 
     Raises
     ------
@@ -59,7 +68,8 @@ def load(name: str | Path, *, components: Components = (), settings: Settings = 
         raise ExperimentError(
             f"load: expected a file or the name of a shipped experiment, {_but_got(name)}"
         )
-    source = with_settings(read_experiment(str(name)), settings, Experiment.defaults())
+    source = read_experiment(str(name), allow_outside=allow_outside)
+    source = with_settings(source, settings, Experiment.defaults())
     return Experiment.build(source, components)
 
 
@@ -277,7 +287,8 @@ def as_experiment(given: Given, components: Components, settings: Settings = ())
         return load(given, components=components, settings=settings)
     if _is_dataset(given) or not isinstance(given, Mapping):
         raise ExperimentError(f"expected an experiment, {_but_got(given)}")
-    source = with_settings(Source(data=dict(given)), settings, Experiment.defaults())
+    source = Source(data=dict(given), beside=OF_PROGRAM)
+    source = with_settings(source, settings, Experiment.defaults())
     return Experiment.build(source, components)
 
 

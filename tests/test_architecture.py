@@ -9,6 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "pbdkit"
 ORDER = [
     "errors",
+    "resources",
     "interfaces",
     "registry",
     "components",

@@ -144,7 +144,7 @@ TABLE, MEASURED = "{type: table, file: data.csv}", "{type: measured, file: data.
         (TABLE, "step,ux,uy\n1,0,0\n1,1,0\n", "steps must increase"),
         (TABLE, "step,ux,uy\n1.5,0,0\n", "steps are whole numbers from 1 on, got 1.5"),
         (TABLE, "step,ux,uy\n0,1,0\n", "at step 0 nothing is displaced yet"),
-        (TABLE.replace("data", "other"), "", "is no regular file"),
+        (TABLE.replace("data", "other"), "", r"other\.csv: is not there; its place counts from"),
         (TABLE.replace("data.csv", "."), "", "is no regular file"),
         (TABLE.replace("}", ", steps: [1]}"), STEPS, "give either a file, or steps"),
         (MEASURED, "x,y,ux,uy\n0,0,1,1\n0,0,1,2\n", r"\(0, 0\) is measured twice"),

@@ -10,7 +10,7 @@ import pytest
 import xarray
 
 import pbdkit
-from pbdkit.results.trial import BEGINNINGS, MODULE, opened_unsealed, try_reading
+from pbdkit.resources.trial import BEGINNINGS, MODULE, opened_unsealed, try_reading
 
 sys.path.append(str(Path(__file__).parent / "reliability"))
 import fuzz_experiments
@@ -120,7 +120,7 @@ def test_a_large_file_is_read_in_pieces(tmp_path):
     path, values = tmp_path / "large.nc", np.zeros((300, 2**17))
     xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path)
     code = (
-        "import sys; from pathlib import Path; from pbdkit.results import trial\n"
+        "import sys; from pathlib import Path; from pbdkit.resources import trial\n"
         "trial._read(Path(sys.argv[1])); from pbdkit.runs.course import peak_memory\n"
         "print(peak_memory())"
     )

@@ -17,7 +17,7 @@ import click
 from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.cli.streams import standard_streams
-from pbdkit.scene.memory import refuse_little_memory
+from pbdkit.resources.memory import refuse_little_memory
 
 COMPLETING = "_PBDKIT_COMPLETE"
 """The variable in which a shell asks how a line goes on."""

@@ -39,9 +39,9 @@ def _verified(file: Path) -> str:
     """What a file's line says against it, if anything."""
     from pbdkit.cli.output import refusals_as
     from pbdkit.errors import StorageError
+    from pbdkit.resources.trial import refuse_no_result
     from pbdkit.results.other_files import other_file
     from pbdkit.results.result_file import UNSEALED, refuse_no_file
-    from pbdkit.results.trial import refuse_no_result
     from pbdkit.storage.seal import SealedFile
 
     fault = ""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from itertools import chain
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.beside import ALLOW, Beside
 from pbdkit.experiment.kinds import EXPERIMENT, of_kind
 from pbdkit.experiment.parts import brief, fault
 from pbdkit.experiment.shipped import shipped_names, shipped_text
@@ -36,9 +37,9 @@ def base_source(path: Path, given: Any, source: Source) -> Source:
     ExperimentError."""
     if isinstance(given, dict):
         inner = {w[1:]: p for w, p in source.places.items() if w[:1] == ("experiment",)}
-        return Source(str(path), given, inner, path.parent)
+        return Source(str(path), given, inner, source.beside)
     try:
-        return _beside(path, given)
+        return _read(path, given, source.beside)
     except _NoSuchExperimentError as error:
         text = source.message(("experiment",), str(error))
         raise ExperimentError(text, ("experiment",)) from None
@@ -48,23 +49,21 @@ class _NoSuchExperimentError(ExperimentError):
     """The field `experiment` leads nowhere."""
 
 
-def _beside(path: Path, name: str) -> Source:
-    """The source of a file in the folder of that file, or below it, or of a shipped experiment."""
-    given, folder = PurePath(name), path.absolute().parent
+def _read(path: Path, name: str, beside: Beside) -> Source:
+    """The source of a file beside that file, or of a shipped experiment."""
     accepted = "give a shipped name, or a file in the folder of that file or below it"
-    if given.is_absolute() or ".." in given.parts:
-        raise _NoSuchExperimentError(f"{brief(name)} leads elsewhere; {accepted}")
+    file = (beside.folder or path.parent) / name
     try:
-        file = (folder / given).resolve()
-        found = file.is_file()
+        found = beside.folder is not None and file.is_file()
+        allowed = beside.folder is None or beside.holds(file)
     except (OSError, ValueError):
         raise _NoSuchExperimentError(f"{brief(name)} is no name of a file") from None
-    if found and not file.is_relative_to(folder.resolve()):
-        raise _NoSuchExperimentError(f"{brief(name)} is a link that leads elsewhere; {accepted}")
+    if not allowed:
+        raise _NoSuchExperimentError(f"{brief(name)} leads elsewhere; {accepted}, or {ALLOW}")
     if found:
-        return of_kind(EXPERIMENT, read_file(path.parent / given))
+        return of_kind(EXPERIMENT, read_file(file))
     if name in (names := shipped_names()):
         return read_text(shipped_text(name), name)
-    files = chain(path.parent.glob("*.yaml"), path.parent.glob("*.yml"))
-    hint = did_you_mean(name, [*(file.name for file in files), *names])
+    near = chain(path.parent.glob("*.yaml"), path.parent.glob("*.yml"))
+    hint = did_you_mean(name, [*(file.name for file in near), *names])
     raise _NoSuchExperimentError(f"{brief(name)} is neither{hint} ({accepted})")

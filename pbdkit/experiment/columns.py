@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from pydantic import ValidationInfo
 
+from pbdkit.experiment.beside import beside
 from pbdkit.experiment.parts import fault
 from pbdkit.interfaces.component import did_you_mean
 
 MOST_BYTES, MOST_ROWS = 2**26, 200_000
+LONGEST_LINE = 2**16
+"""Maximum number of characters in a line."""
 
 
 def or_a_file(*names: str) -> Callable[[dict[str, Any]], None]:
@@ -45,7 +48,10 @@ def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list
     Raises a fault of the key `file` that says what is wrong in it, where, and the remedy.
     """
     try:
-        return list(_rows(_path(given, (info.context or {}).get("folder", Path())), names))
+        path = beside(info).path(given, "CSV")
+        if path.stat().st_size > MOST_BYTES:
+            raise fault(f"{path}: is larger than 64 MiB; leave out points", key="file")
+        return list(_rows(path, names))
     except UnicodeDecodeError as error:
         raise fault(
             f"{given}: is not UTF-8: {error.reason}; save it as UTF-8", key="file"
@@ -53,40 +59,45 @@ def read_columns(given: Any, info: ValidationInfo, names: Sequence[str]) -> list
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise fault(f"{given}: cannot be read: {reason}", key="file") from None
-
-
-def _path(given: Any, folder: Path) -> Path:
-    if not isinstance(given, str) or not given or "\0" in given:
-        raise fault(f"expected the name of a CSV file, got {given!r:.40}", key="file")
-    path = folder / given
-    if not path.is_file():
-        raise fault(
-            f"{path}: is no regular file; its place counts from the experiment's file", key="file"
-        )
-    if path.stat().st_size > MOST_BYTES:
-        raise fault(f"{path}: is larger than 64 MiB; leave out points", key="file")
-    return path
+    except ValueError as error:
+        raise fault(str(error), key="file") from None
 
 
 def _rows(path: Path, names: Sequence[str]) -> Iterator[list[float]]:
     with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = csv.DictReader(file, skipinitialspace=True)
-        header = [name.strip() for name in lines.fieldnames or ()]
-        lines.fieldnames = header
-        for name in names:
-            if header.count(name) != 1:
-                found = f"two '{name}'" if name in header else f"no '{name}'"
-                text = f"needs columns {', '.join(names)}, named in its first line; there are"
-                hint = _separators(header) or did_you_mean(name, {*header} - {*names})
-                raise fault(f"{path}:1: {text} {found}{hint}", key="file")
+        lines = csv.reader(_bounded(file, path), skipinitialspace=True)
+        columns = _columns([name.strip() for name in next(lines, [])], names, path)
         count = 0
         for row in lines:
+            if not row:
+                continue
             count += 1
             if count > MOST_ROWS:
                 raise fault(f"{path}: has more than {MOST_ROWS} rows; leave out some", key="file")
-            yield [_number(row, name, f"{path}:{lines.line_num}") for name in names]
+            place = f"{path}:{lines.line_num}"
+            yield [_number(row[n : n + 1], name, place) for name, n in columns.items()]
         if not count:
             raise fault(f"{path}: holds no row of numbers below its first line", key="file")
+
+
+def _bounded(file: TextIO, path: Path) -> Iterator[str]:
+    """Yield the lines of a table. Raises a fault where one is longer than those of a table are."""
+    while line := file.readline(LONGEST_LINE + 1):
+        if len(line) > LONGEST_LINE:
+            text = f"{path}: has a line of more than {LONGEST_LINE} characters"
+            raise fault(f"{text}; leave out the columns that are not needed", key="file")
+        yield line
+
+
+def _columns(header: list[str], names: Sequence[str], path: Path) -> dict[str, int]:
+    """Return where the columns stand. Raises a fault where one is missing, or there twice."""
+    for name in names:
+        if header.count(name) != 1:
+            found = f"two '{name}'" if name in header else f"no '{name}'"
+            text = f"needs columns {', '.join(names)}, named in its first line; there are"
+            hint = _separators(header) or did_you_mean(name, {*header} - {*names})
+            raise fault(f"{path}:1: {text} {found}{hint}", key="file")
+    return {name: header.index(name) for name in names}
 
 
 def _separators(header: list[str]) -> str:
@@ -100,13 +111,14 @@ def _separators(header: list[str]) -> str:
     return ""
 
 
-def _number(row: Mapping[str, Any], name: str, place: str) -> float:
-    text = row[name]
+def _number(cell: list[str], name: str, place: str) -> float:
+    """The number in a cell, empty where the row is too short. Python would take 1_0 for 10."""
+    text = "".join(cell)
     try:
-        number = float(text)
-    except (TypeError, ValueError):
+        number = math.nan if "_" in text else float(text)
+    except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        got = "nothing" if text in (None, "") else repr(text)[:40]
+        got = repr(text)[:40] if text else "nothing"
         raise fault(f"{place}: column '{name}' needs a finite number, got {got}", key="file")
     return number

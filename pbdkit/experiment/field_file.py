@@ -2,67 +2,74 @@
 
 from __future__ import annotations
 
+import io
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from pbdkit.interfaces.component import did_you_mean
+import numpy as np
+
+from pbdkit.errors import StorageError
+from pbdkit.experiment.beside import Beside
 from pbdkit.interfaces.varying import MOST_VALUES, Gridded
+from pbdkit.registry.blame import one_line
+from pbdkit.resources.field_variable import VALUES
+from pbdkit.resources.trial import read_apart
 
 MOST_BYTES = 2**30
+MODULE = "pbdkit.resources.field_variable"
+"""Reads the variable, in a process of its own."""
+LONGEST_NAME = 200
+"""Maximum number of characters in the name of a variable."""
 
 
 class FieldFileError(ValueError):
     """A field file that is not there, cannot be read, or holds no field; the text names it."""
 
 
-def read_field(given: dict[str, Any], folder: Path) -> Gridded:
-    """What ``{file: NAME, variable: NAME}`` says, the file relative to a folder.
+def read_field(given: dict[str, Any], files: Beside) -> Gridded:
+    """Return what ``{file: NAME, variable: NAME}`` says, the file among those that may be named.
 
-    Raises FieldFileError where the file or the variable is not there, or no numbers over x and y.
+    Raises ValueError where the file or the variable is not there, or no numbers over x and y.
     """
     if given.keys() != {"file", "variable"}:
         raise ValueError(f"a field from a file has file and variable, got {', '.join(given)}")
-    name, variable = given["file"], given["variable"]
-    if not isinstance(name, str) or not isinstance(variable, str):
-        raise ValueError("file and variable should be words")
-    path = folder / name
-    if not path.is_file():
-        what = "is no regular file" if path.exists() else "is not there"
-        raise ValueError(f"{path} {what}; its place counts from the experiment's file")
-    if path.stat().st_size > MOST_BYTES:
+    path, variable = files.path(given["file"], "netCDF"), given["variable"]
+    if not isinstance(variable, str) or not variable.isprintable() or len(variable) > LONGEST_NAME:
+        raise ValueError(f"variable should be the name of one in {path}")
+    about = path.stat()
+    if about.st_size > MOST_BYTES:
         raise ValueError(f"{path} is larger than 1 GiB")
-    import h5py
-    import xarray
+    return _read(path, variable, about.st_size, about.st_mtime_ns)
 
+
+@lru_cache(maxsize=4)
+def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
+    """The field in a file of that size and time of change: members of a sweep read the same."""
     try:
-        with h5py.File(path, "r") as file:
-            # h5netcdf reads this first, and a file of its own that fails there cannot be closed.
-            file.attrs.get("_nc3_strict")
-        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
-            return _gridded(dataset, variable, path)
-    except FieldFileError:
+        read = read_apart(MODULE, path, variable, str(MOST_VALUES))
+    except StorageError as error:
+        raise FieldFileError(str(error)) from None
+    try:
+        with np.load(io.BytesIO(read)) as arrays:
+            x, y, values = (_decoded(name, arrays) for name in ("x", "y", VALUES))
+        return Gridded(x, y, values)
+    except MemoryError:
         raise
-    except Exception as error:  # whatever the libraries below make of a damaged file
-        told = " ".join(str(error).split())
-        raise FieldFileError(f"{path} cannot be read as netCDF-4: {told}") from None
+    except Exception as error:  # attributes that make no sense, in words of other libraries
+        raise FieldFileError(f"{path}: '{variable}': {one_line(str(error))}") from None
 
 
-def _gridded(dataset: Any, variable: str, path: Path) -> Gridded:
-    if variable not in dataset:
-        hint = did_you_mean(variable, dataset)
-        raise FieldFileError(f"{path} has no variable '{variable}'{hint}")
-    values = dataset[variable]
-    if set(values.dims) != {"x", "y"} or not {"x", "y"} <= set(values.coords):
-        raise FieldFileError(
-            f"{path}: '{variable}' should be over x and y, with a coordinate for each; it is over "
-            f"{', '.join(map(str, values.dims)) or 'nothing'}"
-        )
-    if values.size > MOST_VALUES:
-        count = f"{values.size} values, more than {MOST_VALUES}"
-        raise FieldFileError(f"{path}: '{variable}' has {count}")
-    if values.dtype.kind not in "fiu":
-        raise FieldFileError(f"{path}: '{variable}' holds {values.dtype}, not numbers")
-    try:
-        return Gridded(values["x"], values["y"], values.transpose("x", "y"))
-    except ValueError as error:
-        raise FieldFileError(f"{path}: '{variable}': {error}") from None
+def _decoded(name: str, arrays: Any) -> Any:
+    """The numbers of an array, unpacked and masked as its attributes demand."""
+    from xarray import Variable
+    from xarray.conventions import decode_cf_variable
+
+    begin = f"{name}."
+    keys = [key for key in arrays if key.startswith(begin)]
+    attributes = {key.removeprefix(begin): arrays[key][()] for key in keys}
+    if not attributes:
+        return arrays[name]
+    dims = [f"d{n}" for n in range(arrays[name].ndim)]
+    stored = Variable(dims, arrays[name], attributes)
+    return decode_cf_variable(name, stored, decode_times=False).values

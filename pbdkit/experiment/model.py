@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from importlib import import_module
 from typing import Annotated, Any, Self
 
@@ -20,6 +21,7 @@ from pydantic import (
 )
 
 from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.experiment.beside import OF_PROGRAM
 from pbdkit.experiment.body_algebra import BODIES, AnyBody
 from pbdkit.experiment.clashes import clashes_of
 from pbdkit.experiment.cuts import Cut
@@ -155,7 +157,7 @@ class Experiment(Strict):
     _registry: Registry = PrivateAttr()
 
     def __init__(self, **parts: Any) -> None:
-        self._validate(parts, Registry(), Source())
+        self._validate(parts, Registry(), Source(beside=OF_PROGRAM))
 
     @model_serializer(mode="wrap")
     def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -203,7 +205,9 @@ class Experiment(Strict):
         ExperimentError
             For a path that leads nowhere, and a value that is not right.
         """
-        source = Source(self._source.name, self.as_written(), {}, self._source.folder)
+        source = replace(self.as_written(), name=self._source.name)
+        if source.beside.folder is None:
+            source.beside = OF_PROGRAM
         changed = with_settings(source, settings, self.defaults())
         experiment = type(self).__new__(type(self))
         experiment._validate(changed.data, self._registry, changed)
@@ -276,13 +280,15 @@ class Experiment(Strict):
         """The distributions that the parts come from, with their versions."""
         return self._registry.versions(self.components())
 
-    def as_written(self) -> dict[str, Any]:
-        """What can be changed and built again. With `units` that is what it was made of, whose
-        lengths may name a unit, where that holds plain values; else all of it in lattice units."""
+    def as_written(self) -> Source:
+        """Return what can be changed and built again. With `units` that is what it was made of,
+        whose lengths may name a unit, where that holds plain values; else all of it in lattice
+        units."""
         if self.units and self._source.data is not None and self.is_as_validated:
             with suppress(TypeError, ValueError):
-                return dict(json.loads(json.dumps(self._source.data)))
-        return self.model_dump(mode="json", by_alias=True)
+                data = dict(json.loads(json.dumps(self._source.data)))
+                return Source(self.name, data, beside=self._source.beside)
+        return Source(self.name, self.model_dump(mode="json", by_alias=True))
 
     def located(self, error: ExperimentError) -> ExperimentError:
         """The error with the place of its field in the file, once."""
@@ -296,7 +302,7 @@ class Experiment(Strict):
         parts, source, retired = renewed(parts, source)
         try:
             units = Scales.model_validate({"units": parts.get("units")}).units
-            context = {"registry": registry, "folder": source.folder, "units": units}
+            context = {"registry": registry, "beside": source.beside, "units": units}
             self.__pydantic_validator__.validate_python(parts, self_instance=self, context=context)
         except ValidationError as error:
             raise report(error, source) from None

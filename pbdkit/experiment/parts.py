@@ -7,13 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import reduce
 from operator import or_
-from pathlib import Path
 from typing import Any
 
 from pydantic import BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.experiment.beside import beside
 from pbdkit.experiment.field_file import read_field
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
@@ -181,12 +181,12 @@ def _from_files(
     parameters: dict[str, Any], part: type[TakesFields], info: ValidationInfo
 ) -> dict[str, Any]:
     """The fields that stand in files, read."""
-    folder, found = Path((info.context or {}).get("folder", "")), {}
+    found = {}
     for name in part.numbers() & parameters.keys():
         given = parameters[name]
         if isinstance(given, dict) and "file" in given:
             try:
-                found[name] = read_field(given, folder)
+                found[name] = read_field(given, beside(info))
             except ValueError as error:
                 raise fault(str(error), key=name) from None
     return found

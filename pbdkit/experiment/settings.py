@@ -90,7 +90,7 @@ def with_value(
     """The same of a value that is none of YAML; `label` is what messages call its place."""
     where = tuple(map(_position, path.split(".")))
     places = {k: place for k, place in source.places.items() if k[: len(where)] != where}
-    changed = Source(source.name, copy.deepcopy(source.data), places, source.folder)
+    changed = Source(source.name, copy.deepcopy(source.data), places, source.beside)
     _place(changed.data, where, value, label, defaults)
     for depth in range(1, len(where) + 1):
         changed.places.setdefault(where[:depth], label)

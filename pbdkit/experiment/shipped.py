@@ -7,6 +7,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from pbdkit.errors import ExperimentError
+from pbdkit.experiment.beside import Beside
 from pbdkit.experiment.kinds import EXPERIMENT, of_kind
 from pbdkit.experiment.source import Source, read_file, read_text
 from pbdkit.interfaces.component import did_you_mean
@@ -48,19 +49,22 @@ def shipped_title(name: str) -> str:
     return f"{sentence}."
 
 
-def read_experiment(name: str) -> Source:
-    """The source of the experiment in a file, or of the shipped experiment of that name."""
+def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
+    """The source of the experiment in a file, or of the shipped experiment of that name. Files that
+    it names lie in its folder or below, unless others are allowed."""
     path = Path(name)
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
     except OSError as error:
         raise ExperimentError(f"{name[:80]}...: {error.strerror}") from None
     if is_file:
-        return of_kind(EXPERIMENT, read_file(path))
+        source = of_kind(EXPERIMENT, read_file(path))
+        source.beside = Beside(path.parent, allow_outside)
+        return source
     names = shipped_names()
     if name in names:
         source = read_text(shipped_text(name), name)
-        source.folder = (FOLDER / name).parent
+        source.beside = Beside((FOLDER / name).parent)
         return source
     what = "is a folder" if is_folder else "is no file and no shipped experiment"
     near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []

@@ -30,6 +30,7 @@ from ruamel.yaml.reader import ReaderError
 from ruamel.yaml.scanner import Scanner
 
 from pbdkit.errors import ExperimentError, dotted
+from pbdkit.experiment.beside import Beside
 
 MAX_BYTES = 2**20
 MAX_DEPTH = 32
@@ -44,8 +45,8 @@ class Source:
     name: str = ""
     data: Any = None
     places: dict[Where, str] = field(default_factory=dict)
-    folder: Path = field(default_factory=Path)
-    """Where the files lie that it names."""
+    beside: Beside = field(default_factory=Beside)
+    """The files that it may name."""
 
     def message(self, where: Sequence[str | int], text: str) -> str:
         """``file:line:column: field: text``; of an absent field the place of what encloses it."""
@@ -84,7 +85,7 @@ def read_file(path: Path) -> Source:
             f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8"
         ) from None
     source = read_text(text, str(path))
-    source.folder = path.parent
+    source.beside = Beside(path.parent)
     return source
 
 

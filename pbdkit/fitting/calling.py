@@ -13,7 +13,6 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
-from pbdkit.experiment.source import Source
 from pbdkit.fitting.comparison import Candidate, Posed, compared
 from pbdkit.fitting.fitted import Fitted, fitted
 from pbdkit.fitting.least_squares import Solution, solved
@@ -134,7 +133,9 @@ def _with_settings(
 ) -> Experiment:
     if not settings:
         return experiment
-    source = Source(experiment.name, experiment.as_written(), {}, fit.folder)
+    source = experiment.as_written()
+    if source.beside.folder is None:
+        source.beside = fit.beside
     for path, value in settings.items():
         source = with_value(source, path, value, f"{where}: {path}", Experiment.defaults())
     return Experiment.build(source, components)

@@ -15,7 +15,6 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
-from pbdkit.experiment.source import Source
 from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.varying import ByRegion
@@ -78,7 +77,7 @@ class Parameter:
             if new is not None:
                 changed = self._changed(component, name, new, value)
                 return experiment.model_copy(update={part: changed})
-        source = Source(experiment.name, experiment.as_written())
+        source = experiment.as_written()
         label = f"{self.path} = {value:.6g}"
         source = with_value(source, self.path, value, label, Experiment.defaults())
         found = Experiment.build(source, given_classes(experiment))

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, mod
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.base import Base, base_source
+from pbdkit.experiment.beside import OF_PROGRAM, Beside, beside
 from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
 from pbdkit.experiment.parts import report
@@ -83,16 +84,16 @@ class Fit(Strict):
     candidates: dict[str, Rival] = Field(default_factory=dict)
     folds: Annotated[int, Field(ge=2, le=20)] = 5
 
-    _folder: Path = Path()
+    _beside: Beside = Beside()
 
     @property
-    def folder(self) -> Path:
-        """Where files that it names lie."""
-        return self._folder
+    def beside(self) -> Beside:
+        """The files that it may name."""
+        return self._beside
 
     @model_validator(mode="after")
     def _fits_together(self, info: ValidationInfo) -> Self:
-        object.__setattr__(self, "_folder", Path((info.context or {}).get("folder", "")))
+        object.__setattr__(self, "_beside", beside(info))
         if len(self.measured) > 1 and any(m.noise is None for m in self.measured):
             raise ValueError("several measurements need the `noise` of each, to be weighed by it")
         if self.force and not isinstance(self.measured[0], MeasuredField):
@@ -124,7 +125,7 @@ def described_fit(
     """The fit in a file, of a shipped name or in a dict, and the source of its experiment; none is
     looked for where one is `given`. Raises ExperimentError."""
     if isinstance(description, Mapping):
-        path, source = Path("fit"), Source("fit", dict(description), {}, Path())
+        path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:
         path = _file(str(description))
         source = of_kind(FIT, read_file(path))
@@ -134,10 +135,10 @@ def described_fit(
         )
     if given and isinstance(source.data, dict):
         source = Source(
-            source.name, {"experiment": "", **source.data}, source.places, source.folder
+            source.name, {"experiment": "", **source.data}, source.places, source.beside
         )
     try:
-        fit = Fit.model_validate(source.data, context={"folder": source.folder})
+        fit = Fit.model_validate(source.data, context={"beside": source.beside})
     except ValidationError as error:
         raise report(error, source) from None
     return fit, source if given else base_source(path, fit.experiment, source)

@@ -13,7 +13,6 @@ from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.solvers import Equilibrium
-from pbdkit.experiment.source import Source
 from pbdkit.fitting.first_break import Elastic, Pull, Seen, bond_strains, strengths
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.fitting.strength_specification import Peaks
@@ -134,6 +133,6 @@ def seeded(experiment: Experiment, seed: int) -> Experiment:
     varies = any(getattr(part, "varying", None) for part in (experiment.rule, experiment.fracture))
     if not varies:
         return experiment.model_copy(update={"seed": seed})
-    source = Source(experiment.name, experiment.as_written())
+    source = experiment.as_written()
     source = with_value(source, "seed", seed, "the seed of a specimen", Experiment.defaults())
     return Experiment.build(source, given_classes(experiment))

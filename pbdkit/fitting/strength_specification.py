@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, model_validator
 
 from pbdkit.experiment.base import Base, base_source
+from pbdkit.experiment.beside import OF_PROGRAM
 from pbdkit.experiment.columns import read_columns
 from pbdkit.experiment.kinds import FIT, of_kind
 from pbdkit.experiment.names import Version
@@ -156,15 +157,15 @@ def described_strength_fit(
     """The strength fit in a file, of a shipped name or in a dict, and the source of its experiment;
     none is looked for where one is `given`. Raises ExperimentError."""
     if isinstance(description, Mapping):
-        path, source = Path("fit"), Source("fit", dict(description), {}, Path())
+        path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:
         path = _file(description)
         source = of_kind(FIT, read_file(path))
     if given and isinstance(source.data, dict):
         data = {"experiment": "", **source.data}
-        source = Source(source.name, data, source.places, source.folder)
+        source = Source(source.name, data, source.places, source.beside)
     try:
-        fit = StrengthFit.model_validate(source.data, context={"folder": source.folder})
+        fit = StrengthFit.model_validate(source.data, context={"beside": source.beside})
     except ValidationError as error:
         raise report(error, source) from None
     return fit, source if given else base_source(path, fit.experiment, source)

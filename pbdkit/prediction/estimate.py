@@ -19,8 +19,8 @@ from pbdkit.analysis.spectrum import NEUTRAL, Spectrum, spectrum_of
 from pbdkit.analysis.stencil import wave_bound
 from pbdkit.equilibrium.grids.inverse_iteration import SlowMode
 from pbdkit.equilibrium.system import StuckError
+from pbdkit.resources.memory import machine_memory
 from pbdkit.results.progress import Watch
-from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State, initial_state
 

@@ -13,10 +13,10 @@ from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.units import LENGTH
 from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.prediction.masses import too_light
+from pbdkit.resources.memory import machine_memory
 from pbdkit.scene.bonds import count_bonds
 from pbdkit.scene.guides import kinds_of_places
 from pbdkit.scene.leader_groups import kinds_at
-from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, Sizes, sizes_of

@@ -8,7 +8,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.experiment.kinds import EXPERIMENT, kind_of, what_takes
 from pbdkit.experiment.shipped import shipped_names
 from pbdkit.experiment.source import read_file
-from pbdkit.results.trial import BEGINNINGS
+from pbdkit.resources.trial import BEGINNINGS
 from pbdkit.storage.run_files import STORE
 
 TEXTS = (".yaml", ".yml", ".json")

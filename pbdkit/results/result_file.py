@@ -13,11 +13,11 @@ from xarray.backends import StoreBackendEntrypoint
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, WriteError
 from pbdkit.registry.blame import one_line
+from pbdkit.resources.trial import opened_unsealed, try_reading
 from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.members import SWEEP, choices, member
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.other_files import refuse_other_file
-from pbdkit.results.trial import opened_unsealed, try_reading
 from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
 

@@ -180,7 +180,8 @@ def _refuse_changed_file(output: Path, about: Mapping[str, Any], origin: Any) ->
     if not isinstance(file, str) or not Path(file).is_file():
         return
     try:
-        source = with_settings(read_experiment(file), settings, Experiment.defaults())
+        source = read_experiment(file, allow_outside=True)  # only compared
+        source = with_settings(source, settings, Experiment.defaults())
         now = json.loads(Experiment.build(source).model_dump_json(by_alias=True))
     except PbdkitError:
         now = None

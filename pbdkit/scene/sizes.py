@@ -12,8 +12,8 @@ from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
 from pbdkit.interfaces.lattice import Index
 from pbdkit.interfaces.units import LENGTH
+from pbdkit.resources.memory import machine_memory
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
-from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.neighbourhood import Neighbourhood
 from pbdkit.scene.others import ALONE, Others
 from pbdkit.scene.solver_sizes import equilibrium_size

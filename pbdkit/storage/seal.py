@@ -20,6 +20,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
+from pbdkit.resources.declared import check_declared
 from pbdkit.storage.file_system import write_all
 
 BLOCK = 2**20
@@ -185,18 +186,29 @@ def is_whole(file: io.FileIO) -> bool:
 
 
 def opened(path: Path, mode: str = "r") -> Any:
-    """The content of a sealed file as an h5netcdf.File."""
+    """The content of a sealed file as an h5netcdf.File. Raises StorageError where it declares or
+    refers to what it should not: anybody can make a seal."""
     file = SealedFile(path)
     file.check_structure()
-    return opened_in(file)
+    try:
+        return opened_in(file)
+    except StorageError as error:
+        file.close()
+        raise type(error)(f"{path}: {error}") from None
 
 
 def opened_in(file: io.RawIOBase) -> Any:
-    """The netCDF-4 content of a file that is read through Python, as an h5netcdf.File."""
+    """The netCDF-4 content of a file that is read through Python, as an h5netcdf.File. Raises
+    StorageError where it declares or refers to what it should not."""
     import h5netcdf
     import h5py
 
     content = h5py.File(file, "r")
+    try:
+        check_declared(content, file.seek(0, os.SEEK_END))
+    except BaseException:
+        content.close()
+        raise
     found = h5netcdf.File(content, "r", decode_vlen_strings=True)
     # HDF5 reads from Python here, and no more once Python has ended: by then it must be closed.
     weakref.finalize(found, content.close)

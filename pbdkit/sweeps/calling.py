@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import warnings
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ def called(
     progress: bool,
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
-    data = experiment.as_written()
+    base = replace(experiment.as_written(), name="")
     given = given_classes(experiment)
     if given and folder is not None:
         raise ExperimentError(
@@ -43,8 +44,8 @@ def called(
             "have none; leave it out, or make a plugin of them (`pbdkit plugins new`)"
         )
     crew = crew_of(workers, client, given)
-    sweep = checked(parts | {"experiment": data}, Source())
-    asked = Asked(sweep, Source(data=data), Source(), given)
+    sweep = checked(parts | {"experiment": base.data}, Source())
+    asked = Asked(sweep, base, Source(), given)
     with ExitStack() as ending:
         kept = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
         with progress_bar(progress) as show:

@@ -11,8 +11,8 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
+from pbdkit.resources.memory import machine_memory
 from pbdkit.results.members import STATUS
-from pbdkit.scene.memory import machine_memory
 from pbdkit.sweeps.content import Variable, unpacked
 from pbdkit.sweeps.grid import MESSAGE, Dimension
 from pbdkit.sweeps.member import Member

@@ -11,10 +11,10 @@ import xxhash
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
 from pbdkit.interfaces.component import did_you_mean
+from pbdkit.resources.memory import machine_memory
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.recorder import Recorder
 from pbdkit.results.sink import Sink
-from pbdkit.scene.memory import machine_memory
 from pbdkit.scene.scene import build_scene
 from pbdkit.sweeps.member import named
 from pbdkit.sweeps.specification import Keep

@@ -1,0 +1,1 @@
+"""The memory of the machine, and what files from elsewhere may take of it."""
