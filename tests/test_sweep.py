@@ -276,7 +276,7 @@ WRONG = [
     ({"experiment": "paper/x"}, "experiment: 'paper/x' is neither; did you mean 'paper/"),
     ({"experiment": "../e.json"}, "leads elsewhere; give a shipped name, or a file in the folder"),
     ({"experiment": "/etc/passwd"}, "leads elsewhere"),
-    ({"experiment": "link.json"}, "is a link that leads elsewhere"),
+    ({"experiment": "link.json"}, "'link.json' leads elsewhere"),
     ({"experiment": 3}, "experiment: expected a shipped name, a file beside this one"),
 ]  # fmt: skip
 

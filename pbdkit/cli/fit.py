@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from pbdkit.cli.options import outside_option
+
 PATH = click.Path(path_type=Path)
 
 
@@ -15,6 +17,7 @@ PATH = click.Path(path_type=Path)
 @click.option("-o", "--output", type=PATH, help="JSON; else the name of FIT with .json.")
 @click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF: measured, fitted, left.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
+@outside_option
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
     """Find the parameters that fit a measured field best, or the strengths of repeated tests, with

@@ -38,9 +38,6 @@ def result_argument(name: str, metavar: str = "OUT.nc", **more: Any) -> Callable
     return click.argument(name, metavar=metavar, type=PATH, shell_complete=completed, **more)
 
 
-experiment_argument = click.argument(
-    "experiment", metavar="EXPERIMENT", shell_complete=completed_by("experiments")
-)
 color_option = click.option(
     "--color",
     metavar="VARIABLE",
@@ -86,16 +83,42 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 verbose_option = click.option("--verbose", is_flag=True, help="Say all that is known.")
 
 
-def _disable_plugins(context: click.Context, option: click.Parameter, given: bool) -> None:
-    """For this call and the processes that it starts: it is what the variable does."""
-    if not given:
-        return
-    from pbdkit.registry.discovery import ALL, DISABLE
+def _setting(module: str, name: str) -> Callable[[click.Context, click.Parameter, bool], None]:
+    """Return the callback of a flag that sets the environment variable of that name in a module to
+    "*", for this call and the processes that it starts."""
 
-    before = {name: value for name, value in os.environ.items() if name == DISABLE}
-    os.environ[DISABLE] = ALL
-    context.call_on_close(lambda: os.environ.update(before))
-    context.call_on_close(lambda: os.environ.pop(DISABLE, None))  # the last comes first
+    def set_variable(context: click.Context, option: click.Parameter, given: bool) -> None:
+        if not given:
+            return
+        variable = getattr(import_module(module), name)
+        before = os.environ.get(variable)
+        os.environ[variable] = "*"
+
+        def restore() -> None:
+            os.environ.pop(variable, None)
+            os.environ.update({} if before is None else {variable: before})
+
+        context.call_on_close(restore)
+
+    return set_variable
+
+
+outside_option = click.option(
+    "--allow-outside",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_setting("pbdkit.experiment.beside", "ALLOW_OUTSIDE"),
+    help="Read files that lie outside the folder of the file that names them.",
+)
+
+
+def experiment_argument(command: F) -> F:
+    """Add the argument of that name, and the option which of the files that it names are read."""
+    argument = click.argument(
+        "experiment", metavar="EXPERIMENT", shell_complete=completed_by("experiments")
+    )
+    return outside_option(argument(command))
 
 
 NO_PLUGINS = click.Option(
@@ -103,7 +126,7 @@ NO_PLUGINS = click.Option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_disable_plugins,
+    callback=_setting("pbdkit.registry.discovery", "DISABLE"),
     help="Load no plugin, as if only pbdkit itself were installed.",
 )
 

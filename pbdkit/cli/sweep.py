@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from pbdkit.cli.options import outside_option
 
 if TYPE_CHECKING:
     from pbdkit.cli.stopping import Stop
@@ -25,6 +28,7 @@ SHOWN = 20
 @click.option("-o", "--output", "folder", type=PATH, help="The folder to keep the members in.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes; else one a processor.")
 @click.option("--dask", "address", metavar="ADDRESS", help="Run on a dask cluster instead.")
+@outside_option
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 def sweep(
     file: Path, folder: Path | None, workers: int | None, address: str | None, quiet: bool
@@ -76,6 +80,8 @@ def _client(address: str | None) -> Iterator[Any]:
     except ImportError:
         what = "--dask needs dask.distributed: pip install 'pbdkit[sweep]'"
         raise ExperimentError(what) from None
+    # Its notes on lost connections, with tracebacks, would stand between those of the program.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = connect(address, timeout=CONNECT_S)
     except (OSError, ValueError, ImportError) as error:
@@ -90,6 +96,7 @@ def _told(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
     failures = summary.failures
     if summary.path is None:
         what = f"interrupted: {count - missing} of {count} members are finished, in {folder}"
+        what = what if count else "interrupted while members were validated; none was run"
         click.echo(f"pbdkit: {what}; the same command goes on with the others", err=True)
         return stop.exit_status
     if not quiet:

@@ -8,12 +8,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pbdkit.errors import ExperimentError, printable
-from pbdkit.interfaces import Pair
 from pbdkit.interfaces.component import Strict
 
 LONGEST = 4096
 """Bytes of a command."""
+FARTHEST = 1e12
+"""Largest coordinate, in lattice units: squares and differences of it are finite."""
 Step = Annotated[int, Field(ge=0, lt=2**31)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Place = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
+"""(x, y) on the page's plane."""
 
 
 class Play(Strict):
@@ -55,7 +59,7 @@ class Drag(Strict):
     """Leads what is held so far from where it was grabbed."""
 
     do: Literal["drag"]
-    by: Pair
+    by: Place
 
 
 class Release(Strict):
@@ -76,8 +80,8 @@ class CutLine(Strict):
     """Cuts along a line across the body as it stands."""
 
     do: Literal["cut"]
-    from_: Pair = Field(alias="from")
-    to: Pair
+    from_: Place = Field(alias="from")
+    to: Place
 
 
 class CutBond(Strict):

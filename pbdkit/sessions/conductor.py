@@ -19,6 +19,7 @@ from pbdkit.sessions.session import Session
 
 SHORTEST_S = 1 / 60
 """Between two pictures."""
+CLOSE_S = 1.0
 
 
 class Viewer(ABC):
@@ -75,11 +76,12 @@ class Conductor:
         self._asked.put((viewer, command))
 
     def close(self) -> None:
-        """Ends the session's thread after the steps that it is at."""
+        """End the session's thread after the steps that it is at, or, where these take longer than
+        `CLOSE_S`, with the process."""
         self._asked.put((None, "close"))
         self._judge.close()
         if self._thread.is_alive():
-            self._thread.join()
+            self._thread.join(CLOSE_S)
 
     def _work(self) -> None:
         due = 0.0

@@ -11,7 +11,9 @@ from contextlib import suppress
 from html import escape
 from http import HTTPStatus
 from string import Template
+from typing import Any
 from urllib.parse import urlsplit
+from weakref import WeakSet
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
@@ -27,6 +29,8 @@ from pbdkit.sessions.scenery import Message
 MOST_WAITING = 1000
 """Messages to a page that takes none; then its line is cut."""
 MOST_PAGES = 8
+CLOSE_S = 0.5
+"""Seconds that pages have at the end to answer; then their lines are cut."""
 POLICY = (
     "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -80,6 +84,7 @@ class SessionServer:
     def __init__(self, conductor: Conductor, title: str, port: int = 0) -> None:
         self._conductor, self._title, self._port = conductor, title, port
         self._pages = 0
+        self._transports: WeakSet[Any] = WeakSet()
         self.access = Access(port)
 
     async def run(self, ready: Callable[[str], None], end: asyncio.Event) -> None:
@@ -94,14 +99,31 @@ class SessionServer:
         async with server:
             ready(self.access.address)
             await end.wait()
+            server.close()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(server.wait_closed(), CLOSE_S)
+            for transport in self._transports:  # half-open requests, and pages that do not read
+                transport.abort()
 
     async def _started(self) -> Server:
         server = await serve(
             self._talk, HOST, self._port, process_request=self._answer, max_size=LONGEST,
             max_queue=64, compression=None, server_header=None, logger=_silent(),
+            create_connection=self._connection(),
         )  # fmt: skip
         self.access = Access(next(iter(server.sockets)).getsockname()[1], self.access.token)
         return server
+
+    def _connection(self) -> type[ServerConnection]:
+        """Return the class of connections, of which each leaves its transport here."""
+        transports = self._transports
+
+        class Connection(ServerConnection):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                transports.add(transport)
+                super().connection_made(transport)
+
+        return Connection
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page, a refusal, or nothing where the socket may open."""

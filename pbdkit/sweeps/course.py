@@ -57,7 +57,16 @@ def carry_out(
     Raises ExperimentError and PluginError before anything runs, and StorageError. `stopping` is
     asked all the time; once it says so, what is finished is kept and there is no dataset.
     """
-    grid, members, versions = validated(asked, show)
+
+    def show_unless_stopped(what: str, share: float) -> None:
+        if stopping():
+            raise _StoppedError
+        show(what, share)
+
+    try:
+        grid, members, versions = validated(asked, show_unless_stopped)
+    except _StoppedError:
+        return Summary([], {}, 0, [], None)
     jobs = {member.job.key: member.job for member in members}
     with Store(folder) as store:
         ends, faults = store.held()
@@ -80,6 +89,10 @@ def carry_out(
         dataset.attrs = _attributes(asked, versions)
         _write(dataset, folder / RESULT)
     return Summary(members, ends, run, faults, folder / RESULT)
+
+
+class _StoppedError(Exception):
+    """The sweep was stopped while its members were validated."""
 
 
 def _heard(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
+from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.interfaces import Component
 from pbdkit.sweeps.member import Job
 from pbdkit.sweeps.worker import LOST, Report, report_of, run_member, run_members
@@ -100,33 +102,57 @@ class Cluster(Crew):
 
     def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
         """Chunks as tasks, a few more than there are threads; those still out are cancelled where
-        the work ends early. Raises ExperimentError where no worker is there."""
+        the work ends early. Raises ExperimentError where no worker is there, and StorageError where
+        the scheduler is lost."""
+        out: dict[Any, list[Job]] = {}
+        try:
+            yield from self._with_workers(stopping)
+            yield from self._handed_out(jobs, out, stopping)
+        except (Exception, CancelledError) as error:
+            if self._is_there():
+                raise
+            raise StorageError(
+                f"--dask: the scheduler is lost ({type(error).__name__}); what was finished is "
+                "held, and the same command goes on with the others"
+            ) from None
+        finally:
+            if self._is_there():
+                self._client.cancel(list(out))
+
+    def _is_there(self) -> bool:
+        """Whether the scheduler is connected."""
+        return bool(self._client.status == "running")
+
+    def _with_workers(self, stopping: Callable[[], bool]) -> Iterator[None]:
+        """Wait for the first worker."""
+        end = time.monotonic() + WAIT_FOR_WORKERS_S
+        while not self._client.nthreads():
+            if time.monotonic() > end:
+                what = f"the cluster has had no worker for {WAIT_FOR_WORKERS_S:g} s"
+                raise ExperimentError(f"--dask: {what}")
+            if stopping():
+                return
+            time.sleep(HEARTBEAT_S)
+            yield None
+
+    def _handed_out(
+        self, jobs: list[Job], out: dict[Any, list[Job]], stopping: Callable[[], bool]
+    ) -> Iterator[Report | None]:
         from distributed import wait as wait_for
 
         wait: Any = wait_for
-        try:
-            self._client.wait_for_workers(1, timeout=WAIT_FOR_WORKERS_S)
-        except TimeoutError:
-            what = f"the cluster has had no worker for {WAIT_FOR_WORKERS_S:g} s"
-            raise ExperimentError(f"--dask: {what}") from None
-        out: dict[Any, list[Job]] = {}
         queue = Queue(deque(jobs), 1)
-        try:
-            while out or (queue.jobs and not stopping()):
-                queue.workers = max(1, sum(self._client.nthreads().values()))
-                while queue.jobs and len(out) < AHEAD * queue.workers and not stopping():
-                    chunk = queue.chunk()
-                    out[self._client.submit(run_members, chunk, pure=False)] = chunk
-                if stopping():
-                    return
-                try:
-                    wait(list(out), timeout=HEARTBEAT_S, return_when="FIRST_COMPLETED")
-                except TimeoutError:
-                    yield None
-                for future in [future for future in out if future.done()]:
-                    yield from _reports(future, out.pop(future), queue)
-        finally:
-            self._client.cancel(list(out))
+        while (out or queue.jobs) and not stopping():
+            queue.workers = max(1, sum(self._client.nthreads().values()))
+            while queue.jobs and len(out) < AHEAD * queue.workers and not stopping():
+                chunk = queue.chunk()
+                out[self._client.submit(run_members, chunk, pure=False)] = chunk
+            try:
+                wait(list(out), timeout=HEARTBEAT_S, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                yield None
+            for future in [future for future in out if future.done()]:
+                yield from _reports(future, out.pop(future), queue)
 
 
 def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[Report]:

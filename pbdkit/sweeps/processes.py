@@ -10,8 +10,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from multiprocessing import get_context, parent_process
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any
 
@@ -20,8 +21,8 @@ from pbdkit.sweeps.crew import AHEAD, HEARTBEAT_S, Crew, Queue
 from pbdkit.sweeps.member import Job
 from pbdkit.sweeps.worker import Report, run_members
 
-GRACE_S = 2.0
-"""Who is stopped waits so long for what is nearly done."""
+GRACE_S = 1.0
+"""Seconds that members have to end once the sweep is stopped."""
 MOST_STARTS = 10
 """So many workers that end before they have begun, with nothing reported between, are no chance."""
 ONE_THREAD = dict.fromkeys(
@@ -73,6 +74,7 @@ class _Worker:
     def __init__(self) -> None:
         self.chunks: dict[Future[list[Report]], list[Job]] = {}
         self._pool: ProcessPoolExecutor | None = None
+        self._processes: set[BaseProcess] = set()
 
     def take(self, queue: Queue) -> bool:
         """Whether it could take the next chunk: not where it was killed and has still to say so."""
@@ -103,11 +105,10 @@ class _Worker:
             yield from queue.reported(reports)
 
     def end(self) -> None:
-        """Ends the process, whatever it is at."""
+        """Ends the process, whatever it is at, begun or not."""
         if self._pool is not None:
-            if self.chunks and self._begun.done() and not self._begun.exception():
-                with suppress(ProcessLookupError, PermissionError):
-                    os.kill(self._begun.result(), getattr(signal, "SIGKILL", signal.SIGTERM))
+            for process in self._processes:
+                process.kill()
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
@@ -135,8 +136,10 @@ class _Worker:
 
     def _current(self) -> ProcessPoolExecutor:
         if self._pool is None:
+            others = {*active_children()}
             self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
             self._begun = self._pool.submit(os.getpid)
+            self._processes = {*active_children()} - others
         return self._pool
 
 
