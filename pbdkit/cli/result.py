@@ -54,9 +54,25 @@ def _verified(file: Path) -> str:
             if content.seal is None:
                 refuse_no_result(file)
                 fault = f"{file}: {UNSEALED}"
+            else:
+                _refuse_elsewhere(file)
     except StorageError as error:
         fault = str(error)
     return fault
+
+
+def _refuse_elsewhere(file: Path) -> None:
+    """Raises StorageError where the bytes are what was sealed, and refer to others elsewhere."""
+    from pbdkit.errors import StorageError
+    from pbdkit.registry.blame import one_line
+    from pbdkit.storage.seal import opened
+
+    try:
+        opened(file).close()
+    except StorageError:
+        raise
+    except Exception as error:  # whatever the libraries make of it
+        raise StorageError(f"{file}: cannot be read as netCDF-4: {one_line(str(error))}") from None
 
 
 @click.command()

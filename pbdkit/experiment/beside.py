@@ -55,7 +55,7 @@ class Beside:
             raise ValueError(f"{str(path)[:80]}...: {error.strerror}") from None
         if not inside:
             folder = self.folder.absolute()
-            text = f"{name} lies outside {folder}, the folder of the file that names it"
+            text = f"{name} lies outside the folder of the file that names it, {folder}"
             raise ValueError(f"{text}; copy it there, or {ALLOW}")
         if not regular:
             how = "is no regular file" if path.exists() else "is not there"

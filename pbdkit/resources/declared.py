@@ -25,7 +25,7 @@ EMPTY = 2**20
 LARGEST_CHUNK = 2**26
 """Bytes of a chunk that are taken whatever is stored."""
 MOST_OBJECTS = 10_000
-"""Maximum number of objects, of links and of attributes in a file."""
+"""Maximum number of objects and of links in a file, and of attributes of each."""
 LARGEST_TEXTS = 2**28
 """Bytes that a block of texts can take when it is looked at."""
 FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32"}
@@ -43,34 +43,36 @@ def check_declared(content: h5py.File, size: int) -> None:
     """
     from h5py import h5a, h5d, h5l, h5o
 
-    count = 0
+    links: list[tuple[bytes, bool]] = []
+    objects = [b"."]
 
-    def look_at_link(name: bytes, info: Any) -> None:
-        nonlocal count
-        count = _counted(count)
-        if info.type != h5l.TYPE_HARD:
+    # h5py ends a visit where something is returned; it does not bear exceptions there.
+    def note_link(name: bytes, info: Any) -> bool | None:
+        links.append((name, info.type == h5l.TYPE_HARD))
+        return len(links) > MOST_OBJECTS or None
+
+    def note_object(name: bytes, info: Any) -> bool | None:
+        objects.append(name)
+        return len(objects) > MOST_OBJECTS or None
+
+    if content.id.links.visit(note_link, info=True) or h5o.visit(
+        content.id, note_object, info=True
+    ):
+        raise StorageError(f"it holds more than {MOST_OBJECTS} objects")
+    for name, is_hard in links:
+        if not is_hard:
             raise StorageError(f"its link '{_text(name)}' leads elsewhere; {_REMEDY}")
-
-    def look_at_object(name: bytes, info: Any) -> None:
-        nonlocal count
+    for name in objects:
         found = h5o.open(content.id, name)
-        for n in range(h5a.get_num_attrs(found)):
-            count = _counted(count)
+        if (count := h5a.get_num_attrs(found)) > MOST_OBJECTS:
+            raise StorageError(f"'{_text(name)}' has {count} attributes")
+        for n in range(count):
             _check_attribute(h5a.open(found, index=n), size)
         if isinstance(found, h5d.DatasetID):
             _check_dataset(found, _text(name), size)
 
-    content.id.links.visit(look_at_link, info=True)
-    h5o.visit(content.id, look_at_object, info=True)
-
 
 _REMEDY = "copy the data into one netCDF-4 file, for instance by xarray: open_dataset, to_netcdf"
-
-
-def _counted(count: int) -> int:
-    if count >= MOST_OBJECTS:
-        raise StorageError(f"it holds more than {MOST_OBJECTS} objects and attributes")
-    return count + 1
 
 
 def _text(name: bytes) -> str:
