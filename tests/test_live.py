@@ -8,9 +8,11 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from socket import create_connection
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from pbdkit.scene.raster import FOLLOWER
 from pbdkit.scene.scene import build_scene
 from pbdkit.sessions import history, saving, stage
 from pbdkit.sessions.access import Access
-from pbdkit.sessions.commands import LONGEST, command_of
+from pbdkit.sessions.commands import FARTHEST, LONGEST, command_of
 from pbdkit.sessions.conductor import Conductor
 from pbdkit.sessions.judgement import judged
 from pbdkit.sessions.obeying import obey
@@ -571,6 +573,28 @@ def test_who_knows_the_address_gets_the_page_and_nothing_else(address):
     assert asked(address.replace("/?", "/etc/passwd?")) == 404
 
 
+def test_the_end_waits_for_no_page(tmp_path):
+    """Neither for requests of which half has come, nor for pages that read nothing."""
+    session, _ = session_of("paper/a", tmp_path)
+    with ExitStack() as lines:
+        with served(session) as address:
+            parts = urlsplit(address)
+            half, silent = (
+                lines.enter_context(create_connection((parts.hostname, parts.port)))
+                for _ in range(2)
+            )
+            half.sendall(b"GET / HTT")
+            silent.sendall(
+                f"GET /socket?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\n"
+                f"Origin: http://{parts.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+                .encode()
+            )  # fmt: skip
+            assert silent.recv(12) == b"HTTP/1.1 101"
+            begin = time.monotonic()
+        assert time.monotonic() - begin < 6.0
+
+
 def test_a_port_that_is_taken_is_said(address, tmp_path):
     port = int(re.search(r":(\d+)/", address)[1])
     with pytest.raises(pbdkit.ExperimentError, match=f"--port {port}: cannot be served at"):
@@ -610,6 +634,28 @@ def test_tokens_are_never_the_same():
     assert len(tokens) == 20
     assert min(map(len, tokens)) >= 43
     assert Access(1).token not in repr(Access(1))
+
+
+FAR = [
+    {"do": "cut", "from": [1e308, -1e308], "to": [-1e308, 1e308]},
+    {"do": "cut", "from": [1e300, 0], "to": [0, 0]},
+    {"do": "drag", "by": [0, 1e200]},
+]
+
+
+@pytest.mark.parametrize("command", FAR)
+def test_places_that_no_body_reaches_are_no_commands(command):
+    with pytest.raises(pbdkit.ExperimentError, match=r"no command: .* 1000000000000"):
+        command_of(json.dumps(command))
+
+
+def test_cuts_as_far_as_commands_reach_cut_or_miss(tmp_path):
+    session, _ = session_of("paper/d1", tmp_path)
+    for end in ([FARTHEST, FARTHEST], [-FARTHEST, 0.0], [0.0, 0.0]):
+        with suppress(pbdkit.ExperimentError):
+            do(session, do="cut", **{"from": [FARTHEST, -FARTHEST], "to": end})
+    session.advance(2)
+    assert np.isfinite(session.state.u).all()
 
 
 def test_pages_that_say_nonsense_are_told_so_and_the_session_goes_on(address):

@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from asyncio import CancelledError
 from pathlib import Path
 from typing import Literal
 
@@ -17,10 +18,14 @@ import xarray
 from reliability.sweep_under_fire import under_fire
 
 import pbdkit
+from pbdkit.experiment.source import Source
 from pbdkit.sweeps import store as stores
-from pbdkit.sweeps.crew import Alone
+from pbdkit.sweeps.course import carry_out
+from pbdkit.sweeps.crew import Alone, Cluster
 from pbdkit.sweeps.grid import replicate_seeds
+from pbdkit.sweeps.member import Asked
 from pbdkit.sweeps.processes import Processes
+from pbdkit.sweeps.specification import checked
 
 VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
 
@@ -321,6 +326,75 @@ def test_a_stopped_sweep_goes_on_where_it_was(small, tmp_path):
     held = rows(tmp_path / "out")
     assert 0 < held < 30
     assert not (tmp_path / "out" / "sweep.nc").exists()
+
+
+def test_a_worker_that_hangs_before_it_begins_is_ended(small, tmp_path, monkeypatch):
+    """As one that is stopped, or whose disk does not answer."""
+    (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(60)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    begun, stopped = time.monotonic(), []
+    reports = Processes(1).work(jobs_of(small, 2), lambda: bool(stopped))
+    assert next(reports) is None
+    stopped.append(True)
+    assert [*reports] == []
+    assert time.monotonic() - begun < 20.0
+
+
+def jobs_of(experiment, count):
+    """Jobs of some seeds."""
+    base = Source(data=experiment)
+    asked = Asked(
+        checked({"experiment": experiment, "vary": {"seed": [*range(count)]}}, base), base, base
+    )
+    return [
+        member.job for member, _ in asked.members(asked.grid(asked.experiment()), lambda _: None)
+    ]
+
+
+def test_a_sweep_is_stopped_while_its_members_are_validated(small, tmp_path, monkeypatch):
+    asked = []
+
+    def stopping():
+        asked.append(1)
+        return len(asked) > 3
+
+    base = Source(data=small)
+    sweep = checked({"experiment": small, "vary": {"seed": [*range(50)]}}, base)
+    summary = carry_out(
+        Asked(sweep, base, base), tmp_path / "out", Alone(), stopping, lambda *told: None
+    )
+    assert (summary.path, summary.run, len(asked)) == (None, 0, 4)
+    assert not (tmp_path / "out").exists()
+
+
+class Lost:
+    """A client of a dask cluster whose scheduler is lost as soon as it is asked for something."""
+
+    status = "running"
+
+    def nthreads(self):
+        return {"worker": 1}
+
+    def submit(self, *task, **more):
+        self.status = "connecting"
+        raise CancelledError("scheduler-connection-lost")
+
+
+def test_a_scheduler_that_is_lost_is_named_with_how_to_go_on(small):
+    with pytest.raises(pbdkit.StorageError, match=r"the scheduler is lost.*is held, and the same"):
+        [*Cluster(Lost()).work(jobs_of(small, 2), lambda: False)]
+
+
+def test_the_wait_for_a_worker_of_a_cluster_can_be_stopped(small):
+    from distributed import Client
+
+    with Client(processes=False, n_workers=0, dashboard_address=None) as client:
+        begun, stopped = time.monotonic(), []
+        reports = Cluster(client).work(jobs_of(small, 2), lambda: bool(stopped))
+        assert next(reports) is None
+        stopped.append(True)
+        assert [*reports] == []
+        assert time.monotonic() - begun < 10.0
 
 
 def rows(folder):

@@ -287,8 +287,8 @@ def result_case(folder: Path, subjects: Path, draw: random.Random) -> Case:
 
 
 ELSEWHERE = (
-    "../secret.csv", "{}/secret.csv", "link.csv", "linked/secret.csv", "/etc/passwd", "../secret.txt",
-    "a/../../secret.csv", "./../secret.csv",
+    "../secret.csv", "{}/secret.csv", "link.csv", "linked/secret.csv", "/etc/passwd",
+    "../secret.txt", "a/../../secret.csv", "./../secret.csv",
 )  # fmt: skip
 NO_FILES = (
     "/dev/zero", "/dev/stdin", ".", "", "x" * 300, "x/" * 3000, "no.csv", "\n", "fifo", "a\0b", 7,
@@ -298,7 +298,8 @@ TABLES = (
     b"step,ux,uy\n1,1_0,0\n", b"step,ux,uy\n1," + "١".encode() + b",0\n", b"step,ux,uy\n1,nan,0\n",
     b"step,ux,uy\n" + b"1,0,0,\n" * 10, b"," * 3_000_000 + b"\n", b"step,ux,ux\n1,2,3\n",
     ",".join(f"ux{n}" for n in range(300_000)).encode(), b"step,ux,uy\n1,\"0\n,0\n" * 9,
-    b"step,ux,uy\n1,1e400,0\n", b"\xff\xfe" + b"step,ux,uy\n", b"", b"\0" * 99, b"step,ux,uy\r1,0,0\r",
+    b"step,ux,uy\n1,1e400,0\n", b"\xff\xfe" + b"step,ux,uy\n", b"", b"\0" * 99,
+    b"step,ux,uy\r1,0,0\r",
 )  # fmt: skip
 
 
