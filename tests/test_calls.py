@@ -91,7 +91,7 @@ def test_a_dataset_returns_its_experiment(ds):
 def test_copies_with_other_parts_are_validated_when_they_run():
     experiment = pbdkit.load("modelling/composite-plate")
     again = experiment.model_copy(update={"seed": 3})
-    assert again.as_written()["seed"] == 3
+    assert again.as_written().data["seed"] == 3
     assert not again.is_as_validated
     wrong = experiment.record.model_copy(update={"every": -1})
     for update, place in (({"steps": -5}, "steps: "), ({"record": wrong}, "record.every: ")):

@@ -40,7 +40,7 @@ def test_what_is_retired_is_read_as_its_successor(name):
         found = pbdkit.Experiment(**SHEET | {"frame": {"type": name}})
     assert found == pbdkit.Experiment(**SHEET)
     assert [warning.filename for warning in caught] == [__file__]
-    assert "traction-free" not in found.model_dump_json() + str(found.as_written())
+    assert "traction-free" not in found.model_dump_json() + str(found.as_written().data)
 
 
 def test_what_is_built_of_an_experiment_again_does_not_warn_again():
@@ -49,7 +49,7 @@ def test_what_is_built_of_an_experiment_again_does_not_warn_again():
         found = Experiment.build(Source(data=given))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert found.of_parts(found.as_written()) == found
+        assert found.of_parts(found.as_written().data) == found
 
 
 def test_the_program_warns_once_and_names_the_place(call, tmp_path):
