@@ -278,6 +278,18 @@ def test_an_experiment_with_units_keeps_the_folder_of_its_files(
     assert found.status.values.tolist() == ["complete"] * 2
 
 
+def test_sweeps_in_python_vary_files(tensile: dict[str, Any], elsewhere: Path) -> None:
+    Path("again.csv").write_text(STEPS)
+    files = ["../data.csv", "again.csv"]
+    found = pbdkit.sweep(
+        with_table(tensile, files[0]),
+        vary={"leaders.1.motion": [{"type": "table", "file": file} for file in files]},
+        workers=1,
+        progress=False,
+    )
+    assert found.status.values.tolist() == ["complete"] * 2
+
+
 @pytest.mark.parametrize("parts", [with_table, with_field])
 def test_an_experiment_in_a_result_names_no_files(call: Any, parts: Any, elsewhere: Path) -> None:
     assert call("run", "paper/a", "-o", "r.nc", "--quiet").code == 0

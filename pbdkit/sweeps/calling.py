@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import ExperimentError, PbdkitWarning
+from pbdkit.experiment.beside import OF_PROGRAM
 from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.source import Source
@@ -37,6 +38,8 @@ def called(
 ) -> xarray.Dataset:
     """The dataset of a sweep with these parts, loaded where no folder keeps it."""
     base = replace(experiment.as_written(), name="")
+    if base.beside.folder is None:
+        base.beside = OF_PROGRAM
     given = given_classes(experiment)
     if given and folder is not None:
         raise ExperimentError(
