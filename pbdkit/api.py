@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
 from pbdkit.experiment.beside import OF_PROGRAM
+from pbdkit.experiment.loading import load_experiment
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import Settings, with_settings
-from pbdkit.experiment.shipped import read_experiment
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import Component
-from pbdkit.prediction.analysis import Analysis
 from pbdkit.prediction.forecast import refuse_too_much_output
 from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.carried import carried
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from pbdkit.fitting.fitted import Fitted
     from pbdkit.fitting.strength_fitted import FittedStrength
     from pbdkit.identity.identity import Identity
+    from pbdkit.prediction.analysis import Analysis
 
 Components = Iterable[type[Component]]
 Given = Experiment | Mapping[str, Any] | str | Path
@@ -68,9 +68,7 @@ def load(
         raise ExperimentError(
             f"load: expected a file or the name of a shipped experiment, {_but_got(name)}"
         )
-    source = read_experiment(str(name), allow_outside=allow_outside)
-    source = with_settings(source, settings, Experiment.defaults())
-    return Experiment.build(source, components)
+    return load_experiment(str(name), settings, components, allow_outside=allow_outside)
 
 
 def run(
@@ -131,6 +129,8 @@ def _warn(texts: Iterable[str]) -> None:
 def analyse(experiment: Given, *, components: Components = (), settings: Settings = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
+    from pbdkit.prediction.analysis import Analysis
+
     return Analysis(tuned(build_scene(as_experiment(experiment, components, settings))))
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 LONGEST = 3900
 """So many characters a message has at most."""
 MOST_LINES = 20
+MOST_NAMES = 8
+"""So many names that begin with a word are suggested for it."""
 
 
 class PbdkitError(Exception):
@@ -111,3 +114,17 @@ def warn_caller(text: str) -> None:
 def dotted(where: Sequence[Any]) -> str:
     """The path of a field as users write it: ``leaders.1.select``."""
     return ".".join(str(part) for part in where)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?`` with the known names that begin with the word, or else with
+    the nearest one; an empty string where no known name is near."""
+    by_lower, lower = {k.lower(): k for k in known}, name[:80].lower()
+    near = [k for k in by_lower if k.startswith((f"{lower}_", f"{lower}-"))] if lower else []
+    if not 0 < len(near) <= MOST_NAMES or lower in by_lower:
+        near = difflib.get_close_matches(lower, by_lower, n=1, cutoff=0.5)
+    names = [f"'{by_lower[k]}'" for k in near]
+    if not names:
+        return ""
+    before = f"{', '.join(names[:-1])} or " if len(names) > 1 else ""
+    return f"; did you mean {before}{names[-1]}?"

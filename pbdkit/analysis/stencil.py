@@ -29,6 +29,8 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.evaluator import Evaluator, summed
 
+NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
+"""What a bound adds where no relaxation is stable."""
 TINY, SMALL = 1e-100, 1e-6
 """The steps of derivatives, imaginary and real, as shares of the spacing."""
 Moved = Callable[[complex], tuple[Any, Any]]

@@ -105,8 +105,8 @@ class Commands(click.Group):
         if name not in COMMANDS:
             if ctx.resilient_parsing:  # a shell asks how to go on
                 return None
+            from pbdkit.errors import did_you_mean
             from pbdkit.experiment.shipped import shipped_names
-            from pbdkit.interfaces.component import did_you_mean
 
             run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
             near = run or did_you_mean(name, COMMANDS) or "; `pbdkit` alone lists them"

@@ -35,17 +35,18 @@ SHOWN = 3
 def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
     """Say what will happen, without running it: who is held and who leads, whether it is stable,
     in how many steps it settles, what it takes in time and memory."""
-    from pbdkit.api import load
     from pbdkit.cli.waiting import waiting
     from pbdkit.errors import PbdkitWarning
+    from pbdkit.experiment.loading import load_experiment
+
+    with warnings.catch_warnings(record=True) as of_loading:
+        warnings.simplefilter("always", PbdkitWarning)
+        loaded = load_experiment(experiment, settings)
     from pbdkit.prediction.forecast import forecast
     from pbdkit.runs.course import rehearse
     from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
 
-    with warnings.catch_warnings(record=True) as of_loading:
-        warnings.simplefilter("always", PbdkitWarning)
-        loaded = load(experiment, settings=settings)
     with waiting(f"checking {loaded.name}", silent=as_json):
         scene = tuned(build_scene(loaded))
         rehearse(scene)

@@ -133,8 +133,7 @@ def _asked_for(distributions: tuple[str, ...]) -> list[Plugin]:
 
     Raises PluginError for a name that is not installed, and where there is no plugin at all.
     """
-    from pbdkit.errors import PluginError
-    from pbdkit.interfaces.component import did_you_mean
+    from pbdkit.errors import PluginError, did_you_mean
     from pbdkit.registry import BUILTIN
     from pbdkit.registry.discovery import canonical
     from pbdkit.registry.registry import Registry

@@ -51,18 +51,16 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
-    from pbdkit.api import load
     from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output, refuse_unfinished
+    from pbdkit.experiment.loading import load_experiment
     from pbdkit.ranks.launched import launched
-    from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.runs.course import record
 
     with launched() as processes:
         with processes.agreeing():
             with folder_kept(), warnings.catch_warnings():
                 if quiet or not processes.first:
                     warnings.simplefilter("ignore", PbdkitWarning)
-                loaded = load(experiment, settings=settings)
+                loaded = load_experiment(experiment, settings)
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
             if processes.first:
                 refuse_output(path, force=force, experiment=Path(experiment))
@@ -71,6 +69,9 @@ def run(
         quiet = quiet or not processes.first
 
         def run_by(those: Processes, again: bool) -> int:
+            from pbdkit.results.netcdf_sink import NetcdfSink
+            from pbdkit.runs.course import record
+
             scene = those.scene(loaded)
             with those.agreeing():
                 if those.first:

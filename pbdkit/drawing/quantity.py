@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.drawing.labels import in_its_units
-from pbdkit.errors import ExperimentError
-from pbdkit.interfaces.component import did_you_mean
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.results.layout import INDICES, broken_by, makers_of
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from pbdkit.drawing.look import Look
 from pbdkit.drawing.quantity import Quantity
-from pbdkit.errors import ExperimentError
-from pbdkit.interfaces.component import did_you_mean
+from pbdkit.errors import ExperimentError, did_you_mean
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap, Normalize

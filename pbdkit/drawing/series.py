@@ -9,8 +9,7 @@ import numpy as np
 
 from pbdkit.drawing.labels import in_its_units
 from pbdkit.drawing.quantity import axes_of, component_of, makers_of_missing
-from pbdkit.errors import ExperimentError
-from pbdkit.interfaces.component import did_you_mean
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.results.layout import OF_BODY
 
 if TYPE_CHECKING:

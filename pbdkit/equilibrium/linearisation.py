@@ -10,7 +10,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from pbdkit.equilibrium.contact_system import ContactSystem
 from pbdkit.equilibrium.matrix_system import MatrixSystem
 from pbdkit.equilibrium.moves import Moves, random_displacements
 from pbdkit.equilibrium.rows import ALL, Rows
@@ -47,6 +46,8 @@ def linearised(
     if rows.strip:
         return _shared(scene, state, math.ceil(moment), watch, rows)
     if scene.barriers:
+        from pbdkit.equilibrium.contact_system import ContactSystem
+
         return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
     step = math.ceil(moment)
 

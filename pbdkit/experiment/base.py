@@ -8,13 +8,12 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.beside import ALLOW, Beside
 from pbdkit.experiment.kinds import EXPERIMENT, of_kind
 from pbdkit.experiment.parts import brief, fault
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.component import did_you_mean
 
 
 def _an_experiment(value: Any) -> Any:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationInfo
+if TYPE_CHECKING:
+    from pydantic import ValidationInfo
 
 ALLOW_OUTSIDE = "PBDKIT_ALLOW_OUTSIDE"
 """The environment variable that, where it is not empty, allows files outside the folder."""

@@ -10,9 +10,9 @@ from typing import Any, TextIO
 
 from pydantic import ValidationInfo
 
+from pbdkit.errors import did_you_mean
 from pbdkit.experiment.beside import beside
 from pbdkit.experiment.parts import fault
-from pbdkit.interfaces.component import did_you_mean
 
 MOST_BYTES, MOST_ROWS = 2**26, 200_000
 LONGEST_LINE = 2**16

@@ -12,12 +12,11 @@ from typing import Any
 from pydantic import BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.errors import ExperimentError, PbdkitError, PluginError, did_you_mean
 from pbdkit.experiment.beside import beside
 from pbdkit.experiment.field_file import read_field
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.course import FORMS, WORD
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.units import TEXT

@@ -6,11 +6,10 @@ import re
 from itertools import takewhile
 from pathlib import Path
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.beside import Beside
 from pbdkit.experiment.kinds import EXPERIMENT, of_kind
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.component import did_you_mean
 
 FOLDER = Path(__file__).parent.parent / "experiments"
 SUFFIX = ".yaml"

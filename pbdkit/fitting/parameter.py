@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.given import given_classes
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.varying import ByRegion
 

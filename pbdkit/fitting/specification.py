@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, model_validator
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.base import Base, base_source
 from pbdkit.experiment.beside import OF_PROGRAM, Beside, beside
 from pbdkit.experiment.kinds import FIT, of_kind
@@ -17,7 +17,7 @@ from pbdkit.experiment.parts import report
 from pbdkit.experiment.source import Source, read_file
 from pbdkit.fitting.least_squares import Loss
 from pbdkit.fitting.measurements import MeasuredCurve, MeasuredField, Measurements, Pair, Positive
-from pbdkit.interfaces.component import Strict, did_you_mean
+from pbdkit.interfaces.component import Strict
 
 FOLDER = Path(__file__).parent.parent / "fits"
 

@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import printable
+from pbdkit.errors import did_you_mean, printable
 from pbdkit.interfaces.vector import Components
-
-MOST_NAMES = 8
-"""So many names that begin with a word are suggested for it."""
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ``; did you mean 'x'?`` with the known names that begin with the word, or else with
-    the nearest one; an empty string where no known name is near."""
-    by_lower, lower = {k.lower(): k for k in known}, name[:80].lower()
-    near = [k for k in by_lower if k.startswith((f"{lower}_", f"{lower}-"))] if lower else []
-    if not 0 < len(near) <= MOST_NAMES or lower in by_lower:
-        near = difflib.get_close_matches(lower, by_lower, n=1, cutoff=0.5)
-    names = [f"'{by_lower[k]}'" for k in near]
-    if not names:
-        return ""
-    before = f"{', '.join(names[:-1])} or " if len(names) > 1 else ""
-    return f"; did you mean {before}{names[-1]}?"
-
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
 """Two numbers, (x, y); an experiment file writes them as a list of two."""

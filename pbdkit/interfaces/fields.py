@@ -15,7 +15,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
-from pbdkit.interfaces.component import Component, did_you_mean
+from pbdkit.errors import did_you_mean
+from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.course import Course, as_course
 from pbdkit.interfaces.random_field import random_fields
 from pbdkit.interfaces.units import PATTERN

@@ -22,8 +22,7 @@ from pbdkit.analysis.spectrum import (
     slowest_swing,
     swings_below,
 )
-from pbdkit.analysis.stencil import bounds_the_body
-from pbdkit.equilibrium.linearisation import linearised
+from pbdkit.analysis.stencil import NO_REMEDY, bounds_the_body
 from pbdkit.equilibrium.system import System
 from pbdkit.interfaces import Anchors
 from pbdkit.prediction.lag import Lag, fastest, lag_of
@@ -34,7 +33,6 @@ from pbdkit.stepping.state import initial_state
 
 TOLERANCES = ("1e-3", "1e-6", "1e-10")
 NEAR = 0.9
-NO_REMEDY = "; no relaxation helps: look at the rule, and keep |memory| below 1"
 
 
 @dataclass(frozen=True)
@@ -178,6 +176,8 @@ class Analysis:
         state = initial_state(self.scene)
 
         def system_at(step: int) -> System:
+            from pbdkit.equilibrium.linearisation import linearised
+
             return linearised(self.scene.bare, state, step, "auto", Watch())
 
         return lag_of(self.scene, state, system_at, self._slowness)

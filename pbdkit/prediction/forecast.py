@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL
-from pbdkit.analysis.stencil import Bound, bounds_the_body, wave_bound
+from pbdkit.analysis.stencil import NO_REMEDY, Bound, bounds_the_body, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces.units import LENGTH
-from pbdkit.prediction.analysis import NO_REMEDY, Analysis
 from pbdkit.prediction.masses import too_light
 from pbdkit.resources.memory import machine_memory
 from pbdkit.scene.bonds import count_bonds
@@ -22,6 +21,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.scene.sizes import MIB, Sizes, sizes_of
 from pbdkit.scene.solver_sizes import LARGEST_ANEW
 from pbdkit.stepping.choice import choose, seconds_of
+
+if TYPE_CHECKING:
+    from pbdkit.prediction.analysis import Analysis
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ WITHOUT = (
 
 def forecast(scene: Scene) -> Forecast:
     """The forecast of a scene."""
+    from pbdkit.prediction.analysis import Analysis
+
     kinds = kinds_at(scene.raster, scene.leading, 1)
     analysis, solver = Analysis(scene), scene.experiment.stepping
     sizes = _sizes(analysis)
@@ -164,6 +168,8 @@ def _too_short(analysis: Analysis) -> list[str]:
 
 def _on_the_way(scene: Scene) -> list[str]:
     """Where steps diverge within the run with other numbers than the last."""
+    from pbdkit.prediction.analysis import Analysis
+
     courses, steps = scene.experiment.courses, scene.experiment.steps
     bends = sorted({min(bend, steps) for course in courses.values() for bend in course.bends})
     moments = [n for n in bends if any(c.at(n) != c.last for c in courses.values())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from pbdkit.analysis.couplings import Entries
 from pbdkit.analysis.operator import StepOperator, step_operator
 from pbdkit.analysis.spectrum import Spectrum, excess, modes, spectrum, spectrum_of
 from pbdkit.equilibrium.system import one_thread
-from pbdkit.prediction.estimate import Estimate
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import LARGEST_ANEW
+
+if TYPE_CHECKING:
+    from pbdkit.prediction.estimate import Estimate
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Spectra:
     @cached_property
     def estimate(self) -> Estimate:
         """Of what has no matrix, or one that is too large."""
+        from pbdkit.prediction.estimate import Estimate  # of large bodies alone
+
         return Estimate(self.scene)
 
     @cached_property

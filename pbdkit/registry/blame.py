@@ -8,9 +8,9 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import entry_points
 from pathlib import PureWindowsPath
 
-from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.errors import ExperimentError, PbdkitError, PluginError, did_you_mean
 from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.interfaces.component import AnswerError, did_you_mean
+from pbdkit.interfaces.component import AnswerError
 from pbdkit.registry import GROUP
 
 LONGEST = 400

@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 
-from pbdkit.errors import ExperimentError, PluginError
+from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.interfaces import Component
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.registry import BUILTIN
 from pbdkit.registry.blame import interface_of, one_line
 from pbdkit.registry.discovery import (

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.errors import did_you_mean
 from pbdkit.interfaces import (
     LeaderRows,
     LoadRows,
@@ -20,7 +21,6 @@ from pbdkit.interfaces import (
     TouchingRows,
     length,
 )
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.diagnostic import BondHistory, ForceValues
 from pbdkit.interfaces.frame import Indices
 from pbdkit.registry.blame import blaming

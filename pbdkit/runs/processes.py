@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pbdkit.experiment.model import Experiment
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import Run
-from pbdkit.runs.tuning import tuned
-from pbdkit.scene.scene import Scene, build_scene
+if TYPE_CHECKING:
+    from pbdkit.experiment.model import Experiment
+    from pbdkit.results.progress import Watch
+    from pbdkit.runs.course import Run
+    from pbdkit.scene.scene import Scene
 
 
 class Processes:
@@ -30,10 +30,14 @@ class Processes:
 
     def scene(self, experiment: Experiment) -> Scene:
         """What this one needs of an experiment's scene: here all."""
+        from pbdkit.scene.scene import build_scene
+
         return build_scene(experiment)
 
     def tuned(self, scene: Scene) -> Scene:
         """The scene with numbers in place of `auto`."""
+        from pbdkit.runs.tuning import tuned
+
         return tuned(scene)
 
     def by_first(self, work: Callable[[], int]) -> int:
@@ -42,4 +46,6 @@ class Processes:
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """The run of a scene that they make together."""
+        from pbdkit.runs.course import Run
+
         return Run(scene, watch=watch)

@@ -9,11 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.body import Body
 from pbdkit.experiment.leaders import Selection
 from pbdkit.interfaces import Pair
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.field_values import signed_distance
 from pbdkit.scene.places import Floats, distinct

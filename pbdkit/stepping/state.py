@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import PluginError
+from pbdkit.errors import PluginError, did_you_mean
 from pbdkit.interfaces import (
     Bonds,
     Draws,
@@ -21,7 +21,6 @@ from pbdkit.interfaces import (
     Remembered,
     StartsCracked,
 )
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.leader_groups import kinds_at

@@ -8,9 +8,8 @@ import math
 import numpy as np
 import xxhash
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.resources.memory import machine_memory
 from pbdkit.results.layout import Column, Values
 from pbdkit.results.recorder import Recorder
