@@ -122,7 +122,11 @@ def _worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
         ended = f"it ended with status {done.returncode} (out of memory?)"
         why = (done.stderr.strip() or ended).splitlines()[-1]
         raise ExperimentError(f"the measurement failed: {why}")
-    result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
+    return _without_fault(json.loads(answer.read_text("utf-8")))
+
+
+def _without_fault(result: dict[str, Any]) -> dict[str, Any]:
+    """The result of a job. Raises what went wrong with it."""
     if "fault" in result:
         kind = PluginError if result["fault"] == "PluginError" else ExperimentError
         raise kind(result["message"])

@@ -46,13 +46,16 @@ TURNS, ROUGH = 12, 1e-3
 
 
 def main(answer: Path) -> None:
-    """Does the job; what is wrong with it goes into the answer."""
-    job = json.load(sys.stdin)
+    """Does the job on the input; the result goes into the file `answer`."""
+    answer.write_text(json.dumps(result_of(json.load(sys.stdin))), encoding="utf-8")
+
+
+def result_of(job: Job) -> Job:
+    """Does the job; what is wrong with it goes into the result."""
     try:
-        found = {"step": _step, "settle": _settle, "exact": _find_exact}[job["what"]](job)
+        return {"step": _step, "settle": _settle, "exact": _find_exact}[job["what"]](job)
     except PbdkitError as error:
-        found = {"fault": type(error).__name__, "message": str(error)}
-    answer.write_text(json.dumps(found), encoding="utf-8")
+        return {"fault": type(error).__name__, "message": str(error)}
 
 
 def _import(*modules: str) -> int:
