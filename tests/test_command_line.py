@@ -329,6 +329,31 @@ def test_starting_loads_nothing_heavy(start: str) -> None:
     assert python("-c", ask).stdout.splitlines()[-1] == "heavy: []"
 
 
+LIBRARIES = {"dask", "h5py", "matplotlib", "numba", "pandas", "rich", "scipy", "shapely", "xarray"}
+NEEDED = {
+    "import pbdkit.api": ({"numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.prediction.lag"}),
+    "run paper/aa": (set(), {"pbdkit.interfaces", "pbdkit.components", "pbdkit.experiment.model"}),
+    "run e.json --set rul=1": ({"numpy", "pydantic"}, {"pbdkit.scene.scene", "pbdkit.stepping"}),
+    "check e.json": ({"numpy", "pydantic"}, {"pbdkit.results.netcdf", "pbdkit.runs.resumption"}),
+    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.prediction.lag"}),
+    "status e.nc": ({"numpy"}, {"pbdkit.interfaces", "pbdkit.components"}),
+    "verify e.nc": ({"numpy", "pydantic"}, {"pbdkit.stepping", "pbdkit.equilibrium"}),
+}
+"""Of commands, and of an import, the libraries that are loaded, all others left out, and parts of
+pbdkit that are not."""
+
+
+@pytest.mark.parametrize(("asked", "needed"), NEEDED.items(), ids=NEEDED)
+@pytest.mark.usefixtures("call")  # its folder
+def test_what_is_not_used_is_not_imported(asked: str, needed: tuple[set[str], set[str]]) -> None:
+    start = asked if asked.startswith("import") else HELP.replace("['--help']", str(asked.split()))
+    told = python("-c", f"{start}\nimport sys\nprint('loaded:', *sys.modules)").stdout
+    (line,) = (line for line in told.splitlines() if line.startswith("loaded:"))
+    libraries, unused = needed
+    assert {*line.split()} & (LIBRARIES | {"numpy", "pydantic"}) == libraries
+    assert {*line.split()} & unused == set()
+
+
 ASKED = {
     "run": (["run", "e.json"], False),
     "the distribution named": (["check", "e.json", "--set", "rule.type=pbdkit:barycentre"], False),

@@ -13,7 +13,8 @@ from pydantic import BeforeValidator, Field, ValidationInfo
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
-from pbdkit.interfaces.component import Component, Strict, did_you_mean
+from pbdkit.errors import did_you_mean
+from pbdkit.interfaces.component import Component, Strict
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?+"
 WORD = r"[^\W\d]+(?:(?:\*\*|\^)-?[0-9]|[²³])?"

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.experiment.model import Experiment
 from pbdkit.experiment.settings import with_value
 from pbdkit.experiment.source import Source
-from pbdkit.interfaces.component import did_you_mean
 from pbdkit.results.carried import carried
 
 if TYPE_CHECKING:

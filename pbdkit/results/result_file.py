@@ -6,10 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import xarray
-from xarray.backends import StoreBackendEntrypoint
+from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, WriteError
 from pbdkit.registry.blame import one_line
@@ -20,6 +17,9 @@ from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.other_files import refuse_other_file
 from pbdkit.storage.run_files import STORE, store_of
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
+
+if TYPE_CHECKING:
+    import xarray
 
 UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
 
@@ -80,10 +80,15 @@ def _opened(file: Path) -> xarray.Dataset:
         dataset = opened_unsealed(file)
         warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
         return dataset
+    import xarray
+
     return _dataset(xarray.backends.CachingFileManager(opened, file.absolute(), mode="r"))
 
 
 def _dataset(content: Any) -> xarray.Dataset:
+    import xarray
+    from xarray.backends import StoreBackendEntrypoint
+
     # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
     store = xarray.backends.H5NetCDFStore(content)
     return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)

@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from pbdkit.errors import did_you_mean
 from pbdkit.experiment.base import Base, base_source
 from pbdkit.experiment.kinds import SWEEP, of_kind
 from pbdkit.experiment.names import Version
@@ -24,7 +25,7 @@ from pbdkit.experiment.schema import DIALECT
 from pbdkit.experiment.settings import plain
 from pbdkit.experiment.shipped import shipped_names, shipped_text
 from pbdkit.experiment.source import Source, read_file, read_text
-from pbdkit.interfaces.component import Strict, did_you_mean
+from pbdkit.interfaces.component import Strict
 
 MOST_MEMBERS = 100_000
 """Each takes about a millisecond to be validated, and some kilobytes while the sweep goes on."""
