@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         BreaksAtStrain as BreaksAtStrain,
         Calibrated as Calibrated,
         Cell as Cell,
+        CellStress as CellStress,
         Component as Component,
         Components as Components,
         Diagnostic as Diagnostic,
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
         FrameMap as FrameMap,
         FramePolicy as FramePolicy,
         FrameSites as FrameSites,
-        HasStiffBonds as HasStiffBonds,
         Here as Here,
         KnowsStiffness as KnowsStiffness,
         Lattice as Lattice,
@@ -79,6 +79,7 @@ if TYPE_CHECKING:
         SharesParticles as SharesParticles,
         Slot as Slot,
         Softens as Softens,
+        SoftensCells as SoftensCells,
         SpaceVector as SpaceVector,
         StartsCracked as StartsCracked,
         Stiffness as Stiffness,
@@ -107,12 +108,12 @@ _HOME = {
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
         "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
-        "Calibrated Cell Component Components Diagnostic Draws FollowerRule FractureModel "
-        "FrameMap FramePolicy FrameSites HasStiffBonds Here KnowsStiffness Lattice LeaderRows "
+        "Calibrated Cell CellStress Component Components Diagnostic Draws FollowerRule "
+        "FractureModel FrameMap FramePolicy FrameSites Here KnowsStiffness Lattice LeaderRows "
         "LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles "
         "Quantity Remembered Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot "
-        "Softens SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn TouchingRows "
-        "TurnsParticles Variable Vector dot length squared_length where"
+        "Softens SoftensCells SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn "
+        "TouchingRows TurnsParticles Variable Vector dot length squared_length where"
     ),
     "pbdkit.pages.report": "report",
     "pbdkit.registry.discovery": "hookimpl",

@@ -56,6 +56,13 @@ SHEETS = {
         "fracture": {"type": "strain", "failure": 0.15},
         "initial": {"type": "noise", "amplitude": 0.1},
     },
+    "torn by the stress of cells": {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": ELASTIC,
+        "frame": {"type": "natural"},
+        "fracture": {"type": "cohesive", "energy": 0.05, "onset": 0.1},
+        "initial": {"type": "noise", "amplitude": 0.1},
+    },
     "strength by bond, cut cells": CUT["square"]
     | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
     "triangles": CUT["hexagonal"],

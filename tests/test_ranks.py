@@ -156,6 +156,11 @@ CASES = {
     "numbers of particles": {"rule": Tiring(spread=0.1)},
     "numbers of bonds": {"fracture": Weakest(spread=0.1)},
     "damage": {"fracture": {"type": "damage", "onset": 0.1, "failure": 0.4}},
+    "torn by the stress of cells": ELASTIC
+    | {
+        "fracture": {"type": "cohesive", "energy": 0.05, "onset": 0.1},
+        "initial": {"type": "noise", "amplitude": 0.1},
+    },
     "diverging": {"rule": {"type": "mixed-coordinate", "K": 5.0}, "steps": 400},
     "every diagnostic of bonds": {
         "fracture": {"type": "threshold", "thresholds": [1.4371]},

@@ -36,6 +36,12 @@ LOADED: dict[str, Any] = {
     "loads": [{"select": {"edge": "top"}, "force": [0.0, 0.02], "from": 3, "until": 6}],
     "diagnostics": [{"type": "load-displacement", "youngs_modulus": 1.0}],
 }
+SOFTENED: dict[str, Any] = {
+    "neighbours": {"type": "chebyshev", "shells": 1},
+    "rule": {"type": "elastic", "poisson_ratio": 0.2},
+    "frame": {"type": "natural"},
+    "fracture": {"type": "cohesive", "energy": 0.1, "onset": 0.1},
+}
 COMES = [
     {
         "shape": {"type": "disc", "radius": 3.0, "centre": [4.5, 14.0]},
@@ -58,6 +64,9 @@ RUNS: dict[str, dict[str, Any]] = {
     "loads": LOADED,
     "equilibrium, loads": LOADED | {"solver": {"type": "equilibrium"}},
     "equilibrium, obstacles": {"solver": {"type": "equilibrium"}, "obstacles": COMES},
+    "softened cells": SOFTENED,
+    "equilibrium, softened cells": SOFTENED
+    | {"solver": {"type": "equilibrium", "increments": 10, "tolerance": 1e-3}},
     "equilibrium, fracture": {
         "solver": {"type": "equilibrium", "increments": 20},
         "fracture": FRACTURE,

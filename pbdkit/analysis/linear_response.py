@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.analysis.stencil import SMALL, array_of, derivative
-from pbdkit.interfaces import Components, Here, Slot, Softens
+from pbdkit.interfaces import Components, Here, Slot, Softens, SoftensCells
 from pbdkit.interfaces.frame import Indices
 from pbdkit.interfaces.vector import vector
 from pbdkit.registry.blame import blaming
@@ -107,7 +107,8 @@ def _differ(scene: Scene, state: State) -> bool:
     everywhere."""
     if scene.constants.by_particle:
         return True
-    of_bonds = list(state.bond_values) if isinstance(scene.experiment.fracture, Softens) else []
+    softens = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
+    of_bonds = list(state.bond_values) if softens else []
     of_bonds += scene.constants.by_bond.values() if of_bonds else ()
     return any((values != values.flat[0]).any() for values in (*of_bonds, *state.particle_values))
 

@@ -2,26 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pbdkit.components.strain_fracture import DAMAGE, Softening, StrainLimit
+from pbdkit.components.fracture import Parting
+from pbdkit.components.strain_fracture import StrainLimit, softened
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import LENGTH, KnowsStiffness, Remembered, Setting, Slot, Vector, length
+from pbdkit.interfaces import (
+    LENGTH,
+    Calibrated,
+    CellStress,
+    Components,
+    KnowsStiffness,
+    Remembered,
+    Setting,
+    Slot,
+    SoftensCells,
+    Vector,
+    squared_length,
+    where,
+)
+
+CROSSED = 0.09
+"""The least square of the cosine between a bond and the normal of a crack that crosses it."""
+DIRECTIONS = 360
+"""So many directions are looked at for the crack that the spacing suits least."""
 
 
-class Cohesive(KnowsStiffness, Softening):
-    """A bond softens from strain `onset` on, as under `damage`, and is broken at the strain at
-    which the bonds across a crack have taken up `energy` for each unit of its length.
+class Cohesive(KnowsStiffness, SoftensCells, Parting):
+    """A cell softens from the principal stress `onset` times its Young's modulus on, in a band one
+    cell wide, and is torn where the band has taken up `energy` for each unit of the crack's length.
 
-    A bond of length l and stiffness k takes up ½ k l² onset · failure. It is to take up c/l: on
-    the square lattice a crack along an axis then takes as much as one along a diagonal, and none
-    takes less. So failure = 2c/(k l³ onset), c = energy · A / min_n Σ_k |r_k · n| / l_k over the
-    bonds k of a site, each once, with the area A of a site: inversely as the spacing.
+    The stress is that which the cell would have without damage. Where its largest principal value
+    reaches the onset, the direction of that is the normal e of the cell's crack, for good. Bonds of
+    the cell that cross the crack, |n · e| > .3, lose their pull in the cell by the largest stress
+    κ over Young's modulus since: D = failure / (failure - onset) (1 - onset / κ); the others do
+    not. The failure strain is 2 energy / (onset · width), the width of the cell along e being that
+    of the band of cells which a straight crack crosses (Bažant and Oh 1983, Oliver 1989). A bond is
+    broken where D is 1 in all cells beside it. Cracks do not close under pressure.
     """
 
     type: Literal["cohesive"] = "cohesive"
@@ -35,60 +55,139 @@ class Cohesive(KnowsStiffness, Softening):
         description="G_c over Young's modulus: a length (lattice units).", examples=[0.05]
     )
     onset: StrainLimit = Field(
-        description="The strain at which a bond begins to soften; where stress is uniaxial, along "
-        "a bond, the strength over Young's modulus.",
+        description="The tensile strength over Young's modulus: the largest principal stress over "
+        "it at which a cell begins to soften.",
         examples=[0.1],
     )
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """`per_rest` = 1/|r| and `onset_strain`."""
-        return {"per_rest": 1.0 / length(slot.rest), "onset_strain": self.onset}
+        """`onset_strain`."""
+        return {"onset_strain": self.onset}
 
-    def of_material(
-        self, slot: Slot, stiffness: Mapping[Slot, float], setting: Setting
-    ) -> dict[str, float]:
-        """`failure_strain`; ExperimentError where it is not above the onset, since the spacing is
-        too large for so little energy, and where bonds are not stiff along themselves."""
-        if stiffness[slot] <= 0.0:
-            raise ExperimentError(
-                f"'{self.type}' works on bonds that pull along themselves, and one along "
-                f"{tuple(slot.rest)} has the stiffness {stiffness[slot]:.3g}; take 'springs' or "
-                "'elastic'"
-            )
-        least = min(_share(s, setting) / (k * length(s.rest) ** 2) for s, k in stiffness.items())
-        room = 2.0 * self.energy * least / self.onset**2
+    def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
+        """`release` = 2 energy / onset over the modulus of the cell, a length; the compliances
+        `along_x`, `along_y` and `across` times that modulus; and the bonds of a cell, `x0` to `y2`.
+
+        ExperimentError where the failure strain of some crack is not above the onset, since the
+        spacing is too large for so little energy.
+        """
+        modulus, along_x, along_y, across = _compliance(rule)
+        bonds = _bonds_of_a_cell(setting)
+        angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+        cos, sin = np.cos(2 * angles), np.sin(2 * angles)
+        size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
+        size = float((size * _flexibility(cos, sin, along_x, along_y, across)).max())
+        room = 2.0 * self.energy / (modulus * size * self.onset**2)
         if np.any(room <= 1.0):
             raise ExperimentError(
-                f"{self.energy:g} is too little for this spacing: a bond would have to break "
-                f"{1.0 / room:.3g} times before its onset, and the crack snaps from bond to bond; "
+                f"{self.energy:g} is too little for this spacing: a cell would have to be torn "
+                f"{1.0 / room:.3g} times before its onset, and the crack snaps from cell to cell; "
                 f"make the spacing smaller than {room:.3g} of what it is, or set fracture.onset "
                 f"below {self.onset * room**0.5:.3g} or fracture.energy above "
                 f"{self.energy / room:.3g}",
                 ("energy",),
             )
-        strain = (
-            2.0 * _share(slot, setting) / (stiffness[slot] * length(slot.rest) ** 2 * self.onset)
-        )
-        return {"failure_strain": self.energy * strain}
+        cell = {f"x{n}": float(r.x) for n, r in enumerate(bonds)}
+        cell |= {f"y{n}": float(r.y) for n, r in enumerate(bonds)}
+        compliance = {"along_x": along_x, "along_y": along_y, "across": across}
+        return {"release": 2.0 * self.energy / (modulus * self.onset), **compliance, **cell}
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """`damage`."""
-        return (DAMAGE,)
+        """`damage_left` and `damage_right`, and the strains at which the cells are torn, negative
+        where the crack of a cell does not cross the bond."""
+        return _NUMBERS
+
+    @staticmethod
+    def update(  # type: ignore[override]
+        d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
+    ) -> tuple[Any, ...]:
+        """Those of both cells; where there is one alone they are the same."""
+        here, fails = _of_cell(left, c.damage_left, c.failure_left, r, c)
+        there, parts = _of_cell(right, c.damage_right, c.failure_right, r, c)
+        on_left, on_right = left.share > 0.0, right.share > 0.0
+        return (
+            where(on_left, here, there),
+            where(on_right, there, here),
+            where(on_left, fails, parts),
+            where(on_right, parts, fails),
+        )
+
+    @staticmethod
+    def load(stress: CellStress, c: Any, p: Any) -> Any:
+        """The largest principal stress over the onset."""
+        return _principal(stress)[0] / c.onset_strain
+
+    @staticmethod
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+        """D = 1 on both sides."""
+        return (c.damage_left >= 1.0) & (c.damage_right >= 1.0)
 
 
-def _share(slot: Slot, setting: Setting) -> float:
-    """Of the energy of a unit of crack, what a bond takes up: an area per length."""
-    across = _across(tuple(s.rest for s in setting.slots[slot.source]))
-    a, b = setting.cell.vectors
-    area = abs(a.x * b.y - a.y * b.x) / len(setting.cell.sites)
-    return float(area / (across * length(slot.rest)))
+def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> Any:
+    """The damage of a bond in a cell under a stress, and the failure strain, from those before."""
+    strain, cos, sin = _principal(stress)
+    size = _projection(Vector(c.x0, c.y0), cos, sin)
+    other = _projection(Vector(c.x1, c.y1), cos, sin)
+    size = where(other > size, other, size)
+    other = _projection(Vector(c.x2, c.y2), cos, sin)
+    size = np.sqrt(where(other > size, other, size))
+    fails = c.release / (size * _flexibility(cos, sin, c.along_x, c.along_y, c.across))
+    crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
+    begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
+    failure = where(begins, where(crossed, fails, -fails), failure)
+    crosses = failure > 0.0
+    law = softened(strain, c.onset_strain, where(crosses, failure, 2.0 * c.onset_strain), damage)
+    return where(crosses, law, damage), failure
 
 
-@cache
-def _across(rests: tuple[Vector, ...]) -> float:
-    """min_n Σ_k |r_k · n| / l_k: every bond is met from both ends, and the least is found along one
-    of them. Kept, since it is asked for bond by bond where materials differ."""
-    sizes = (
-        sum(abs(r.x * n.y - r.y * n.x) / (length(r) * length(n)) for r in rests) for n in rests
-    )
-    return float(min(sizes)) / 2
+def _principal(stress: CellStress) -> Any:
+    """The largest principal stress, and cosine and sine of twice the angle of its direction."""
+    mean, half = 0.5 * (stress.xx + stress.yy), 0.5 * (stress.xx - stress.yy)
+    radius = np.sqrt(half * half + stress.xy * stress.xy)
+    some = radius > 0.0
+    size = where(some, radius, 1.0)
+    return mean + radius, where(some, half / size, 1.0), where(some, stress.xy / size, 0.0)
+
+
+def _projection(r: Any, cos: Any, sin: Any) -> Any:
+    """(r · e)² along the direction of which twice the angle has this cosine and sine."""
+    x, y = r.x * r.x, r.y * r.y
+    return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
+
+
+def _flexibility(cos: Any, sin: Any, along_x: Any, along_y: Any, across: Any) -> Any:
+    """The strain along that direction under a unit of stress along it."""
+    x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
+    return along_x * x * x + along_y * y * y + across * 0.25 * sin * sin
+
+
+def _compliance(rule: Calibrated) -> tuple[float, float, float, float]:
+    """Young's modulus along x of a rule's material; times that modulus S_xx, S_yy and
+    2 S_xy + S_shear in its plane."""
+    material = rule.elasticity()
+    assert material is not None
+    modulus = material.own_modulus(rule.through_thickness())
+    xx, yy, xy, shear, *_ = material
+    det = (xx * yy - xy * xy) / modulus
+    return modulus, yy / det, xx / det, modulus / shear - 2.0 * xy / det
+
+
+def _bonds_of_a_cell(setting: Setting) -> tuple[Components, Components, Components]:
+    """Those that are longest in some direction: the sides of a triangle, the diagonals of a
+    rectangle."""
+    origin, one, other, *more = setting.cells.polygons[0].rest
+    if more:
+        return other - origin, more[0] - one, more[0] - one
+    return one - origin, other - origin, other - one
+
+
+def _pair(name: str, text: str) -> tuple[Remembered, Remembered]:
+    sides = ("left", "right")
+    one, other = (Remembered(f"{name}_{side}", f"{text} on its {side}", "1") for side in sides)
+    return one, other
+
+
+_NUMBERS = (
+    *_pair("damage", "damage of the bond, from 0 to 1 where it is broken, in the cell"),
+    *_pair("failure", "strain at which a crack tears the cell, negative along the bond,"),
+)

@@ -22,7 +22,6 @@ from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     AppliesTwice,
     FollowerRule,
-    HasStiffBonds,
     Here,
     Loadable,
     MixesCells,
@@ -41,7 +40,7 @@ Factor = Annotated[
 ]
 
 
-class CellElastic(MixesCells, TearsCells, HasStiffBonds, Loadable, FollowerRule):
+class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
     """Common to the rules x_j = (Σ W_k)⁻¹ Σ W_k x_k whose 2 × 2 weights are the stiffness of the
     cells on both sides of each bond, -K_jk of the cells' matrices.
 
@@ -108,12 +107,6 @@ class CellElastic(MixesCells, TearsCells, HasStiffBonds, Loadable, FollowerRule)
         """The most that a stiffness exceeds."""
         modulus, material = self.material()
         return springs_in(c / (self.stiffness * modulus), material, setting.cells)
-
-    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
-        """Stiffness · modulus · r·W r / |r|²."""
-        (modulus, _), (x, y), w = self.material(), slot.rest, self.weights(slot, setting)
-        along = w["xx"] * x * x + (w["xy"] + w["yx"]) * x * y + w["yy"] * y * y
-        return float(2.0 * self.stiffness * modulus * along / (x * x + y * y))
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:

@@ -60,7 +60,7 @@ class NoFracture(FractureModel):
         return 0.0 * r
 
 
-class Parting(BreaksAtStrain, StartsCracked, FractureModel):
+class Parting(StartsCracked, FractureModel):
     """What models share whose fictitious points stand at m_j + λ R or at X_k.
 
     The fictitious point that takes the lost neighbour's place stands at m_j + λ R
@@ -105,7 +105,7 @@ class Parting(BreaksAtStrain, StartsCracked, FractureModel):
         return where(p.at_reference, -u, p.excess * r)
 
 
-class Threshold(Parting):
+class Threshold(BreaksAtStrain, Parting):
     """A bond breaks when |r + d|² > threshold², one threshold a shell (the paper's section 5).
 
     The fictitious point that takes the lost neighbour's place stands at m_j + λ R

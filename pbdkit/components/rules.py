@@ -11,7 +11,6 @@ from pbdkit.components.elasticity import Factor
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     FollowerRule,
-    HasStiffBonds,
     Here,
     Loadable,
     Setting,
@@ -133,7 +132,7 @@ EDGE_OF_SQUARE, DIAGONAL_OF_SQUARE, OF_TRIANGLE = 0.75, 0.375, math.sqrt(0.75)
 """Stiffnesses of the springs over Young's modulus and thickness: isotropic with ν = 1/3."""
 
 
-class Springs(TearsCells, HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
+class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
     """Each neighbour proposes the place at its rest distance, on the line to where the particle
     stands: x_k + l₀ (x_j - x_k)/|x_j - x_k|; the particle goes to the weighted mean.
 
@@ -164,10 +163,6 @@ class Springs(TearsCells, HasStiffBonds, Loadable, StoresEnergy, FollowerRule):
             "'springs' works on the hexagonal lattice with 6 neighbours ({type: coordination, "
             "shells: 1}) and on the square lattice with 8 ({type: chebyshev, shells: 1})"
         )
-
-    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
-        """That of the spring."""
-        return 2.0 * self.weights(slot, setting)["half"]
 
     @staticmethod
     def gather(d: Any, r: Any, w: Any, p: Any) -> tuple[Any, ...]:

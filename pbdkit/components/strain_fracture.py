@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 from pbdkit.components.fracture import Parting
 from pbdkit.interfaces import (
     Bonds,
+    BreaksAtStrain,
     Draws,
     Remembered,
     RenewsBonds,
@@ -35,7 +36,7 @@ def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strai
     return {name: strain * factors for name, strain in strains.items()}
 
 
-class StrainFracture(Draws, Parting):
+class StrainFracture(Draws, BreaksAtStrain, Parting):
     """A bond breaks when its strain |r + d| / |r| - 1 exceeds `failure`, whatever its shell; bonds
     that are pressed together never break.
 
@@ -77,37 +78,7 @@ class StrainFracture(Draws, Parting):
         return np.sqrt(c.square) * (1.0 + c.failure_strain) / length(r) - 1.0
 
 
-class Softening(Softens, RenewsBonds, Parting):
-    """What models share under which a bond loses its pull along a straight line, from its
-    `onset_strain` to zero at its `failure_strain`; `per_rest` is 1/|r|. They remember `damage`."""
-
-    @staticmethod
-    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
-        """The damage, where there is more than before."""
-        onset, failure, damage = c.onset_strain, c.failure_strain, c.damage
-        strain = length(r + d) * c.per_rest - 1.0
-        softens = strain > onset
-        law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
-        law = where(strain < failure, law, 1.0)
-        return (where(softens & (law > damage), law, damage),)
-
-    @staticmethod
-    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
-        """D = 1."""
-        return c.damage >= 1.0
-
-    @staticmethod
-    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
-        """(1 - D) d + D lost."""
-        return (1.0 - c.damage) * d + c.damage * lost
-
-    @staticmethod
-    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
-        """The failure strain of the bond."""
-        return c.failure_strain
-
-
-class Damage(Draws, Softening):
+class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     """A bond softens from strain `onset` on and is broken at strain `failure`.
 
     Its damage is the largest so far of D = failure / (failure - onset) (1 - onset / ε), from 0 at
@@ -143,7 +114,7 @@ class Damage(Draws, Softening):
 
     def remembered(self) -> tuple[Remembered, ...]:
         """`damage`, after `onset_strain` and `failure_strain` where they are scattered."""
-        return (_ONSET_STRAIN, _FAILURE_STRAIN, DAMAGE) if self.scatter else (DAMAGE,)
+        return (_ONSET_STRAIN, _FAILURE_STRAIN, _DAMAGE) if self.scatter else (_DAMAGE,)
 
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
@@ -152,9 +123,39 @@ class Damage(Draws, Softening):
     def _strains(self) -> dict[str, float]:
         return {"onset_strain": self.onset, "failure_strain": self.failure}
 
+    @staticmethod
+    def update(d: Any, r: Any, c: Any, p: Any) -> tuple[Any, ...]:
+        """The damage, where there is more than before."""
+        strain = length(r + d) * c.per_rest - 1.0
+        return (softened(strain, c.onset_strain, c.failure_strain, c.damage),)
+
+    @staticmethod
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+        """D = 1."""
+        return c.damage >= 1.0
+
+    @staticmethod
+    def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
+        """(1 - D) d + D lost."""
+        return (1.0 - c.damage) * d + c.damage * lost
+
+    @staticmethod
+    def breaking_strain(r: Any, c: Any, p: Any) -> Any:
+        """The failure strain of the bond."""
+        return c.failure_strain
+
+
+def softened(strain: Any, onset: Any, failure: Any, damage: Any) -> Any:
+    """D = failure / (failure - onset) (1 - onset / strain), where it is more than the damage
+    before: the pull (1 - D) strain falls along a straight line from the onset to 0 at failure."""
+    softens = strain > onset
+    law = failure * (strain - onset) / ((failure - onset) * where(softens, strain, 1.0))
+    law = where(strain < failure, law, 1.0)
+    return where(softens & (law > damage), law, damage)
+
 
 _FAILURE_STRAIN = Remembered(
     "failure_strain", "strain at which the bond breaks", "1", changes=False
 )
 _ONSET_STRAIN = Remembered("onset_strain", "strain at which the bond softens", "1", changes=False)
-DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")
+_DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is broken", "1")

@@ -434,7 +434,7 @@ def _bonds_change(scene: Scene, fracturing: Fracturing, state: State, step: int)
     out, so that the certificate speaks of the bonds as they are."""
     before = [value.copy() for value in state.bond_values]
     broken = broken_bonds(state)
-    fracturing.break_bonds(state.u, state, step)
+    fracturing.break_bonds(state.u, state, step, in_turn=True)
     if broken_bonds(state) > broken:
         return True
     tolerance = scene.experiment.solver.sought.tolerance

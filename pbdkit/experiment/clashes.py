@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pbdkit.experiment.newton import Newton
-from pbdkit.interfaces import Draws, Loadable, RenewsParticles, Softens
+from pbdkit.interfaces import Draws, Loadable, RenewsParticles, Softens, SoftensCells
 from pbdkit.interfaces.fields import unknown_regions
 from pbdkit.interfaces.rule import material_of
 
@@ -69,7 +69,7 @@ def _of_events(asked: Any) -> list[tuple[Key, bool, str]]:
     jumps, settles = not asked.solver.makes_steps, asked.stepping.settle is not None
     remembers, softens = (
         isinstance(asked.rule, RenewsParticles),
-        isinstance(asked.fracture, Softens),
+        isinstance(asked.fracture, (Softens, SoftensCells)),
     )
     return [
         ("record", last > asked.steps, f"step {last} is beyond the run's {asked.steps}"),

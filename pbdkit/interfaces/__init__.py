@@ -11,10 +11,12 @@ from pbdkit.interfaces.diagnostic import (
 )
 from pbdkit.interfaces.fracture_model import (
     BreaksAtStrain,
+    CellStress,
     FractureModel,
     KnowsStiffness,
     RenewsBonds,
     Softens,
+    SoftensCells,
     StartsCracked,
 )
 from pbdkit.interfaces.frame import Anchors, FrameMap, FramePolicy, FrameSites
@@ -24,7 +26,6 @@ from pbdkit.interfaces.rule import (
     AppliesTwice,
     Calibrated,
     FollowerRule,
-    HasStiffBonds,
     Here,
     Loadable,
     MixesCells,
@@ -61,12 +62,12 @@ INTERFACES: dict[str, type[Component]] = {
 
 __all__ = [
     "AREA", "ENERGY", "FORCE", "INTERFACES", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
-    "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "Component", "Components",
-    "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap", "FramePolicy",
-    "FrameSites", "HasStiffBonds", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows",
+    "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress", "Component",
+    "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap",
+    "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows",
     "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair",
     "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles",
-    "Setting", "SharesParticles", "Slot", "Softens", "SpaceVector", "StartsCracked", "Stiffness",
-    "StoresEnergy", "TearsCells", "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector",
-    "dot", "length", "squared_length", "where",
+    "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells", "SpaceVector",
+    "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Torn", "TouchingRows",
+    "TurnsParticles", "Variable", "Vector", "dot", "length", "squared_length", "where",
 ]  # fmt: skip

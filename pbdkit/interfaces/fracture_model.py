@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces.fields import TakesFields
 from pbdkit.interfaces.neighbour_metric import Slot
-from pbdkit.interfaces.rule import Setting
+from pbdkit.interfaces.rule import Calibrated, Setting
 from pbdkit.interfaces.units import Place
 from pbdkit.interfaces.values import Remembers
 
@@ -31,7 +31,7 @@ class FractureModel(TakesFields):
     Afterwards a model that `Softens` says what the rule sees at bonds that have not broken.
 
     What only some models can do is a class that they take on besides: `Remembers`, `Draws`,
-    `RenewsBonds`, `Softens`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
+    `RenewsBonds`, `Softens`, `SoftensCells`, `StartsCracked`, `BreaksAtStrain`, `KnowsStiffness`.
     """
 
     has_axes: ClassVar[bool] = False
@@ -87,17 +87,13 @@ class RenewsBonds(Remembers):
 
 class KnowsStiffness(ABC):
     """A fracture model that goes with calibrated rules, some constants of which follow from the
-    stiffness of bonds."""
+    material and the cells."""
 
     @abstractmethod
-    def of_material(
-        self, slot: Slot, stiffness: Mapping[Slot, float], setting: Setting
-    ) -> dict[str, float]:
+    def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
         """Further constants of a slot, seen as ``c.name`` after those of `constants`.
 
-        `stiffness` is by slot the force along a whole bond inside the body over its elongation,
-        over Young's modulus and thickness. Raise ExperimentError where the model does not go with
-        them.
+        `rule` has an elasticity. Raise ExperimentError where the model does not go with it.
         """
 
 
@@ -110,6 +106,42 @@ class Softens(ABC):
     def seen(d: Any, lost: Any, r: Any, c: Any, p: Any) -> Any:
         """The difference that the rule sees; `lost` is the fictitious one: damage D softens a bond
         as (1 - D) d + D lost."""
+
+
+class CellStress(NamedTuple):
+    """The stress that a cell would have without damage, over its own Young's modulus, and the
+    `share` of it that belongs to the body: 0 where there is no cell."""
+
+    xx: Any
+    yy: Any
+    xy: Any
+    share: Any
+
+
+class SoftensCells(RenewsBonds):
+    """A fracture model that softens bonds in each of the two cells beside them, by the stress of
+    that cell; for rules that `TearsCells`, with a frame that weighs cells.
+
+    Its numbers come in pairs, with names that end in `_left` and `_right`, as seen along the slot
+    by which the bond is kept; all start at 0, and stay there until the cell begins to soften.
+    `damage_left` and `damage_right` are the shares of its pull that the bond has lost in the two.
+    A diagonal has one cell on both sides.
+    """
+
+    @staticmethod
+    @abstractmethod
+    def update(  # type: ignore[override]
+        d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
+    ) -> tuple[Any, ...]:
+        """The new values of the numbers that change, in their order, from the stress of the cell
+        on either side of the bond as well."""
+
+    @staticmethod
+    @abstractmethod
+    def load(stress: CellStress, c: Any, p: Any) -> Any:
+        """How far the stress of a cell has come on the way to where it begins to soften: 1 there.
+
+        Of cells that would begin together under `solver: equilibrium`, the most loaded do."""
 
 
 class StartsCracked(ABC):

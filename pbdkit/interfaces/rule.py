@@ -45,6 +45,11 @@ class Stiffness(NamedTuple):
     x_shear: Any = 0.0
     y_shear: Any = 0.0
 
+    def own_modulus(self, through_thickness: float) -> Any:
+        """Young's modulus along x, over that of the material it is compared with, given σ_zz over
+        σ_xx + σ_yy."""
+        return (self.xx - self.xy * self.xy / self.yy) * (1.0 - through_thickness**2)
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -161,15 +166,6 @@ class Loadable(Calibrated):
 
         What it adds to the move is the same wherever neighbours stand.
         """
-
-
-class HasStiffBonds(Calibrated):
-    """A calibrated rule that knows how stiff bonds are, for fracture with energy."""
-
-    @abstractmethod
-    def stiffness_along(self, slot: Slot, setting: Setting) -> float:
-        """The force along a whole bond inside the body over its elongation, over Young's modulus
-        and thickness, for small strain."""
 
 
 class StoresEnergy(Calibrated):

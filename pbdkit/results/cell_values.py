@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Softens, Vector
+from pbdkit.interfaces import Softens, SoftensCells, Vector
 from pbdkit.interfaces.diagnostic import CellValues
 from pbdkit.interfaces.polygons import area_share, corner_share, signed_area
 from pbdkit.results.softened_stress import lost_stress
@@ -144,7 +144,7 @@ class StateCells(CellValues):
     def lost_stress(self) -> Floats | None:
         """Found anew whenever it is called: one diagnostic does."""
         scene, state = self._scene, self._state
-        if not (scene.tears and isinstance(scene.experiment.fracture, Softens)):
+        if not (scene.tears and isinstance(scene.experiment.fracture, (Softens, SoftensCells))):
             return None
         u = state.u.astype(float, copy=False)
         planes = lost_stress(scene, state, u, self._weighed)

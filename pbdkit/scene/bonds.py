@@ -14,7 +14,7 @@ from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
 from pbdkit.scene.neighbourhood import BondPlane, Neighbourhood
-from pbdkit.scene.places import Block, Floats, Mask, hull
+from pbdkit.scene.places import Block, Floats, Mask, common, hull
 from pbdkit.scene.raster import EMPTY, FOLLOWER, Raster
 
 
@@ -61,11 +61,14 @@ class BondTable:
     place: Indices
 
 
-def plane_block(raster: Raster, plane: BondPlane) -> Block | None:
-    """The block of source places of every bond of a plane with an end in the body."""
+def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Block | None:
+    """The block of source places of every bond of a plane with an end in the body, or of those with
+    both."""
     forward = raster.body_block(plane.slot.source)
     landed = raster.body_block(plane.slot.target)
     backward = landed.seen_through(plane.opposite) if landed else None
+    if inside:
+        return common(forward, backward) if forward and backward else None
     corners = [(block.start, block.stop) for block in (forward, backward) if block]
     return Block(plane.slot.source, *hull(corners)) if corners else None
 

@@ -27,6 +27,11 @@ class CellBond:
     on_left: bool
     on_right: bool
 
+    @property
+    def side(self) -> int:
+        """0 where the cell lies to its left, 1 where to its right alone."""
+        return 0 if self.on_left else 1
+
 
 @dataclass(frozen=True)
 class CellsAround:

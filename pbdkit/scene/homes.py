@@ -19,11 +19,12 @@ from pbdkit.interfaces import (
     Calibrated,
     FollowerRule,
     FractureModel,
-    HasStiffBonds,
     KnowsStiffness,
     Remembered,
     Setting,
     Slot,
+    SoftensCells,
+    TearsCells,
 )
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
@@ -83,6 +84,12 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
+        if isinstance(fracture, SoftensCells) and not experiment.frame.weighs_cells:
+            raise ExperimentError(
+                f"'{fracture.type}' softens the cells of the body, which the frame "
+                f"'{experiment.frame.type}' does not tell from others; take frame: "
+                "{type: natural}, or fracture: {type: damage}"
+            )
         of_fracture = _named("Parameters", fracture.parameters())
         further = {s: of_material(fracture, rule, setting, s) for s in slots}
         limits = {s: _named("Constants", fracture.constants(s), **further[s]) for s in slots}
@@ -122,17 +129,16 @@ def named_weights(values: Any, rule: FollowerRule) -> Any:
 def of_material(
     fracture: FractureModel, rule: FollowerRule, setting: Setting, slot: Slot
 ) -> dict[str, float]:
-    """Further constants of a slot, of a model that knows how stiff bonds are."""
+    """Further constants of a slot, of a model that knows the material."""
     if not isinstance(fracture, KnowsStiffness):
         return {}
-    if not isinstance(rule, HasStiffBonds) or rule.elasticity() is None:
+    if not isinstance(rule, TearsCells) or rule.elasticity() is None:
         raise ExperimentError(
-            f"'{fracture.type}' needs a rule that is calibrated to a material, and knows how stiff "
-            f"bonds are, which '{rule.type}' with these parameters is not; take 'springs' or "
-            "'elastic'"
+            f"'{fracture.type}' needs a rule that is calibrated to a material and works cell by "
+            f"cell, which '{rule.type}' with these parameters is not; take 'springs' or 'elastic', "
+            "or fracture: {type: damage}"
         )
-    stiffness = {s: rule.stiffness_along(s, setting) for own in setting.slots for s in own}
-    return fracture.of_material(slot, stiffness, setting)
+    return fracture.of_material(slot, rule, setting)
 
 
 def _named(kind: str, values: Any, **more: float) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from operator import add, sub
+from operator import add, lt, sub
 from typing import Any
 
 import numpy as np
@@ -117,6 +117,13 @@ def hull(boxes: Iterable[tuple[Sequence[Any], Sequence[Any]]]) -> tuple[Any, Any
     """The smallest and the largest number along each axis over some (low, high), as tuples."""
     low, high = zip(*boxes, strict=True)
     return tuple(map(min, zip(*low, strict=True))), tuple(map(max, zip(*high, strict=True)))
+
+
+def common(one: Block, other: Block) -> Block | None:
+    """The places of one sublattice that two blocks share, if any."""
+    start = tuple(map(max, one.start, other.start))
+    stop = tuple(map(min, one.stop, other.stop))
+    return Block(one.sublattice, start, stop) if all(map(lt, start, stop)) else None
 
 
 Where = Block | Places

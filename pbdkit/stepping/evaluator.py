@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pbdkit.interfaces import (
     Calibrated,
+    CellStress,
     Components,
     FollowerRule,
     Here,
@@ -25,6 +26,7 @@ from pbdkit.interfaces import (
     RenewsParticles,
     Slot,
     Softens,
+    SoftensCells,
     StoresEnergy,
     Torn,
     where,
@@ -39,6 +41,7 @@ from pbdkit.stepping.state import renew, shown
 
 Mask = NDArray[np.bool_]
 Contributions = tuple[Any, ...]
+Cells = tuple[CellStress, ...]
 
 
 @dataclass(frozen=True)
@@ -116,12 +119,16 @@ class Evaluator:
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
 
-    def damage(self, r: Components, c: Any) -> Any:
-        """The share of its pull that a bond with the constants c has lost, which has not broken."""
+    def damage(self, r: Components, c: Any) -> tuple[Any, Any]:
+        """The share of its pull that a bond with the constants c, which has not broken, has lost in
+        the cells to its left and right."""
         model: Any = self._model
+        if isinstance(model, SoftensCells):
+            return c.damage_left, c.damage_right
         ahead, nothing = (vector([x, *[0.0] * (len(r) - 1)]) for x in (1.0, 0.0))
         with blaming(model, "to soften a bond"):
-            return 1.0 - as_vector(model.seen(ahead, nothing, r, c, self._q), "seen", ahead)[0]
+            seen = as_vector(model.seen(ahead, nothing, r, c, self._q), "seen", ahead)
+        return (1.0 - seen[0],) * 2
 
     def move(self, total: Contributions, here: Here, load: Components | None = None) -> Any:
         """From where the particle stands to its target, under a load if there is any."""
@@ -148,17 +155,31 @@ class Evaluator:
             renew(self._of_particle, own, self.remember(total, here), where)
 
     def renew_bonds(
-        self, d: Components, r: Components, limits: Any, own: Sequence[Any], intact: Mask
+        self,
+        d: Components,
+        r: Components,
+        limits: Any,
+        own: Sequence[Any],
+        intact: Mask,
+        cells: Cells = (),
     ) -> None:
-        """Writes the new values over what is remembered of bonds, in place, where they hold."""
+        """Writes the new values over what is remembered of bonds, in place, where they hold;
+        `cells` are those beside the bonds, for a model that softens cells."""
         if isinstance(self._model, RenewsBonds):
-            renew(self._of_bond, own, self.update(d, r, limits, own), intact)
+            renew(self._of_bond, own, self.update(d, r, limits, own, cells), intact)
 
-    def update(self, d: Any, r: Any, limits: Any, own: Sequence[Any]) -> Contributions:
+    def update(
+        self, d: Any, r: Any, limits: Any, own: Sequence[Any], cells: Cells = ()
+    ) -> Contributions:
         """The new values of the bonds' numbers that change."""
         assert isinstance(self._model, RenewsBonds)
         c = self._scene.constants.of_bond(*limits, *shown(own))
-        return as_values(self._model.update(d, r, c, self._q), "update")
+        return as_values(self._model.update(d, r, c, self._q, *cells), "update")
+
+    def load(self, cell: CellStress, limits: Any, own: Sequence[Any]) -> Any:
+        """How far the stress of a cell has come on the way to where it softens."""
+        assert isinstance(self._model, SoftensCells)
+        return self._model.load(cell, self._scene.constants.of_bond(*limits, *shown(own)), self._q)
 
     def breaks(self, d: Components, r: Components, limits: Any, own: Sequence[Any]) -> Any:
         """Whether bonds break that remember these numbers."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import RenewsBonds
+from pbdkit.interfaces import RenewsBonds, SoftensCells
 from pbdkit.scene.scene import Scene
 
 CACHE = 2**24
@@ -42,6 +42,8 @@ def single_steps(scene: Scene) -> str:
     """Why every step is a pass of its own; empty where several can go together."""
     if scene.experiment.neighbours.nearness():
         return "neighbours are found anew"
+    if isinstance(scene.experiment.fracture, SoftensCells):
+        return "bonds soften by the stress of cells"
     if scene.inner and scene.inner.inner:
         return "the rule moves by the moves of one that moves by another's"
     if max(map(len, scene.neighbourhood.slots)) > MOST_SLOTS:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Components, Here, Slot, Softens, Torn
+from pbdkit.interfaces import Components, Here, Slot, Softens, SoftensCells, Torn
 from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.vector import vector
 from pbdkit.scene.cell_bonds import CellBond
@@ -130,10 +130,10 @@ class Surroundings:
             for cell in around.cells
             for bond in cell
         }
-        if not any(np.any(one) for one in damage.values()):
+        if not any(np.any(one) for both in damage.values() for one in both):
             return None
         largest = [
-            reduce(np.maximum, (damage[bond.plane, bond.home] for bond in cell))
+            reduce(np.maximum, (damage[bond.plane, bond.home][bond.side] for bond in cell))
             for cell in around.cells
         ]
         found = {}
@@ -141,23 +141,26 @@ class Surroundings:
             plane, at_this_end = self._scene.neighbourhood.home[slot]
             own = damage[plane, None if at_this_end else slot]
             left, right = (largest[n] for n in around.beside[slot])
-            found[slot] = Torn(left, right, own, own)
+            found[slot] = Torn(left, right, *(own if at_this_end else own[::-1]))
         return found
 
-    def _damage(self, bond: CellBond, state: State) -> NDArray[np.floating[Any]]:
-        """The share of their pull that bonds have lost: 1 where they are broken."""
+    def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
+        """The share of their pull that bonds have lost in the cells to their left and right, where
+        they are kept: 1 where they are broken."""
         scene, home = self._scene, self.where
         if bond.home:
             home = home.seen_through(bond.home)
         assert state.broken_step is not None
         broken = home.within(state.broken_step[bond.plane]) >= 0
-        softened: Any = 0.0
-        if isinstance(scene.experiment.fracture, Softens):
+        softened: tuple[Any, Any] = 0.0, 0.0
+        if isinstance(scene.experiment.fracture, (Softens, SoftensCells)):
             own = shown([home.within(value[bond.plane]) for value in state.bond_values])
             limits = scene.constants.limits_at(bond.slot, bond.plane, home)
-            c = scene.constants.of_bond(*limits, *own)
-            softened = self._evaluator.damage(bond.slot.rest, c)
-        return np.where(broken, 1.0, softened).astype(scene.experiment.stepping.precision)
+            softened = self._evaluator.damage(
+                bond.slot.rest, scene.constants.of_bond(*limits, *own)
+            )
+        precision = scene.experiment.stepping.precision
+        return tuple(np.where(broken, 1.0, side).astype(precision) for side in softened)
 
     def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
         """Where the bond along a slot is broken, and its constants where they reach the rule."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.interfaces import (
+    CellStress,
     Component,
     Components,
     Diagnostic,
@@ -50,6 +51,7 @@ from pbdkit.testing.states import (
     remembers,
     shared,
     standing,
+    stressed,
 )
 
 Arrays = dict[str, Any]
@@ -166,6 +168,9 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         c = scene.constants.of_bond(*limits, *own)
         return as_vector(model.seen(d, lost, r, c, p), "seen", lost)
 
+    def update(d: Any, r: Any, limits: Any, own: Any, cells: Any) -> Any:
+        return evaluator.update(d, r, limits, own, tuple(CellStress(*cell) for cell in cells))
+
     bonds = {"d": differences(scene, seed, share=2.0), "own": remembers(model, scene, seed)}
     u, lost = here(scene, seed)["u"], here(scene, seed + 3)["u"]
     questions = [
@@ -173,7 +178,7 @@ def _to_fracture_model(model: FractureModel, scene: Scene, seed: int) -> list[Qu
         question("fictitious", fictitious, u=u),
     ]
     if isinstance(model, RenewsBonds):
-        questions.append(question("update", evaluator.update, **bonds))
+        questions.append(question("update", update, **bonds, cells=stressed(model, seed)))
     if isinstance(model, Softens):
         questions.append(question("seen", seen, **bonds, lost=lost))
     return [*questions, *_to_draw(model, scene)]

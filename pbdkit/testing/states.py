@@ -22,6 +22,7 @@ from pbdkit.interfaces import (
     Here,
     Particles,
     Remembered,
+    SoftensCells,
     TouchingRows,
     Vector,
 )
@@ -96,6 +97,16 @@ def differences(scene: Scene, seed: int, share: float = 0.3) -> list[Vector]:
     """A difference along each slot of the first sublattice, at random."""
     rng = np.random.default_rng(seed)
     return [_vector(share * spacing(scene), rng) for _ in scene.neighbourhood.slots[0]]
+
+
+def stressed(model: Component, seed: int) -> tuple[Any, ...]:
+    """The cells to the left and right of some bonds, by the numbers of their stress, where a
+    fracture model softens cells by it."""
+    rng, count = np.random.default_rng(seed), 2 * isinstance(model, SoftensCells)
+    return tuple(
+        (*rng.uniform(-0.2, 0.5, (3, *SHAPE)), rng.integers(0, 2, SHAPE).astype(float))
+        for _ in range(count)
+    )
 
 
 def here(scene: Scene, seed: int) -> dict[str, Any]:

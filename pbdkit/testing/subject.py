@@ -23,6 +23,7 @@ from pbdkit.interfaces import (
     KnowsStiffness,
     Lattice,
     NeighbourMetric,
+    SoftensCells,
 )
 from pbdkit.interfaces.rule import shares_particles
 from pbdkit.interfaces.units import is_needed
@@ -101,6 +102,8 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
 def _frames(component: Component) -> list[dict[str, Any]]:
     if shares_particles(component):
         return [{"type": "none"}]
+    if isinstance(component, SoftensCells):
+        return [NATURAL]
     return [MEAN, NATURAL] if getattr(component, "uses_cells", False) else [MEAN]
 
 

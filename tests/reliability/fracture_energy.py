@@ -5,10 +5,10 @@ a central notch, over spacings.
     python tests/reliability/fracture_energy.py plate 31 63 127 255
 
 The bodies are the net of springs of ν = 1/3, which 'elastic' is for small strains, mirrored at the
-crack's plane. What is not on that plane is linear and condensed once; the bonds across it soften by
-`Cohesive` itself, settled and softened in turn as `solver: equilibrium` does. So finer lattices are
-affordable than whole bodies; `tests/test_cohesive_fracture.py` holds one of these, cracked, against
-a whole one by pbdkit.
+crack's plane. What is not on that plane is linear and condensed once; the cells across it soften by
+`Cohesive` itself under the stress across the plane, settled and softened in turn as `solver:
+equilibrium` does. So finer lattices are affordable than whole bodies;
+`tests/test_cohesive_fracture.py` holds one of these, cracked, against a whole one by pbdkit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 
 from pbdkit.components.cohesive_fracture import Cohesive
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import Vector, length
+from pbdkit.interfaces import CellStress, Vector
 from pbdkit.scene.scene import build_scene
 
 PARTS = {
@@ -40,7 +40,10 @@ PARTS = {
 }
 EDGE, DIAGONAL = 0.75, 0.375
 """Stiffnesses of bonds over Young's modulus and thickness."""
+POISSON = 1 / 3
 ONSET, ENOUGH, MOST = 1e-4, 1e-5, 3000
+NUMBERS = "damage_left", "damage_right", "failure_left", "failure_right"
+"""What `Cohesive` remembers of a bond, in its order."""
 
 
 def net(columns, rows):
@@ -98,17 +101,17 @@ class Half:
             self.stretch[c + k, place] += sign / np.sqrt(2)
         self.k = np.concatenate([np.full(c, EDGE), np.full(c - 1, 2 * DIAGONAL)])
         self.k[[0, c - 1]] /= 2
-        self.rest = self.h * np.concatenate([np.ones(c), np.full(c - 1, np.sqrt(2))])
 
     def force(self, damage, opening):
-        """(the force that opens it, the strains of the bonds across)."""
+        """(the force that opens it, the displacements of the lowest row), with the shares of their
+        pull that the bonds across have lost."""
         c = 2 * self.columns
         matrix = 2 * self.stiffness[:c, :c]
         matrix = matrix + (self.stretch.T * (self.k * (1 - damage))) @ self.stretch
         right = -self.stiffness[:c, c] * opening
         x = scipy.linalg.solve(matrix, right, assume_a="pos")
         force = self.stiffness[c, :c] @ x + self.stiffness[c, c] * opening / 2
-        return force, self.stretch @ x / self.rest
+        return force, x
 
     def torn(self, first, last):
         """The damage where the upright bonds of these columns, and the diagonals between, are
@@ -117,29 +120,38 @@ class Half:
         damage[first : last + 1] = damage[self.columns + first : self.columns + last] = 1.0
         return damage
 
-    def load(self, fracture, damage, openings):
-        """The force and the damage at each opening, settled and softened in turn, as far as they
-        are asked for."""
-        c, zero = constants(self.h, self.columns, fracture), 0.0 * self.rest
+    def load(self, fracture, cut, openings):
+        """The force and the damage of the cells at each opening, settled and softened in turn, as
+        far as they are asked for; some bonds are `cut`."""
+        c, zero = constants(self.h, self.columns, fracture), np.zeros(self.columns - 1)
+        numbers = dict.fromkeys(NUMBERS, zero)
+        d = r = Vector(zero, zero + self.h)
         for opening in openings:
             for _ in range(MOST):
-                force, strain = self.force(damage, opening)
-                d, r = Vector(strain * self.rest, zero), Vector(self.rest, zero)
-                (softer,) = Cohesive.update(d, r, SimpleNamespace(damage=damage, **c), None)
-                if (softer - damage).max() < ENOUGH:
+                damage = numbers["damage_left"]
+                force, x = self.force(np.maximum(cut, self.lost(damage)), opening)
+                strain = (x[self.columns + 1 :] + x[self.columns : -1]) / self.h
+                along = np.diff(x[: self.columns]) / self.h
+                pull = (strain + POISSON * along) / (1 - POISSON**2)
+                stress = CellStress(zero, pull, zero, zero + 1.0)
+                known = SimpleNamespace(**numbers, **c)
+                found = Cohesive.update(d, r, known, None, stress, stress)
+                numbers = dict(zip(NUMBERS, found, strict=True))
+                if (numbers["damage_left"] - damage).max() < ENOUGH:
                     break
-                damage = softer
             yield force, damage
+
+    def lost(self, damage):
+        """The shares of their pull that bonds lose by the damage of the cells beside them."""
+        beside = np.concatenate([damage[:1], (damage[1:] + damage[:-1]) / 2, damage[-1:]])
+        return np.concatenate([beside, damage])
 
 
 def constants(h, columns, fracture):
-    """What `Cohesive` knows of upright and diagonal bonds, as a scene of that spacing has it."""
+    """The constants of upright bonds that `Cohesive` knows in a scene of that spacing."""
     scene = build_scene(Experiment(**PARTS, lattice={"type": "square", "a": h}, fracture=fracture))
-    limits = scene.constants.limits
-    by_length = {round(float(length(s.rest)) / h, 3): limits[s]._asdict() for s in limits}
-    upright, diagonal = by_length[1.0], by_length[1.414]
-    sizes = columns, columns - 1
-    return {name: np.repeat([upright[name], diagonal[name]], sizes) for name in upright}
+    upright = next(s for s in scene.constants.limits if s.rest.x == 0.0)
+    return scene.constants.limits[upright]._asdict()
 
 
 def beam(n, a=2.0, size=5.0, energy=1.0, far=1.8, count=24):

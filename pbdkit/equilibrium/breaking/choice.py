@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import RenewsBonds
+from pbdkit.interfaces import RenewsBonds, SoftensCells
 from pbdkit.results.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.scene.solver_sizes import LARGEST_ANEW
@@ -40,14 +40,15 @@ def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
 
 
 def _is_plain(scene: Scene) -> bool:
-    """Whether the kernel knows all that such a scene has: loads, cuts, fields, courses and leaders
-    along one axis it does not."""
+    """Whether the kernel knows all that such a scene has: loads, cuts, fields, courses, leaders
+    along one axis and cells that begin to soften in turn it does not."""
     asked, constants = scene.experiment, scene.constants
     more = any((asked.cuts, asked.loads, asked.courses, constants.by_bond, constants.by_particle))
     mixed = scene.cells is not None and bool(scene.cells.mixed)
     guided = any(leading.group.axes for leading in scene.leading)
     flat = scene.axes == 2 and scene.inner is None
-    return scene.has_fracture and flat and not (more or mixed or guided)
+    in_turn = isinstance(asked.fracture, SoftensCells)
+    return scene.has_fracture and flat and not (more or mixed or guided or in_turn)
 
 
 def _seconds(scene: Scene) -> float:

@@ -17,9 +17,10 @@ from pbdkit.scene.frame_points import Frame
 from pbdkit.scene.neighbourhood import BondPlane
 from pbdkit.scene.places import Block, slot_step
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.compiled.bands import frame_order
 from pbdkit.stepping.compiled.plan import Plan
-from pbdkit.stepping.compiled.tearing import tearing_arrays
+from pbdkit.stepping.compiled.tearing import stress_arrays, tearing_arrays
 from pbdkit.stepping.state import Floats, State
 
 Arrays = dict[str, Any]
@@ -39,7 +40,7 @@ def constant_arrays(plan: Plan) -> Arrays:
         "counts": np.array([len(own) for own in slots]),
         **changing_arrays(plan),
         **{name: v.reshape(len(slots), most, *v.shape[1:]) for name, v in by_slot.items()},
-        **_stacked([_of_plane(scene, plane) for plane in scene.neighbourhood.planes], real),
+        **_stacked([_of_plane(plan, plane) for plane in scene.neighbourhood.planes], real),
     }
     if scene.cells:
         arrays["share"] = np.array(scene.cells.weight, real)
@@ -49,6 +50,8 @@ def constant_arrays(plan: Plan) -> Arrays:
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
     if scene.tears:
         arrays |= tearing_arrays(scene)
+    if plan.softens_cells:
+        arrays |= stress_arrays(scene, real)
     if frame := scene.frame:
         arrays |= _of_frame(frame, frame_order(plan), real)
     return arrays
@@ -87,6 +90,11 @@ def changing_arrays(plan: Plan) -> Arrays:
         **rule_arrays(plan),
         "limits": limits.reshape(len(slots), max(map(len, slots)), limits.shape[-1]),
         "end_limits": np.array(ends, real),
+        **(
+            {"cell_ratios": np.array(CellStresses(scene).ratios, real)}
+            if plan.softens_cells
+            else {}
+        ),
     }
 
 
@@ -133,9 +141,10 @@ def _of_slot(plan: Plan, slot: Slot) -> dict[str, Any]:
     }
 
 
-def _of_plane(scene: Scene, plane: BondPlane) -> dict[str, Any]:
+def _of_plane(plan: Plan, plane: BondPlane) -> dict[str, Any]:
     """Of a plane of bonds source, target and step, rest offset, block."""
-    slot, block = plane.slot, plane_block(scene.raster, plane)
+    scene, slot = plan.scene, plane.slot
+    block = plane_block(scene.raster, plane, inside=plan.softens_cells)
     spans = zip(block.start, block.stop, strict=True) if block else [(0, 0)] * scene.axes
     return {
         "ends": (slot.source, slot.target, *slot.cell),

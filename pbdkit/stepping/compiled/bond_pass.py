@@ -10,7 +10,7 @@ from pbdkit.scene.homes import Home
 from pbdkit.scene.raster import EMPTY, FOLLOWER
 from pbdkit.stepping.compiled.particle import parameters
 from pbdkit.stepping.compiled.plan import Function, Plan, values
-from pbdkit.stepping.compiled.tearing import marking_lines
+from pbdkit.stepping.compiled.tearing import marking_lines, stress_lines
 
 
 def write_bond_pass(plan: Plan) -> Function:
@@ -51,8 +51,8 @@ class Judging(NamedTuple):
     write: list[str]
 
 
-def judging(plan: Plan, d: str) -> Judging:
-    """For a bond whose d has this pattern."""
+def judging(plan: Plan, d: str, home: str) -> Judging:
+    """For a bond whose d has this pattern, and whose end where it is kept has this flat place."""
     numbers = plan.levels[-1].seen.bond
     homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
     c = values(numbers, homes)
@@ -61,7 +61,11 @@ def judging(plan: Plan, d: str) -> Judging:
     renews = isinstance(plan.model, RenewsBonds)
     changing = [m for m, changes in enumerate(kept) if changes and renews]
     if changing:
-        look.append(f"new = update(d, r, Constants({c}), q)")
+        cells = ""
+        if plan.softens_cells:
+            look += stress_lines(plan, home)
+            cells = ", left, right"
+        look.append(f"new = update(d, r, Constants({c}), q{cells})")
     for position, m in enumerate(changing):
         look.append(f"new{m} = new[{position}]")
         c = c.replace(f"b{m}[j]", f"new{m}")
@@ -80,7 +84,7 @@ def _write_judging(out: Function, plan: Plan) -> None:
             f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
             f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
         )
-    own = judging(plan, "n@[j] - h@[j]")
+    own = judging(plan, "n@[j] - h@[j]", "base + j")
     # Loops that look, and vectorise; the last one writes, where there is anything to write. What is
     # far from breaking is told by lengths alone, which takes half the time.
     out.add(0, "some = 0", "for j in range(j1 - j0):")

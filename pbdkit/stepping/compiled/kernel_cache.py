@@ -25,7 +25,7 @@ import numba
 import numpy as np
 from numba.core.registry import cpu_target
 
-from pbdkit.interfaces import Here, Torn, length
+from pbdkit.interfaces import CellStress, Here, Stiffness, Torn, length
 from pbdkit.interfaces.vector import KINDS
 from pbdkit.stepping.compiled.functions import compiled, source_key
 
@@ -164,10 +164,7 @@ def _ready(
 
 def words(made: Callable[[Function], Any]) -> dict[str, Any]:
     """What every kernel may name, with functions as they are `made` for whoever runs it."""
-    kinds = {kind.__name__: kind for kind in KINDS.values()}
+    kinds: dict[str, Any] = {kind.__name__: kind for kind in KINDS.values()}
+    kinds |= {kind.__name__: kind for kind in (Here, Torn, CellStress, Stiffness)}
     numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}
-    return (
-        kinds
-        | numbers
-        | {"Here": Here, "Torn": Torn, "length": made(length), "namedtuple": namedtuple, "np": np}
-    )
+    return kinds | numbers | {"length": made(length), "namedtuple": namedtuple, "np": np}

@@ -17,6 +17,7 @@ from pbdkit.interfaces import (
     RenewsBonds,
     RenewsParticles,
     Softens,
+    SoftensCells,
     TearsCells,
 )
 from pbdkit.interfaces.vector import vector
@@ -24,6 +25,7 @@ from pbdkit.registry.blame import blaming
 from pbdkit.scene import outlines
 from pbdkit.scene.declarations import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.cell_stress import CellStresses, tried
 from pbdkit.stepping.compiled.kernel_cache import load_kernel
 from pbdkit.stepping.compiled.level import Level
 from pbdkit.stepping.evaluator import Evaluator
@@ -61,6 +63,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
                 found |= {f"{name}{number}": getattr(part, name) for name in names}
         if isinstance(part, Loadable) and levels[-1].scene.loads:
             found[f"loaded{number}"] = part.loaded
+    if isinstance(parts.get(""), SoftensCells):
+        found["stress"] = CellStresses(levels[-1].scene).stress
     if levels[-1].scene.barriers:
         found["leave"] = outlines.leave
     return found
@@ -111,7 +115,8 @@ def _parts(scene: Scene) -> tuple[int, ...]:
             with blaming(experiment.fracture, "to compile"):
                 limits = scene.constants.limits[slot]
                 bond = started(scene, bond_numbers(experiment), (1,))
-                evaluator.renew_bonds(one, slot.rest, limits, bond, np.ones(1, bool))
+                cells = tried(experiment.fracture, ones)
+                evaluator.renew_bonds(one, slot.rest, limits, bond, np.ones(1, bool), cells)
                 evaluator.breaks(one, slot.rest, limits, bond)
         with blaming(experiment.rule, "to compile"):
             total = evaluator.contribution(one, one, evaluator.everywhere([slot])[0])

@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import count, permutations
 from typing import Any
 
-from pbdkit.interfaces import RenewsBonds
+from pbdkit.interfaces import RenewsBonds, SoftensCells
 from pbdkit.interfaces.rule import shares_particles
 from pbdkit.scene.guides import has_guides
 from pbdkit.scene.homes import Home, Number
@@ -124,6 +124,11 @@ class Plan:
     def tears(self) -> bool:
         """Whether the rule computes what torn cells exert."""
         return self.scene.tears
+
+    @property
+    def softens_cells(self) -> bool:
+        """Whether the fracture model softens bonds by the stress of the cells beside them."""
+        return isinstance(self.model, SoftensCells)
 
     @property
     def bonds_first(self) -> bool:

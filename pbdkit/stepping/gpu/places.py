@@ -53,7 +53,7 @@ def breakable_bonds(plan: Plan) -> NDArray[np.uint8]:
     planes, shape = plan.scene.neighbourhood.planes, plan.scene.raster.shape
     found = np.zeros((len(planes), *shape[1:]), np.uint8)
     for n, plane in enumerate(planes):
-        if block := plane_block(plan.scene.raster, plane):
+        if block := plane_block(plan.scene.raster, plane, inside=plan.softens_cells):
             too = plan.model.breaks_frame_bonds()
             block.within(found[n])[...] = bonds_in(plan.scene.raster, block, plane, too)
     return found
@@ -99,7 +99,7 @@ def write_bonds(plan: Plan) -> Function:
     out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in kept.items()))
     out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
-    out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]").write)
+    out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
     out.add(3, *marking_lines(plan, "n * cells + j", "here"))
     return out
 

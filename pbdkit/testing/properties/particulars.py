@@ -9,16 +9,26 @@ import numpy as np
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
     BreaksAtStrain,
+    CellStress,
     Diagnostic,
     FractureModel,
     FrameMap,
     FramePolicy,
     RenewsBonds,
 )
+from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.frame_points import sites_of_frame
 from pbdkit.stepping.evaluator import Evaluator
 from pbdkit.testing.properties.elementwise import ROUNDING
-from pbdkit.testing.states import SHAPE, Shown, differences, frame_showing, moment_of, remembers
+from pbdkit.testing.states import (
+    SHAPE,
+    Shown,
+    differences,
+    frame_showing,
+    moment_of,
+    remembers,
+    stressed,
+)
 from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
 
 CLOSE = 1e-9
@@ -36,17 +46,33 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
             fault = f"{here} for the slot {plane.slot.site} and {there} for its opposite"
             raise PropertyError(f"`constants` are {fault}: take lengths and shells, not directions")
     evaluator, own = Evaluator(scene), remembers(model, scene, 0)
-    asks = {"breaks": evaluator.breaks}
+    cells = tuple(CellStress(*cell) for cell in stressed(model, 0))
+    sides = _from_the_other_end([number.name for number in bond_numbers(scene.experiment)])
+    theirs = tuple(own[n] for n in sides)
+    asks: dict[str, list[tuple[CellStress, ...]]] = {"breaks": []}
     if isinstance(model, RenewsBonds):
-        asks["update"] = evaluator.update
+        asks["update"] = [cells] if cells else []
     tried = differences(scene, 0, share=2.0)
     for slot, d in zip(scene.neighbourhood.slots[0], tried, strict=True):
         limits = scene.constants.limits[slot]
-        for what, ask in asks.items():
-            one, other = ask(d, slot.rest, limits, own), ask(-d, -slot.rest, limits, own)
+        for what, beside in asks.items():
+            ask = getattr(evaluator, what)
+            one = ask(d, slot.rest, limits, own, *beside)
+            other = ask(-d, -slot.rest, limits, theirs, *(cells[::-1] for cells in beside))
+            if beside:
+                other = tuple(other[n] for n in sides)
             if not np.array_equal(np.asarray(one), np.asarray(other)):
                 along = f"for (-d, -r) than for (d, r) along {slot.site}"
                 raise PropertyError(f"`{what}` answers otherwise {along}")
+
+
+def _from_the_other_end(names: list[str]) -> list[int]:
+    """The place of each number that is seen from the other end of a bond: left for right."""
+    turned = {"_left": "_right", "_right": "_left"}
+    swapped = [
+        next((n.removesuffix(a) + b for a, b in turned.items() if n.endswith(a)), n) for n in names
+    ]
+    return [names.index(n) for n in swapped]
 
 
 @asked_of(FractureModel)

@@ -1,0 +1,150 @@
+"""The stress of the cells beside bonds, for fracture models that soften cells by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from operator import add
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pbdkit.interfaces import CellStress, Slot, SoftensCells, Stiffness, Vector
+from pbdkit.interfaces.lattice import Index
+from pbdkit.interfaces.polygons import Polygon, Side, signed_area
+from pbdkit.interfaces.rule import material_of
+from pbdkit.scene.places import Block
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import shown
+
+
+@dataclass(frozen=True)
+class CellBeside:
+    """A cell on one side of the bonds along a slot: the way from their start to each corner, a
+    sublattice and a step of repeat cells; and the `rates` that make the mean gradient of the
+    displacement, Σ_k (u_k - u_0) ⊗ rates_k, of the corners but the first."""
+
+    corners: tuple[tuple[int, Index], ...]
+    rates: tuple[Vector, ...]
+    side: Side
+
+    def gradient(self, u: NDArray[Any], home: Block) -> list[Any]:
+        """Of the bonds that start at some places: xx, xy, yx, yy, the component first."""
+        first, *others = (Vector(*shown(self._at(corner, home).of(u))) for corner in self.corners)
+        d = [other - first for other in others]
+        return [
+            sum_in_order(
+                [getattr(one, a) * getattr(g, b) for one, g in zip(d, self.rates, strict=True)]
+            )
+            for a in "xy"
+            for b in "xy"
+        ]
+
+    def way(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
+        """From the flat place of the start of a bond along a slot to that of a corner."""
+        step = corner[0] - slot.source
+        for size, cells in zip(shape[1:], corner[1], strict=True):
+            step = step * size + cells
+        return step
+
+    @staticmethod
+    def _at(corner: tuple[int, Index], home: Block) -> Block:
+        start, stop = (tuple(map(add, end, corner[1])) for end in (home.start, home.stop))
+        return Block(corner[0], start, stop)
+
+
+def sum_in_order(terms: list[Any]) -> Any:
+    """As kernels add them up."""
+    return sum(terms[1:], terms[0])
+
+
+class CellStresses:
+    """The cells beside the bonds of a scene whose fracture model softens cells. `ratios` are the
+    stiffness over the own Young's modulus of the cell."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    @cached_property
+    def ratios(self) -> Stiffness:
+        """Those of the rule's material."""
+        rule: Any = self._scene.experiment.rule
+        material = material_of(rule)
+        assert material is not None
+        modulus = material.own_modulus(rule.through_thickness())
+        return Stiffness(*(float(value / modulus) for value in material))
+
+    @property
+    def stress(self) -> Any:
+        """The function that makes stress of a gradient and the ratios."""
+        return linear_stress if self._scene.experiment.rule.linear else turned_stress
+
+    def beside(self, slot: Slot) -> tuple[CellBeside, CellBeside]:
+        """The cells to the left and to the right of a slot."""
+        left, right = (_beside(self._scene, slot, side) for side in self.tiling.beside[slot])
+        return left, right
+
+    @property
+    def tiling(self) -> Any:
+        """The cells of the lattice."""
+        return self._scene.neighbourhood.tiling
+
+    def of(self, u: NDArray[Any], slot: Slot, home: Block) -> tuple[CellStress, CellStress]:
+        """Of the bonds along a slot that start at some places, the cells to the left and right."""
+        cells, precision = self._scene.cells, self._scene.experiment.stepping.precision
+        assert cells is not None
+        shares = cells.beside(slot, home, precision, cells.share)
+        left, right = (
+            self._stressed(one.gradient(u, home), share)
+            for one, share in zip(self.beside(slot), shares, strict=True)
+        )
+        return left, right
+
+    def _stressed(self, gradient: list[Any], share: Any) -> CellStress:
+        xx, yy, xy = self.stress(*gradient, self.ratios)
+        return CellStress(xx, yy, xy, share)
+
+
+def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
+    source, step = slot.source, (0,) * scene.axes
+    if side.first:
+        source, step = side.first.target, side.first.cell
+    polygons = scene.neighbourhood.tiling.polygons
+    polygon = next(p for p in polygons if (p.source, p.kind) == (source, side.kind))
+    corners = tuple((c.target, tuple(map(add, step, c.cell))) for c in polygon.corners)
+    return CellBeside(corners, _rates(polygon), side)
+
+
+def _rates(polygon: Polygon) -> tuple[Vector, ...]:
+    """Of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area."""
+    r, twice = polygon.rest, 2.0 * float(signed_area(polygon.rest))
+    ends = [(r[(k + 1) % len(r)], r[k - 1]) for k in range(1, len(r))]
+    return tuple(
+        Vector(float(ahead.y - behind.y) / twice, float(behind.x - ahead.x) / twice)
+        for ahead, behind in ends
+    )
+
+
+def linear_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
+    """The stress under a gradient of the displacement that is small."""
+    return _elastic(xx, yy, xy + yx, c)
+
+
+def turned_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
+    """The stress of the strain of Green and Lagrange, of which rotations are no part."""
+    along_x, along_y = xx + 0.5 * (xx * xx + yx * yx), yy + 0.5 * (xy * xy + yy * yy)
+    return _elastic(along_x, along_y, xy + yx + (xx * xy + yx * yy), c)
+
+
+def _elastic(xx: Any, yy: Any, shear: Any, c: Any) -> Any:
+    return (
+        c.xx * xx + c.xy * yy + c.x_shear * shear,
+        c.xy * xx + c.yy * yy + c.y_shear * shear,
+        c.x_shear * xx + c.y_shear * yy + c.shear * shear,
+    )
+
+
+def tried(model: object, ones: Any) -> tuple[CellStress, ...]:
+    """Cells to try a model's functions with, as many as it is given."""
+    stress = CellStress(ones, 0.5 * ones, 0.25 * ones, ones)
+    return (stress, stress) if isinstance(model, SoftensCells) else ()
