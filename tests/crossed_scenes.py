@@ -98,6 +98,11 @@ REFUSALS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (UNCALIBRATED, ("loads", "body force"), r"loads: the rule '[a-z-]+' .* knows no forces"),
     (UNCALIBRATED, ("motion: newton",), "leaders that move by Newton's law need forces, and '"),
     (UNCALIBRATED, ("fracture: cohesive",), "'cohesive' needs a rule that is calibrated"),
+    (
+        ("fracture: cohesive",),
+        ("frame: mean", "frame: first", "frame: none", "frame: mirror"),
+        "'cohesive' softens the cells of the body, which the frame",
+    ),
     (UNCALIBRATED, ("frame: natural",), "the rule '[a-z-]+' does not work cell by cell; take a"),
     (NUMBERLESS, FIELDS_OF_RULE, "rule.stiffness: unknown key"),
     (("rule: strain-gradient",), FIELDS_OF_RULE[:2], "applies a rule to the moves of another"),

@@ -37,7 +37,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
     The stress is that which the cell would have without damage. Where its largest principal value
     reaches the onset, the direction of that is the normal e of the cell's crack, for good. Bonds of
-    the cell that cross the crack, |n · e| > .3, lose their pull in the cell by the largest stress
+    the cell that cross the crack, |n · e| > 0.3, lose their pull in the cell by the largest stress
     κ over Young's modulus since: D = failure / (failure - onset) (1 - onset / κ); the others do
     not. The failure strain is 2 energy / (onset · width), the width of the cell along e being that
     of the band of cells which a straight crack crosses (Bažant and Oh 1983, Oliver 1989). A bond is
@@ -65,18 +65,18 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         return {"onset_strain": self.onset}
 
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """`release` = 2 energy / onset over the modulus of the cell, a length; the compliances
-        `along_x`, `along_y` and `across` times that modulus; and the bonds of a cell, `x0` to `y2`.
+        """`release` = 2 energy / onset over the modulus of the cell along x, a length; the
+        compliances `along_y` and `across` over that along x; and the bonds of a cell, `x0` to `y2`.
 
         ExperimentError where the failure strain of some crack is not above the onset, since the
         spacing is too large for so little energy.
         """
-        modulus, along_x, along_y, across = _compliance(rule)
+        modulus, along_y, across = _compliance(rule)
         bonds = _bonds_of_a_cell(setting)
         angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
         cos, sin = np.cos(2 * angles), np.sin(2 * angles)
         size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
-        size = float((size * _flexibility(cos, sin, along_x, along_y, across)).max())
+        size = float((size / _flexibility(cos, sin, along_y, across)).max())
         room = 2.0 * self.energy / (modulus * size * self.onset**2)
         if np.any(room <= 1.0):
             raise ExperimentError(
@@ -89,7 +89,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
             )
         cell = {f"x{n}": float(r.x) for n, r in enumerate(bonds)}
         cell |= {f"y{n}": float(r.y) for n, r in enumerate(bonds)}
-        compliance = {"along_x": along_x, "along_y": along_y, "across": across}
+        compliance = {"along_y": along_y, "across": across}
         return {"release": 2.0 * self.energy / (modulus * self.onset), **compliance, **cell}
 
     def remembered(self) -> tuple[Remembered, ...]:
@@ -114,8 +114,9 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
     @staticmethod
     def load(stress: CellStress, c: Any, p: Any) -> Any:
-        """The largest principal stress over the onset."""
-        return _principal(stress)[0] / c.onset_strain
+        """κ over the onset."""
+        largest, cos, sin = _principal(stress)
+        return largest * _flexibility(cos, sin, c.along_y, c.across) / c.onset_strain
 
     @staticmethod
     def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
@@ -125,13 +126,15 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 
 def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> Any:
     """The damage of a bond in a cell under a stress, and the failure strain, from those before."""
-    strain, cos, sin = _principal(stress)
+    largest, cos, sin = _principal(stress)
+    flexibility = _flexibility(cos, sin, c.along_y, c.across)
+    strain = largest * flexibility
     size = _projection(Vector(c.x0, c.y0), cos, sin)
     other = _projection(Vector(c.x1, c.y1), cos, sin)
     size = where(other > size, other, size)
     other = _projection(Vector(c.x2, c.y2), cos, sin)
     size = np.sqrt(where(other > size, other, size))
-    fails = c.release / (size * _flexibility(cos, sin, c.along_x, c.along_y, c.across))
+    fails = c.release * flexibility / size
     crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
     begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
     failure = where(begins, where(crossed, fails, -fails), failure)
@@ -155,21 +158,20 @@ def _projection(r: Any, cos: Any, sin: Any) -> Any:
     return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
 
 
-def _flexibility(cos: Any, sin: Any, along_x: Any, along_y: Any, across: Any) -> Any:
-    """The strain along that direction under a unit of stress along it."""
+def _flexibility(cos: Any, sin: Any, along_y: Any, across: Any) -> Any:
+    """The strain along that direction under a unit of stress along it, over that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
-    return along_x * x * x + along_y * y * y + across * 0.25 * sin * sin
+    return x * x + along_y * y * y + across * 0.25 * sin * sin
 
 
-def _compliance(rule: Calibrated) -> tuple[float, float, float, float]:
-    """Young's modulus along x of a rule's material; times that modulus S_xx, S_yy and
-    2 S_xy + S_shear in its plane."""
-    material = rule.elasticity()
+def _compliance(rule: Calibrated) -> tuple[float, float, float]:
+    """Of a rule's material the modulus along x, such that a stress of onset times Young's modulus
+    takes the energy with it; and S_yy and 2 S_xy + S_shear over S_xx in its plane."""
+    material, nu = rule.elasticity(), rule.through_thickness()
     assert material is not None
-    modulus = material.own_modulus(rule.through_thickness())
     xx, yy, xy, shear, *_ = material
-    det = (xx * yy - xy * xy) / modulus
-    return modulus, yy / det, xx / det, modulus / shear - 2.0 * xy / det
+    across = (xx * yy - xy * xy) / (yy * shear) - 2.0 * xy / yy
+    return material.own_modulus(nu) * (1.0 - nu * nu), xx / yy, across
 
 
 def _bonds_of_a_cell(setting: Setting) -> tuple[Components, Components, Components]:

@@ -45,7 +45,7 @@ class Stiffness(NamedTuple):
     x_shear: Any = 0.0
     y_shear: Any = 0.0
 
-    def own_modulus(self, through_thickness: float) -> Any:
+    def own_modulus(self, through_thickness: Any) -> Any:
         """Young's modulus along x, over that of the material it is compared with, given σ_zz over
         σ_xx + σ_yy."""
         return (self.xx - self.xy * self.xy / self.yy) * (1.0 - through_thickness**2)

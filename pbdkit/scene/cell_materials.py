@@ -68,7 +68,7 @@ def weighed(
     slots = [slot for own in setting.slots for slot in own]
     weights = tuple(_weights(experiment, setting, slots, name) for name in used)
     planes = tuple(mixed[name] for name in used)
-    return WeighedCells(setting.cells, share, weight, planes, weights, phase)
+    return WeighedCells(setting.cells, share, weight, planes, weights, phase, tuple(used))
 
 
 def _springs(rule: Any, setting: Setting, mixed: Mask, stiffness: Floats) -> Floats:

@@ -99,7 +99,7 @@ class WeighedCells:
     times its stiffness over that of the rule. Cells whose stiffness is no multiple of that have the
     weight 0, and in `mixed` their share of each of some stiffnesses, whose `weights` by slot are
     those of the rule for it. `phase` tells materials apart by a number, -1 where a cell is of
-    several; None where there is one."""
+    several; None where there is one. `names` are the components of those stiffnesses, one each."""
 
     tiling: Tiling
     share: Floats | None
@@ -107,6 +107,7 @@ class WeighedCells:
     mixed: tuple[Floats, ...] = ()
     weights: tuple[dict[Slot, Any], ...] = ()
     phase: NDArray[np.int64] | None = None
+    names: tuple[str, ...] = ()
 
     def of(self, patch: Patch) -> Floats | float:
         """The shares of the cells of a patch."""

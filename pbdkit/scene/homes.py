@@ -84,14 +84,14 @@ def ask_for_constants(experiment: Experiment, setting: Setting) -> SceneConstant
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
     with blaming(fracture, "when asked for its constants", "fracture"):
+        of_fracture = _named("Parameters", fracture.parameters())
+        further = {s: of_material(fracture, rule, setting, s) for s in slots}
         if isinstance(fracture, SoftensCells) and not experiment.frame.weighs_cells:
             raise ExperimentError(
                 f"'{fracture.type}' softens the cells of the body, which the frame "
                 f"'{experiment.frame.type}' does not tell from others; take frame: "
                 "{type: natural}, or fracture: {type: damage}"
             )
-        of_fracture = _named("Parameters", fracture.parameters())
-        further = {s: of_material(fracture, rule, setting, s) for s in slots}
         limits = {s: _named("Constants", fracture.constants(s), **further[s]) for s in slots}
         _refuse_other_names(limits, "constants")
         if isinstance(rule, Calibrated) and fracture.can_break:

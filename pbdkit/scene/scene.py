@@ -9,7 +9,7 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting, SoftensCells, TearsCells
+from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting, TearsCells
 from pbdkit.interfaces.lattice import Index
 from pbdkit.registry.blame import blaming
 from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
@@ -180,12 +180,6 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     following = _frame_of(raster, experiment)
     check_directions(experiment, has_frame=raster.others.any(following is not None))
     cells = weighed(experiment, raster, setting, cells)
-    if cells and cells.mixed and isinstance(experiment.fracture, SoftensCells):
-        raise ExperimentError(
-            f"'{experiment.fracture.type}' knows the stress of cells of one material; set the "
-            "numbers of the rule to one value each, or take fracture: {type: damage}",
-            ("fracture",),
-        )
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
     barriers = build_obstacles(raster, experiment)
     warnings += collisions(raster, leading, barriers, experiment.steps)

@@ -7,6 +7,7 @@ from functools import cached_property
 from operator import add
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.interfaces import CellStress, Slot, SoftensCells, Stiffness, Vector
@@ -59,11 +60,12 @@ def sum_in_order(terms: list[Any]) -> Any:
 
 
 class CellStresses:
-    """The cells beside the bonds of a scene whose fracture model softens cells. `ratios` are the
-    stiffness over the own Young's modulus of the cell."""
+    """The cells beside the bonds of a scene whose fracture model softens cells. Their `ratios` are
+    the stiffness over the own Young's modulus of the cell."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+        assert scene.cells
+        self._scene, self._cells = scene, scene.cells
 
     @cached_property
     def ratios(self) -> Stiffness:
@@ -73,6 +75,26 @@ class CellStresses:
         assert material is not None
         modulus = material.own_modulus(rule.through_thickness())
         return Stiffness(*(float(value / modulus) for value in material))
+
+    @cached_property
+    def ratios_by_cell(self) -> Stiffness:
+        """Those of each cell, (kind, sublattice, cell, cell), where cells are of several
+        stiffnesses; those of the rule where there is none."""
+        rule: Any = self._scene.experiment.rule
+        base: Any = material_of(rule)
+        planes = {name: self._cells.weight * value for name, value in base._asdict().items()}
+        for name, plane in zip(self._cells.names, self._cells.mixed, strict=True):
+            if name in planes:
+                planes[name] = planes[name] + plane
+        some = planes["xx"] > 0.0
+        planes = {n: np.where(some, v, getattr(base, n)) for n, v in planes.items()}
+        # In plane strain xy over xx is ν / (1 - ν), and σ_zz over σ_xx + σ_yy is ν.
+        share = planes["xy"] / planes["xx"] if rule.through_thickness() else np.zeros(some.shape)
+        alike = dict(planes)
+        if base.xx == base.yy:  # cells that a border cuts count the same whichever axis is x
+            alike["xx"] = alike["yy"] = (planes["xx"] + planes["yy"]) / 2.0
+        modulus = Stiffness(**alike).own_modulus(share / (1.0 + share))
+        return Stiffness(**{name: plane / modulus for name, plane in planes.items()})
 
     @property
     def stress(self) -> Any:
@@ -91,17 +113,20 @@ class CellStresses:
 
     def of(self, u: NDArray[Any], slot: Slot, home: Block) -> tuple[CellStress, CellStress]:
         """Of the bonds along a slot that start at some places, the cells to the left and right."""
-        cells, precision = self._scene.cells, self._scene.experiment.stepping.precision
-        assert cells is not None
-        shares = cells.beside(slot, home, precision, cells.share)
+        precision = self._scene.experiment.stepping.precision
+        shares = self._cells.beside(slot, home, precision, self._cells.share)
+        ratios = [self.ratios] * 2
+        if self._cells.mixed:
+            parts = (self._cells.beside(slot, home, precision, p) for p in self.ratios_by_cell)
+            ratios = [Stiffness(*side) for side in zip(*parts, strict=True)]
         left, right = (
-            self._stressed(one.gradient(u, home), share)
-            for one, share in zip(self.beside(slot), shares, strict=True)
+            self._stressed(one.gradient(u, home), c, share)
+            for one, c, share in zip(self.beside(slot), ratios, shares, strict=True)
         )
         return left, right
 
-    def _stressed(self, gradient: list[Any], share: Any) -> CellStress:
-        xx, yy, xy = self.stress(*gradient, self.ratios)
+    def _stressed(self, gradient: list[Any], ratios: Stiffness, share: Any) -> CellStress:
+        xx, yy, xy = self.stress(*gradient, ratios)
         return CellStress(xx, yy, xy, share)
 
 

@@ -90,12 +90,16 @@ def changing_arrays(plan: Plan) -> Arrays:
         **rule_arrays(plan),
         "limits": limits.reshape(len(slots), max(map(len, slots)), limits.shape[-1]),
         "end_limits": np.array(ends, real),
-        **(
-            {"cell_ratios": np.array(CellStresses(scene).ratios, real)}
-            if plan.softens_cells
-            else {}
-        ),
+        **(_ratios(plan) if plan.softens_cells else {}),
     }
+
+
+def _ratios(plan: Plan) -> Arrays:
+    """The stiffness of cells over their own Young's modulus, those of a cell side by side."""
+    stresses, real = CellStresses(plan.scene), plan.scene.experiment.stepping.precision
+    if plan.mixed:
+        return {"ratios": np.stack(stresses.ratios_by_cell, axis=-1).astype(real)}
+    return {"cell_ratios": np.array(stresses.ratios, real)}
 
 
 def padded(slots: Sequence[tuple[Slot, ...]]) -> list[Slot]:

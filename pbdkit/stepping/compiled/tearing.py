@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import Slot, Softens, SoftensCells
+from pbdkit.interfaces import Slot, Softens, SoftensCells, Stiffness
 from pbdkit.scene.cell_bonds import CellBond
 from pbdkit.scene.declarations import bond_numbers
 from pbdkit.scene.homes import Home
@@ -164,8 +164,13 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
     """The stress of the cells to the `left` and `right` of a bond of plane n whose end where it is
     kept has this flat place."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
-    lines = [f"ratios = Stiffness({', '.join(f'cell_ratios[{m}]' for m in range(6))})"]
+    count = len(Stiffness._fields)
+    known = [f"cell_ratios[{m}]" for m in range(count)]
+    lines = list[str]()
     for side, name in enumerate(("left", "right")):
+        lines.append(f"cell = {home} + body_steps[n, {side}]")
+        if plan.mixed:
+            known = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
         lines.append(f"origin = {home} + corner_steps[n, {side}, 0]")
         for k in range(1, corners):
             lines.append(f"corner = {home} + corner_steps[n, {side}, {k}]")
@@ -175,9 +180,9 @@ def stress_lines(plan: Plan, home: str) -> list[str]:
                 rates = ((k, f"corner_rates[n, {side}, {k - 1}, {b}]") for k in range(1, corners))
                 terms = (f"e{k}_{a} * {rate}" for k, rate in rates)
                 lines.append(f"g_{a}{axis} = {' + '.join(terms)}")
-        lines.append("xx, yy, xy = stress(g_xx, g_xy, g_yx, g_yy, ratios)")
-        share = f"flat_body[{home} + body_steps[n, {side}]]"
-        lines.append(f"{name} = CellStress(xx, yy, xy, {share})")
+        ratios = f"Stiffness({', '.join(known)})"
+        lines.append(f"xx, yy, xy = stress(g_xx, g_xy, g_yx, g_yy, {ratios})")
+        lines.append(f"{name} = CellStress(xx, yy, xy, flat_body[cell])")
     return lines
 
 

@@ -13,7 +13,7 @@ from pbdkit.stepping.gpu.places import Whole, breakable_bonds, find_groups
 from pbdkit.stepping.prescription import Led
 
 PLANES = re.compile(
-    r"kind|share|body|mixed|broken|lengths|lost|torn|groups|breakable"
+    r"kind|share|body|ratios|mixed|broken|lengths|lost|torn|groups|breakable"
     r"|(u|v|z\d+|load)_[xyz]|(bond|own|was|field|limit)\d+"
 )
 """Names of arrays that have a value for every place."""
