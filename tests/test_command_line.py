@@ -178,6 +178,8 @@ def test_an_existing_output_is_kept_unless_forced(call: Call) -> None:
 WRONG = {
     "an experiment as command": (2, ["paper/a"], "there is no command 'paper/a'; `pbdkit run paper/a` runs it"),
     "no command at all": (2, ["qqqqqq"], "there is no command 'qqqqqq'; `pbdkit` alone lists them"),
+    "a word for several": (2, ["list"], "there is no command 'list'; `pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins"),
+    "a word of others": (2, ["validate"], "there is no command 'validate'; `pbdkit check` checks an experiment"),
     "unknown command": (2, ["rnu"], "there is no command 'rnu'; did you mean 'run'?"),
     "missing file": (2, ["run", "f.yaml"], "f.yaml: is no file and no shipped experiment"),
     "fault in the file": (2, ["check", "e.json", "--set", "steps=0"], "setting steps=0: steps: "),
@@ -480,3 +482,11 @@ def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.Mo
         1,
         True,
     )
+
+
+def test_every_command_that_is_suggested_for_another_word_is_there():
+    from pbdkit.cli import COMMANDS, MEANT
+
+    named = [word for told in MEANT.values() for word in re.findall(r"`pbdkit ([a-z]+)", told)]
+    assert {*named} <= {*COMMANDS}
+    assert not {word for words in MEANT for word in words} & {*COMMANDS}

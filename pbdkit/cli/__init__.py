@@ -93,6 +93,23 @@ MORE = """\
 `pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
 
 
+MEANT = {
+    ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
+    ("show", "view", "draw", "picture", "image"): "`pbdkit plot` draws a result or a set-up",
+    ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
+    ("continue", "restart"): "`pbdkit resume` goes on with a run",
+    ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
+    ("new", "create", "template"): "`pbdkit init` writes an experiment, `pbdkit plugins new` a plugin",
+    ("convert", "vtk", "paraview"): "`pbdkit export` writes VTKHDF for ParaView",
+    ("info", "progress"): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
+    ("simulate", "solve", "start"): "`pbdkit run` runs an experiment",
+    ("test",): "`pbdkit plugins check` tests a plugin",
+    ("gui", "play", "interactive"): "`pbdkit live` shows a body that follows the mouse",
+    ("version",): "`pbdkit --version` prints it",
+}
+"""What is meant by words that are no commands."""
+
+
 class Commands(click.Group):
     """A group whose commands are imported when first needed."""
 
@@ -109,7 +126,8 @@ class Commands(click.Group):
             from pbdkit.experiment.shipped import shipped_names
 
             run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
-            near = run or did_you_mean(name, COMMANDS) or "; `pbdkit` alone lists them"
+            meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")
+            near = run or meant or did_you_mean(name, COMMANDS) or "; `pbdkit` alone lists them"
             ctx.fail(f"there is no command '{name}'{near}")
         command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
         return with_no_plugins(command)
