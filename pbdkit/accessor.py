@@ -18,6 +18,7 @@ from pbdkit.results.carried import experiment_of
 from pbdkit.results.members import member
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.physical import in_physical_units
+from pbdkit.results.saving import save
 from pbdkit.results.sites import indices_of, rows_at
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class PbdAccessor:
     history = _method(history)
     curve = _method(curve)
     crack = _method(crack)
+    save = _method(save)
 
     def experiment(self, components: Iterable[type[Component]] = ()) -> Experiment:
         """Return the experiment that the dataset carries, which `pbdkit.rerun` runs again.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning
+from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, warn_caller
 from pbdkit.experiment.beside import OF_PROGRAM
 from pbdkit.experiment.loading import load_experiment
 from pbdkit.experiment.model import Experiment
@@ -20,10 +20,10 @@ from pbdkit.registry.registry import GIVEN, Registry
 from pbdkit.results.carried import carried
 from pbdkit.results.carried import experiment_of as experiment_of
 from pbdkit.results.progress import Watch, progress_bar
-from pbdkit.results.sink import MemorySink
-from pbdkit.runs.course import FAILED, Run, record
+from pbdkit.results.sink import MemorySink, Sink
+from pbdkit.runs.course import FAILED, Report, Run, record
 from pbdkit.runs.tuning import tuned
-from pbdkit.scene.scene import build_scene
+from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
     import xarray
@@ -76,6 +76,8 @@ def run(
     *,
     components: Components = (),
     settings: Settings = (),
+    output: str | Path | None = None,
+    force: bool = False,
     progress: bool = True,
 ) -> xarray.Dataset:
     """Run an experiment and return its dataset.
@@ -86,13 +88,21 @@ def run(
         An experiment, a dict of its parts, a file or the name of a shipped one.
     components, settings
         As in `load`.
+    output : str or path, optional
+        A file to write as `pbdkit run` does: sealed, and kept while it runs, so that
+        `pbdkit.resume` goes on with it where it is interrupted. The dataset is then that of the
+        file, whose values are read when they are used. By default nothing is written.
+    force : bool
+        Replace an existing file.
     progress : bool
         Show how far the run is.
 
     Raises
     ------
     ExperimentError, PluginError
-        Where the experiment is wrong, or a plugin is missing or broken.
+        Where the experiment is wrong, a plugin is missing or broken, or the output exists.
+    StorageError
+        Where the output cannot be written.
     DivergedError
         With what was recorded before, where the run leaves the finite numbers, has no equilibrium,
         or comes apart on the way to one (status "separated").
@@ -103,17 +113,41 @@ def run(
         As `pbdkit run` does, of what is doubtful in the scene or can diverge, and of a last state
         that is inside out.
     """
-    return _run(as_experiment(experiment, components, settings), progress)
+    found = as_experiment(experiment, components, settings)
+    return _run(found, progress, None if output is None else Path(output), force)
 
 
-def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
-    sink, scene = MemorySink(), build_scene(experiment)
+def _run(
+    experiment: Experiment, progress: bool, output: Path | None = None, force: bool = False
+) -> xarray.Dataset:
+    if output is not None:
+        return _run_into(output, experiment, progress, force)
+    memory, scene = MemorySink(), build_scene(experiment)
     refuse_too_much_output(scene)
+    report = _recorded(scene, lambda run: memory, progress)
+    return _finished(report, memory.dataset())
+
+
+def _run_into(output: Path, experiment: Experiment, progress: bool, force: bool) -> xarray.Dataset:
+    from pbdkit.results.netcdf_sink import NetcdfSink
+    from pbdkit.results.result_file import open
+    from pbdkit.results.saving import refuse_taken
+
+    refuse_taken(output, force=force)
+    scene = build_scene(experiment)
+    file = NetcdfSink(output, force, experiment.record.compression)
+    report = _recorded(scene, lambda run: run.sink(file), progress)
+    return _finished(report, open(file.written))
+
+
+def _recorded(scene: Scene, sink_of: Callable[[Run], Sink], progress: bool) -> Report:
     with progress_bar(progress) as show:
         run = Run(scene, watch=Watch(show=show))
         _warn(run.warnings)
-        report = record(run, sink)
-    dataset = sink.dataset()
+        return record(run, sink_of(run))
+
+
+def _finished(report: Report, dataset: xarray.Dataset) -> xarray.Dataset:
     if report.outcome.status in FAILED:
         raise DivergedError(report.outcome.stop_reason, dataset)
     _warn(report.warnings)
@@ -121,9 +155,8 @@ def _run(experiment: Experiment, progress: bool) -> xarray.Dataset:
 
 
 def _warn(texts: Iterable[str]) -> None:
-    """As coming from whoever called `run` or `rerun`."""
     for text in texts:
-        warnings.warn(text, PbdkitWarning, stacklevel=4)
+        warn_caller(text)
 
 
 def analyse(experiment: Given, *, components: Components = (), settings: Settings = ()) -> Analysis:

@@ -160,3 +160,34 @@ def test_the_beginning_of_names_suggests_all_of_them(ds):
                  heat_out=ds.time).pbd.curve):  # fmt: skip
         with pytest.raises(pbdkit.ExperimentError, match="mean 'heat_in' or 'heat_out'"):
             draw("heat")
+
+
+def test_a_run_into_a_file_is_what_the_command_writes(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ds = pbdkit.run("paper/a", settings=SMALL, output="a.nc", progress=False)
+    assert call("run", "paper/a", "--set", SMALL[0], "--set", SMALL[1], "-o", "b.nc").code == 0
+    assert ds.drop_attrs(deep=False).identical(pbdkit.open("b.nc").drop_attrs(deep=False))
+    assert call("verify", "a.nc").code == 0
+    with pytest.raises(pbdkit.ExperimentError, match=r"^a.nc: exists; force=True replaces it"):
+        pbdkit.run("paper/a", output="a.nc", progress=False)
+    other = pbdkit.run("paper/a", settings={"steps": 2}, output="a.nc", force=True, progress=False)
+    assert other.time.values[-1] == pbdkit.open("a.nc").time.values[-1] == 2
+    longer = pbdkit.resume("a.nc", steps=4, progress=False)
+    assert longer.time.values[-1] == 4
+
+
+def test_a_dataset_is_saved_as_a_sealed_result(ds, call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    some = ds.isel(time=[0, -1])
+    path = some.pbd.save("some.nc")
+    assert call("verify", "some.nc").code == 0
+    assert pbdkit.open(path).identical(some)
+    with pytest.raises(pbdkit.ExperimentError, match=r"^some.nc: exists; force=True repl"):
+        some.pbd.save("some.nc")
+    pbdkit.open(path).isel(time=[0]).pbd.save("some.nc", force=True)
+    assert pbdkit.open(path).sizes["time"] == 1
+    with pytest.raises(pbdkit.ExperimentError, match=r"'axis', which .* by `to_netcdf`"):
+        ds[["pe1"]].pbd.save("part.nc")
+    with pytest.raises(pbdkit.StorageError):
+        ds.pbd.save(tmp_path / "nowhere" / "a.nc")
+    assert [p.name for p in tmp_path.glob("*.nc")] == ["some.nc"]

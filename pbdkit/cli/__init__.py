@@ -99,9 +99,16 @@ MEANT = {
     ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
     ("continue", "restart"): "`pbdkit resume` goes on with a run",
     ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
-    ("new", "create", "template"): "`pbdkit init` writes an experiment, `pbdkit plugins new` a plugin",
+    (
+        "new",
+        "create",
+        "template",
+    ): "`pbdkit init` writes an experiment, `pbdkit plugins new` a plugin",
     ("convert", "vtk", "paraview"): "`pbdkit export` writes VTKHDF for ParaView",
-    ("info", "progress"): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
+    (
+        "info",
+        "progress",
+    ): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
     ("simulate", "solve", "start"): "`pbdkit run` runs an experiment",
     ("test",): "`pbdkit plugins check` tests a plugin",
     ("gui", "play", "interactive"): "`pbdkit live` shows a body that follows the mouse",

@@ -230,7 +230,8 @@ def refuse_too_much_output(scene: Scene) -> None:
         raise scene.experiment.located(
             ExperimentError(
                 f"the records take {sizes.output / 2**30:.3g} GiB, more than this machine's "
-                "memory: record fewer steps, or let `pbdkit run` stream them into a file",
+                "memory: record fewer steps, or stream them into a file with `pbdkit run`, or in "
+                "Python with run(..., output='run.nc')",
                 ("record",),
             )
         )

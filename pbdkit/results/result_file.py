@@ -53,7 +53,7 @@ def open(path: str | Path) -> xarray.Dataset:
                 content.check()
         reason = getattr(error, "strerror", None) or error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
-    if fault := _fault(dataset):
+    if fault := fault_of(dataset):
         dataset.close()
         raise StorageError(f"{file}: {fault}")
     return dataset
@@ -145,7 +145,7 @@ def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) ->
         raise ExperimentError(f"{path}: --at {error}") from None
 
 
-def _fault(dataset: xarray.Dataset) -> str | None:
+def fault_of(dataset: xarray.Dataset) -> str | None:
     """Why this pbdkit cannot read it, if it cannot."""
     version = dataset.attrs.get("schema_version")
     if version is None:

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 from pbdkit.errors import ExperimentError
 from pbdkit.registry.registry import GIVEN
 from pbdkit.results.layout import CONVENTIONS, SCHEMA_VERSION
-from pbdkit.storage.destination import written
-from pbdkit.storage.paged_file import PagedFile
+from pbdkit.results.saving import write_dataset
 from pbdkit.sweeps.crew import Crew
 from pbdkit.sweeps.grid import Dimension
 from pbdkit.sweeps.joining import joined
@@ -24,7 +23,7 @@ from pbdkit.sweeps.store import Store
 from pbdkit.sweeps.worker import INTERRUPTED, KEPT, Report
 
 if TYPE_CHECKING:
-    import xarray
+    pass
 
 RESULT = "sweep.nc"
 Show = Callable[[str, float], None]
@@ -87,7 +86,7 @@ def carry_out(
             return Summary(members, ends, run, faults, None)
         dataset = joined(grid, members, lambda key: passing.get(key) or store.report(key))
         dataset.attrs = _attributes(asked, versions)
-        _write(dataset, folder / RESULT)
+        write_dataset(dataset, folder / RESULT, replace=True)
     return Summary(members, ends, run, faults, folder / RESULT)
 
 
@@ -141,17 +140,3 @@ def _attributes(asked: Asked, versions: dict[str, str]) -> dict[str, str]:
         "plugins": json.dumps({k: v for k, v in versions.items() if k != GIVEN}),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-
-
-def _write(dataset: xarray.Dataset, path: Path) -> None:
-    """Whole and sealed, or not at all; what was there before is replaced. Raises WriteError."""
-    import h5netcdf
-    import h5py
-    from xarray.backends import H5NetCDFStore
-
-    with (
-        written(path, PagedFile, replace=True) as file,
-        h5py.File(file, "w", track_order=True) as content,
-        h5netcdf.File(content, "w") as made,
-    ):
-        dataset.dump_to_store(H5NetCDFStore(made, autoclose=False))
