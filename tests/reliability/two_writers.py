@@ -35,8 +35,7 @@ from trials import (
     write_experiment,
 )
 
-from pbdkit.results import destination
-from pbdkit.storage import unfinished
+from pbdkit.storage import destination, unfinished
 from pbdkit.storage.run_files import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
