@@ -166,6 +166,21 @@ def test_packed_fields_are_unpacked_or_refused_with_the_name_of_the_file(
     assert str(caught.value).startswith("f.nc: 'E': ")
 
 
+def test_checksums_in_a_field_file_show_a_changed_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_field(Path("plain.nc"))
+    with xarray.open_dataset("plain.nc", engine="h5netcdf") as field:
+        field.to_netcdf("f.nc", encoding={"E": {"fletcher32": True}})
+    sound = read_field(FIELD, OF_PROGRAM)
+    content = bytearray(Path("f.nc").read_bytes())
+    content[content.index(sound.values.tobytes()) + 12] ^= 1
+    Path("f.nc").write_bytes(content)
+    with pytest.raises(ValueError, match=r"f\.nc: cannot be read as netCDF-4: "):
+        read_field(FIELD, OF_PROGRAM)
+
+
 def test_a_field_file_in_the_classic_format_is_told_how_to_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,6 +279,13 @@ def test_fields_sweeps_and_fits_need_the_same_word(
         allowed = call(command, file, "--allow-outside")
         assert "--allow-outside" not in allowed.err
         assert (command, allowed.code) in {("check", 0), ("sweep", 0), ("fit", 2)}
+
+
+@pytest.mark.parametrize(
+    "command", ["run", "check", "plot", "identify", "live", "bench", "sweep", "fit"]
+)
+def test_every_command_that_reads_an_experiment_takes_the_word(call: Any, command: str) -> None:
+    assert "--allow-outside" in call(command, "--help").out
 
 
 def test_an_experiment_with_units_keeps_the_folder_of_its_files(

@@ -14,6 +14,7 @@ from pbdkit.cli.options import (
     PATH,
     at_option,
     color_option,
+    outside_option,
     result_argument,
     set_option,
     times_option,
@@ -73,6 +74,7 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @times_option
 @at_option
 @set_option
+@outside_option
 @look_options
 @click.option("--numbers", is_flag=True, help="Write the particles' numbers where there is room.")
 @click.option("--dpi", type=int, default=200, show_default=True, help="Pixels an inch.")
