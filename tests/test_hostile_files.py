@@ -135,6 +135,9 @@ def test_what_results_declare_is_within_the_bounds(call: Any) -> None:
     with h5py.File("sparse.nc", "w") as file:
         file.create_dataset("position", data=np.random.default_rng(0).random(2**18))
         file.create_dataset("at_end", (2**21,), "f8")
+        file.attrs["nothing"] = h5py.Empty(h5py.string_dtype())
+        file["nothing"] = h5py.Empty("f8")
+        file["a type"] = np.dtype("f8")
         only = file.create_dataset("n", (2**40,), "f4", chunks=(2**10,))
         only.make_scale("This is a netCDF dimension but not a netCDF variable.         5")
     with h5py.File("sparse.nc") as file:

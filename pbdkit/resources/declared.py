@@ -82,7 +82,7 @@ def _text(name: bytes) -> str:
 def _check_attribute(attribute: Any, size: int) -> None:
     """Elements of variable length may all be the same large one."""
     if _is_ragged(attribute.get_type()):
-        count = math.prod(attribute.shape)
+        count = math.prod(attribute.shape or ())
         if count > max(64, LARGEST_TEXTS // size):
             raise StorageError(f"its attribute '{_text(attribute.name)}' has {count} parts")
 
@@ -109,7 +109,7 @@ def _check_dataset(dataset: Any, name: str, size: int) -> None:
             )
     if _is_dimension_only(dataset):
         return
-    shape, stored = dataset.shape, dataset.get_storage_size()
+    shape, stored = dataset.shape or (), dataset.get_storage_size()
     declared = math.prod(shape) * kind.get_size()
     if declared > max(DENSEST * stored, SPARSEST * size) + EMPTY:
         raise StorageError(f"it cannot hold the {declared:.3g} bytes that '{name}' declares")
