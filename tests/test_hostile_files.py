@@ -68,6 +68,10 @@ def virtual(file: h5py.File) -> None:
     file.create_virtual_dataset("more", layout)
 
 
+def circle(file: h5py.File) -> None:
+    file.create_group("more")["again"] = file["/"]
+
+
 def lzf(file: h5py.File) -> None:
     file.create_dataset("more", data=np.ones(6), compression="lzf")
 
@@ -89,6 +93,7 @@ HARMFUL = [
     (external, "the values of its variable 'more' lie in other files; copy the data into one"),
     (link, "its link 'more' leads elsewhere; copy the data into one netCDF-4 file"),
     (virtual, "the values of its variable 'more' lie in other files"),
+    (circle, "its group '.' lies in several groups; copy the data into one netCDF-4 file"),
     (lzf, "its variable 'more' is stored by the filter 32000 (lzf); pbdkit applies deflate, "),
     (large_chunk, "it cannot hold the chunks of 2.15e+09 bytes of 'more'"),
     (one_text_for_many, "its attribute 'more' has 50000 parts"),

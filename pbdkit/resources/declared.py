@@ -38,10 +38,10 @@ def check_declared(content: h5py.File, size: int) -> None:
     """Check what an open file of `size` bytes declares, and that all of it is in the file.
 
     Raises StorageError, without the name of the file, for links that lead elsewhere, external
-    storage, virtual datasets, filters other than `FILTERS`, and for variables, attributes and texts
+    storage, virtual datasets, groups in a circle, filters other than `FILTERS`, and for variables, attributes and texts
     larger than a file of that size can hold.
     """
-    from h5py import h5a, h5d, h5l, h5o
+    from h5py import h5a, h5d, h5g, h5l, h5o
 
     links: list[tuple[bytes, bool]] = []
     objects = [b"."]
@@ -68,6 +68,8 @@ def check_declared(content: h5py.File, size: int) -> None:
             raise StorageError(f"'{_text(name)}' has {count} attributes")
         for n in range(count):
             _check_attribute(h5a.open(found, index=n), size)
+        if isinstance(found, h5g.GroupID) and h5o.get_info(found).rc > 1:
+            raise StorageError(f"its group '{_text(name)}' lies in several groups; {_REMEDY}")
         if isinstance(found, h5d.DatasetID):
             _check_dataset(found, _text(name), size)
 
