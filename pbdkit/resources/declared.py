@@ -38,8 +38,8 @@ def check_declared(content: h5py.File, size: int) -> None:
     """Check what an open file of `size` bytes declares, and that all of it is in the file.
 
     Raises StorageError, without the name of the file, for links that lead elsewhere, external
-    storage, virtual datasets, groups in a circle, filters other than `FILTERS`, and for variables, attributes and texts
-    larger than a file of that size can hold.
+    storage, virtual datasets, groups in a circle, filters other than `FILTERS`, and for variables,
+    attributes and texts larger than a file of that size can hold.
     """
     from h5py import h5a, h5d, h5g, h5l, h5o
 
