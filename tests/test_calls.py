@@ -127,6 +127,7 @@ MISTAKES = {
     "variable not recorded": (
         lambda ds: ds.pbd.plot("stress_xx"), "'stress_xx' was not recorded", "{type: stress,",
     ),
+    "family not recorded": (lambda ds: ds.pbd.plot("stress"), "'stress' was not", "{type: stress,"),
     "curve not recorded": (lambda ds: ds.pbd.curve("contact"), "add {type: contact"),
     "component not recorded": (lambda ds: ds.pbd.plot("u_x"), "add {type: displacement}"),
     "time first": (lambda ds: ds.pbd.plot(4, "pe1"), "color: expected the name", "as time=400"),

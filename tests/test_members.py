@@ -116,6 +116,8 @@ def test_commands_choose_a_member(swept, call, tmp_path, monkeypatch):
     choice = ["--at", "steel=0.2", "--at", "poisson_ratio=0.3", "--at", "span=7"]
     assert call("plot", "s.nc", "--color", "u_x", "--dpi", "50", *choice).code == 0
     assert call("curve", "s.nc", "--y", "u_x", *choice[:2]).code == 0
+    without = call("export", "s.nc", *choice)
+    assert (without.code, "keep the variable `position`" in without.err) == (2, True)
     wrong = call("explain", "s.nc", "--at", "steel=4")
     assert (wrong.code, "--at steel=4: no member has this value" in wrong.err) == (2, True)
     assert "expected NAME=VALUE" in call("plot", "s.nc", "--at", "steel").err

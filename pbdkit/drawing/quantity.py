@@ -133,7 +133,10 @@ def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
     an experiment names them; none where it was recorded, or no diagnostic makes it."""
     vector, _, axis = name.rpartition("_")
     names = {name, vector} if axis in axes_of(dataset) else {name}
-    return [] if names & {*dataset.variables} else makers_of(names)
+    recorded = [*map(str, dataset.variables)]
+    if names & {*recorded} or any(other.startswith(f"{name}_") for other in recorded):
+        return []
+    return makers_of(names)
 
 
 def _is_drawable(variable: xarray.Variable) -> bool:

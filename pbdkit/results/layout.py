@@ -214,11 +214,13 @@ def dataset_schema(registry: Registry, *, installed: bool = True) -> dict[str, A
 
 
 def makers_of(names: set[str]) -> list[str]:
-    """The built-in diagnostics that make a variable of one of these names, as an experiment names
-    them."""
+    """Return the built-in diagnostics that make a variable of one of these names, or whose name
+    begins with one and `_`, as an experiment names them."""
+    begins = tuple(f"{name}_" for name in names if name)
     found = []
     for each, types in Registry().spellings(Diagnostic, installed=False).items():
-        if names & {column.name for column in _columns_of(each)}:
+        made = [column.name for column in _columns_of(each)]
+        if any(name in names or name.startswith(begins) for name in made):
             fields = each.model_fields.items()  # the modulus may come from `units`
             needed = [n for n, part in fields if part.is_required() or n == "youngs_modulus"]
             found.append(f"{{{', '.join([f'type: {types[0]}', *(f'{n}: ...' for n in needed)])}}}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.errors import ExperimentError
 from pbdkit.results.grid import Grid, grid_of
 from pbdkit.results.layout import broken_by
 from pbdkit.storage.destination import written
@@ -42,10 +43,13 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
     """Writes every recorded step: the particles, the bonds, and of a `scene` the cells between
     them, with all that the dataset knows of them. At most some steps are in memory.
 
-    Raises WriteError where it cannot be written; then nothing stands there, or the earlier file.
+    Raises ExperimentError where there are no positions, as in a sweep that kept none, and
+    WriteError where it cannot be written; then nothing stands there, or the earlier file.
     """
     import h5py
 
+    if "position" not in dataset.variables:
+        raise ExperimentError("there are no positions to write: keep the variable `position`")
     grid = grid_of(dataset, scene)
     with written(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
         _write(file, dataset, grid)
