@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import pbdkit
 from pbdkit.experiment.shipped import shipped_names
+from pbdkit.prediction.forecast import outlook, refuse_unheld_loads
 from pbdkit.scene.doubts import round_in_radians
 from pbdkit.scene.scene import build_scene
 
@@ -39,10 +42,10 @@ def test_a_point_far_from_the_body_is_named_with_group_particle_and_distance() -
         "45, at (4, 2)"
     ]
     load = {"select": {"nearest": [[-3.0, 0.0]]}, "force": [1.0, 0.0]}
-    assert warnings_of(loads=[load]) == [
+    assert warnings_of(loads=[load])[0] == (
         "loads.0.select.nearest: (-3, 0) lies 3 away from the body; the particle nearest to it is "
         "1, at (0, 0)"
-    ]
+    )
 
 
 @pytest.mark.parametrize(("spacings", "warned"), [(0.0, 0), (1.0, 0), (1.9, 0), (2.1, 1), (9.0, 1)])
@@ -163,3 +166,140 @@ def test_cells_of_cloth_along_the_diagonals_lock_and_the_cure_is_named() -> None
 )
 def test_other_materials_are_not_said_to_lock(rule: dict[str, Any]) -> None:
     assert not [text for text in warnings_of(rule=rule) if "lock" in text]
+
+
+def bar(**more: Any) -> dict[str, Any]:
+    """A bar that is held on its left, and loaded on its right."""
+    return {
+        "name": "bar",
+        "lattice": {"type": "square", "a": 1.0},
+        "body": {"type": "rectangle", "width": 10.0, "height": 4.0, "origin": [2.0, 1.0]},
+        "neighbours": {"type": "chebyshev"},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "leaders": [{"select": {"edge": "left"}, "motion": HOLD}],
+        "loads": [{"select": {"edge": "right"}, "force": [1e-3, 1e-3]}],
+        "steps": 30,
+    } | more
+
+
+def doubted(**more: Any) -> list[str]:
+    return [*build_scene(pbdkit.Experiment(**bar(**more))).warnings]
+
+
+def test_a_crack_that_crosses_nothing_is_warned_of() -> None:
+    crack = {"type": "strain", "failure": 0.02, "cracks": [[[6.5, 0.0], [6.5, 2.5]]]}
+    assert doubted(fracture=crack) == []
+    crack["cracks"] = [[[6.5, 0.0], [6.5, 2.5]], [[60.5, 0.0], [60.5, 2.5]]]
+    (warning,) = doubted(fracture=crack)
+    assert warning.startswith("fracture.cracks.1: it crosses no bond of the body")
+
+
+IN_PERCENT = [
+    (
+        {"type": "strain", "failure": 2.0},
+        ["fracture.failure: 2 is a strain of 200 %; 2 % is written 0.02"],
+    ),
+    ({"type": "strain", "failure": 0.99}, []),
+    (
+        {"type": "damage", "onset": 1.0, "failure": 2.5},
+        ["fracture.onset: 1 is", "fracture.failure: 2.5 is"],
+    ),
+    ({"type": "damage", "onset": 0.01, "failure": 0.1}, []),
+]
+
+
+@pytest.mark.parametrize(("fracture", "fields"), IN_PERCENT)
+def test_strains_in_per_cent_are_warned_of(fracture: dict[str, Any], fields: list[str]) -> None:
+    found = doubted(fracture=fracture)
+    assert len(found) == len(fields)
+    assert all(w.startswith(field) for w, field in zip(found, fields, strict=True))
+
+
+def test_a_load_on_leaders_alone_is_warned_of() -> None:
+    told = "loads.0: acts on leaders alone, which carry it, so that it moves nothing"
+    on_the_left = [{"select": {"edge": "left"}, "force": [1e-3, 0.0]}]
+    assert doubted(loads=on_the_left) == [told]
+    rollers = [{"select": {"edge": "left"}, "motion": HOLD, "axes": ["x"]}]
+    assert doubted(loads=on_the_left, leaders=rollers) == [told]
+    upwards = [{"select": {"edge": "left"}, "force": [1e-3, 1e-3]}]
+    assert doubted(loads=upwards, leaders=rollers) == []
+    for_a_time = [{"select": {"edge": "left"}, "motion": HOLD, "until": 10}]
+    assert doubted(loads=on_the_left, leaders=for_a_time) == []
+    assert doubted(loads=[{"select": {"edge": "bottom"}, "force": [1e-3, 0.0]}]) == []
+
+
+PLACES = [(60.0, 0.0, True), (60.0, -2.0, False), (14.0, 0.0, False)]
+
+
+@pytest.mark.parametrize(("x", "velocity", "far"), PLACES)
+def test_an_obstacle_that_never_comes_near_is_warned_of(
+    x: float, velocity: float, far: bool
+) -> None:
+    motion = {"type": "velocity", "velocity": [velocity, 0.0], "steps": 20}
+    obstacle = {"shape": {"type": "disc", "radius": 1.0, "centre": [x, 3.0]}, "motion": motion}
+    found = doubted(obstacles=[obstacle], loads=[])
+    assert [w.split(":")[0] for w in found] == ["obstacles.0"] * far
+
+
+def supports(*given: tuple[dict[str, Any], list[str] | None]) -> list[dict[str, Any]]:
+    return [{"select": s, "motion": HOLD} | ({"axes": a} if a else {}) for s, a in given]
+
+
+LEFT, CORNER = {"edge": "left"}, {"nearest": [[2.0, 1.0]]}
+HELD = {
+    "clamped": (supports((LEFT, None)), [1e-3, 1e-3], True),
+    "rollers and a corner": (supports((LEFT, ["x"]), (CORNER, ["y"])), [1e-3, 1e-3], True),
+    "rollers, pulled along them": (supports((LEFT, ["x"])), [1e-3, 1e-3], False),
+    "rollers, pulled across": (supports((LEFT, ["x"])), [1e-3, 0.0], True),
+    "a hinge": (supports((CORNER, None)), [0.0, 1e-3], False),
+    "a hinge, with a second roller": (
+        supports((CORNER, None), ({"nearest": [[12.0, 1.0]]}, ["y"])), [1e-3, 1e-3], True,
+    ),
+    "free": ([], [1e-3, 0.0], False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("leaders", "force", "is_held"), HELD.values(), ids=HELD)
+def test_check_refuses_what_has_no_equilibrium_as_run_does(
+    call: Any, leaders: Any, force: list[float], is_held: bool
+) -> None:
+    loads = [{"select": {"edge": "right"}, "force": force}]
+    given = bar(leaders=leaders, loads=loads, steps=1, solver={"type": "equilibrium"})
+    Path("bar.json").write_text(json.dumps(given))
+    checked, run = call("check", "bar.json"), call("run", "bar.json")
+    assert (checked.code, run.code) == (0, 0) if is_held else (2, 2)
+    if not is_held:
+        assert "nothing holds a part of 5" in checked.err
+        assert checked.err == run.err
+    steps = call("check", "bar.json", "--set", "solver={type: stepping}", "--set", "steps=90000")
+    assert ("loads: nothing holds a part of" in steps.out) == (not is_held)
+
+
+def test_of_two_bodies_the_one_that_is_not_held_is_named() -> None:
+    apart = [{"type": "rectangle", "width": 4.0, "height": 4.0},
+             {"type": "rectangle", "width": 4.0, "height": 4.0, "origin": [10.0, 0.0]}]  # fmt: skip
+    given = bar(body={"type": "union", "of": apart}, solver={"type": "equilibrium"})
+    with pytest.raises(pbdkit.ExperimentError, match=r"25 particles \(with number 26\)"):
+        refuse_unheld_loads(build_scene(pbdkit.Experiment(**given)))
+
+
+def test_run_warns_of_leaders_that_are_too_fast_as_check_does(call: Any) -> None:
+    fast = {"type": "velocity", "velocity": [0.3, 0.0], "steps": 10}
+    leaders = [*bar()["leaders"], {"select": {"edge": "right"}, "motion": fast}]
+    Path("bar.json").write_text(json.dumps(bar(leaders=leaders, loads=[])))
+    told = "leaders: in steps 1 to 10 the fastest moves by 0.3 a step and leaves the body"
+    lines = [line for line in call("check", "bar.json").out.splitlines() if "warning" in line]
+    run = call("run", "bar.json")
+    assert run.err.splitlines() == lines
+    assert told in run.err
+    assert call("run", "bar.json", "--force", "--quiet").err == ""
+
+
+def test_large_bodies_are_run_without_a_look_at_their_spectrum(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = build_scene(pbdkit.load("paper/a"))
+    assert outlook(scene)
+    monkeypatch.setattr("pbdkit.prediction.forecast.LOOKED_AT", 100)
+    assert outlook(scene) == []

@@ -42,7 +42,7 @@ def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bo
     with warnings.catch_warnings(record=True) as of_loading:
         warnings.simplefilter("always", PbdkitWarning)
         loaded = load_experiment(experiment, settings)
-    from pbdkit.prediction.forecast import forecast
+    from pbdkit.prediction.forecast import forecast, refuse_unheld_loads
     from pbdkit.runs.course import rehearse
     from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
@@ -50,6 +50,7 @@ def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bo
     with waiting(f"checking {loaded.name}", silent=as_json):
         scene = tuned(build_scene(loaded))
         rehearse(scene)
+        refuse_unheld_loads(scene)
         found = forecast(scene)
     found = replace(found, warnings=[*(str(w.message) for w in of_loading), *found.warnings])
     if as_json:

@@ -81,7 +81,7 @@ def run(
             with _watched(path, quiet or as_json, file) as (stop, watch):
                 one = those.run(scene, watch)
                 del scene  # of which each of several processes goes on with its part alone
-                _warn(one.warnings, quiet)
+                _warn([*one.warnings, *([] if quiet else one.outlook())], quiet)
                 report = record(one, one.sink(file))
             if those.first:
                 _tell(one, report, file, path, quiet, as_json)

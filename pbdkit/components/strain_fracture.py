@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -25,6 +26,8 @@ from pbdkit.interfaces.values import Drawn
 
 StrainLimit = Annotated[float, Field(gt=0.0, le=1e75)]
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
+PERCENT = 1.0
+"""Strains from which on it is likely that per cent are meant."""
 SCATTER = "s: strengths are drawn from 1 ± s, uniformly, by the seed."
 
 
@@ -34,6 +37,16 @@ def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strai
         return {}
     factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))
     return {name: strain * factors for name, strain in strains.items()}
+
+
+def _in_percent(**strains: float) -> list[str]:
+    """A warning for each strain, by its field, that is so large that it may be in per cent."""
+    return [
+        f"fracture.{name}: {strain:g} is a strain of {100 * strain:g} %; {strain:g} % is written "
+        f"{strain / 100:g}"
+        for name, strain in strains.items()
+        if strain >= PERCENT
+    ]
 
 
 class StrainFracture(Draws, BreaksAtStrain, Parting):
@@ -65,6 +78,10 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
         return _drawn(owners, self.scatter, generator, failure_strain=self.failure)
+
+    def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
+        """A warning where the strain may be in per cent."""
+        return _in_percent(failure=self.failure)
 
     @staticmethod
     def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
@@ -119,6 +136,10 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     def draw(self, owners: Bonds, generator: np.random.Generator) -> Drawn:
         """One number a bond."""
         return _drawn(owners, self.scatter, generator, **self._strains())
+
+    def check(self, shells: Sequence[Sequence[float]]) -> list[str]:
+        """A warning where strains may be in per cent."""
+        return _in_percent(onset=self.onset, failure=self.failure)
 
     def _strains(self) -> dict[str, float]:
         return {"onset_strain": self.onset, "failure_strain": self.failure}

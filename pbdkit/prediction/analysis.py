@@ -213,6 +213,10 @@ class Analysis:
         return sorted(parts)
 
     def warnings(self) -> list[str]:
+        """What stands in the way of settling, with the remedy, and what is left out."""
+        return [*self.obstructions(), *self.left_out]
+
+    def obstructions(self) -> list[str]:
         """What stands in the way of settling, with the remedy."""
         anchored = self.scene.frame is not None and isinstance(self.scene.experiment.frame, Anchors)
         parts = [] if anchored or self.scene.barriers else self.parts_without_leader
@@ -220,24 +224,27 @@ class Analysis:
         found = [said.format(len(part), part[0]) for part in parts]
         if len(parts) > 3:
             found = [f"leaders: none reaches {len(parts)} parts of the body; nothing holds them"]
-        if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
-            pass  # it makes no steps, and steps with that relaxation would lead there too
-        elif self.stable is False:
-            bound = self.largest_stable_relaxation
-            remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
-            found.append(
-                f"solver.relaxation: {self.scene.experiment.stepping.relaxation:g} diverges, the "
-                f"spectral radius is {self.spectral_radius:.6g}{remedy}"
-            )
-        elif self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
-            found.append(
-                "solver.relaxation: a mode that changes its sign in every step never decays; take "
-                "a relaxation below 1"
-            )
-        found += self._edges_near_the_bound()
         bond = min(min(lengths) for lengths in self.scene.neighbourhood.shells())
         late = self.trailing.late(bond, self.scene.experiment.units) if self.trailing else []
-        return [*found, *late, *self.left_out]
+        return [*found, *self._growth(), *self._edges_near_the_bound(), *late]
+
+    def _growth(self) -> list[str]:
+        """A warning where modes grow, or never decay."""
+        if not self.scene.experiment.solver.makes_steps and self.largest_stable_relaxation:
+            return []  # steps with that relaxation would lead there too
+        if self.stable is False:
+            bound = self.largest_stable_relaxation
+            remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
+            return [
+                f"solver.relaxation: {self.scene.experiment.stepping.relaxation:g} diverges, the "
+                f"spectral radius is {self.spectral_radius:.6g}{remedy}"
+            ]
+        if self.spectrum and self.spectrum.smallest <= -1.0 + NEUTRAL:
+            return [
+                "solver.relaxation: a mode that changes its sign in every step never decays; take "
+                "a relaxation below 1"
+            ]
+        return []
 
     def _edges_near_the_bound(self) -> list[str]:
         """A warning where the bound is that of waves and free edges may have a lower one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from pbdkit.analysis.spectrum import NEUTRAL
 from pbdkit.analysis.stencil import NO_REMEDY, Bound, bounds_the_body, wave_bound
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.interfaces.units import LENGTH
 from pbdkit.prediction.masses import too_light
 from pbdkit.resources.memory import machine_memory
@@ -65,6 +66,8 @@ class Forecast:
         return asdict(self)
 
 
+LOOKED_AT = 2000
+"""Particles up to which a run looks at what `check` knows of it (at most 0.9 s of a processor)."""
 MOST_MOMENTS = 16
 """Of those at which numbers turn, to be looked at."""
 ANALYSED = (
@@ -103,6 +106,7 @@ def forecast(scene: Scene) -> Forecast:
         size_mm=_size_mm(scene),
         warnings=[
             *_doubts(scene),
+            *_unheld(scene),
             *WITHOUT[: len(scene.barriers)],
             *analysis.warnings(),
             *_on_the_way(scene),
@@ -221,6 +225,45 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
     remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
     grows = f"can diverge, some waves grow by {bound.radius:.4g} a step"
     return [f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"]
+
+
+def refuse_unheld_loads(scene: Scene) -> None:
+    """Raises ExperimentError, as the run would, where loads push a part of the body on for ever and
+    its equilibrium is asked for."""
+    if scene.experiment.solver.makes_steps or not scene.loads:
+        return
+    from pbdkit.equilibrium.matrix_system import DRIFTS
+    from pbdkit.prediction.holding import pushed_parts
+
+    for part in pushed_parts(scene):
+        named = f"{part.particles} particles (with number {part.first})"
+        error = ExperimentError(DRIFTS.format(named), ("leaders",))
+        raise scene.experiment.located(error)
+
+
+def _unheld(scene: Scene) -> list[str]:
+    """A warning for each part of the body that loads push on step by step."""
+    if not (scene.loads and scene.experiment.solver.makes_steps):
+        return []
+    from pbdkit.prediction.holding import pushed_parts
+
+    return [
+        f"loads: nothing holds a part of {part.particles} particles (with number {part.first}) "
+        "against them, so that it moves on in every step; let a leader hold it"
+        for part in pushed_parts(scene)
+    ]
+
+
+def outlook(scene: Scene) -> list[str]:
+    """What `check` warns of besides `quick_warnings` and is known in less than a second: whether
+    loads find supports, and of small bodies what stands in the way of settling."""
+    found = _unheld(scene)
+    if scene.raster.count > LOOKED_AT or not scene.experiment.solver.makes_steps:
+        return found
+    analysis = Analysis(scene)
+    with suppress(PbdkitError):  # where it is not known `check` says why
+        found += [*analysis.obstructions(), *_too_short(analysis)]
+    return found
 
 
 def refuse_too_much_output(scene: Scene) -> None:

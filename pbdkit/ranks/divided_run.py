@@ -52,6 +52,10 @@ class DividedRun(Run):
             whole = self.division.whole_of(scene)
             return quick_warnings(whole, bound) if whole else ()
 
+    def outlook(self) -> list[str]:
+        """Nothing: `check` looks at the whole."""
+        return []
+
     @property
     def particles(self) -> int:
         """Of the whole."""

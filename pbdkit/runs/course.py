@@ -15,7 +15,7 @@ from typing import Any
 from pbdkit.analysis.stencil import Bound, wave_bound
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.solvers import Equilibrium, Solver, Stepping
-from pbdkit.prediction.forecast import prediction, quick_warnings
+from pbdkit.prediction.forecast import outlook, prediction, quick_warnings
 from pbdkit.results.overlapping_sink import OverlappingSink
 from pbdkit.results.progress import Watch
 from pbdkit.results.recorder import Outcome, Recorder
@@ -104,6 +104,12 @@ class Run:
     def warnings(self) -> tuple[str, ...]:
         """What is to be said before the first step: of the scene, and of stability."""
         return quick_warnings(self.scene, self.waves)
+
+    def outlook(self) -> list[str]:
+        """What else `check` warns of, where the body is so small that it is known at once."""
+        wave_warns = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
+        found = outlook(self.scene)
+        return [w for w in found if not (wave_warns and w.startswith("solver.relaxation"))]
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.experiment.cuts import Cut
 from pbdkit.interfaces import Vector
 from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.frame import Indices
@@ -116,12 +115,14 @@ def _bonds_of_plane(
     return ends, shell, of_plane, within
 
 
-def missing_cuts(raster: Raster, neighbourhood: Neighbourhood, cuts: Sequence[Cut]) -> list[str]:
-    """A warning for each cut that crosses nothing."""
+def missing_segments(
+    raster: Raster, neighbourhood: Neighbourhood, segments: Mapping[str, Segment]
+) -> list[str]:
+    """A warning for each segment, by its field, that crosses nothing."""
     return [
-        f"cuts.{n}: it crosses no bond of the body; look where it goes from and to"
-        for n, cut in enumerate(cuts)
+        f"{field}: it crosses no bond of the body; look where it goes from and to"
+        for field, segment in segments.items()
         if not raster.others.any(
-            any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [cut.segment]))
+            any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [segment]))
         )
     ]

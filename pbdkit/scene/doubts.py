@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import compress, islice
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.motions import Rotation
+from pbdkit.experiment.motions import Oscillation, Rotation
+from pbdkit.experiment.newton import Newton
 from pbdkit.interfaces import Lattice, MixesCells
 from pbdkit.interfaces.rule import material_of
 from pbdkit.interfaces.varying import ByRegion
@@ -20,6 +23,11 @@ from pbdkit.scene.raster import FOLLOWER, Raster, cells_of_sites, positions
 from pbdkit.scene.selecting import Selecting
 from pbdkit.scene.setting import body_box
 from pbdkit.scene.sites import has_narrow_slot
+
+if TYPE_CHECKING:
+    from pbdkit.scene.leader_groups import Leading
+    from pbdkit.scene.loads import Loads
+    from pbdkit.scene.obstacles import Barrier
 
 MANY = 1000
 """Equilibria of one run beyond which it is likely that fewer are wanted."""
@@ -129,6 +137,55 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
             f"record: {experiment.record_count} equilibria are found and recorded; `every` or `at` "
             "names fewer steps"
         )
+
+
+def carried_by_leaders(
+    raster: Raster, leading: Sequence[Leading], loads: Loads | None, steps: int
+) -> Iterator[str]:
+    """A line for each load all of whose particles lead along it whenever it acts."""
+    for n, loading in enumerate(loads.each if loads else ()):
+        load = loading.load
+        along = np.flatnonzero(load.force_at(max(load.from_, 1))).tolist()
+        free = dict.fromkeys(along, np.ones(len(loading.rows), bool))
+        for group in leading:
+            if group.group.from_ <= load.from_ and group.group.last(steps) >= load.last(steps):
+                for axis in free.keys() & {*group.axes}:
+                    free[axis] = free[axis] & ~np.isin(loading.rows, group.rows)
+        if along and not raster.others.any(any(each.any() for each in free.values())):
+            yield f"loads.{n}: acts on leaders alone, which carry it, so that it moves nothing"
+
+
+def never_near(
+    raster: Raster, barriers: Sequence[Barrier], leading: Sequence[Leading], steps: int
+) -> Iterator[str]:
+    """A line for each obstacle that stays farther from the body than leaders could turn and move
+    it."""
+    driven: list[Leading | Barrier] = [*barriers, *leading]
+    if any(isinstance(one.group.motion, Newton | Rotation) for one in driven):
+        return
+    box = np.array(body_box(raster)) + raster.lattice.origin if barriers else np.zeros((2, 2))
+    ways = [np.abs(way).max(initial=0.0) for one in leading for way in _ways(one, steps)]
+    reach = 2.0 * max(ways, default=0.0) + float(np.hypot(*(box[1] - box[0])))
+    for n, barrier in enumerate(barriers):
+        moves = np.concatenate(_ways(barrier, steps))
+        low, high = barrier.start.box[:2], barrier.start.box[2:]
+        gaps = [low + moves.min(axis=0) - box[1], box[0] - high - moves.max(axis=0)]
+        if np.max(gaps) > reach:
+            yield (
+                f"obstacles.{n}: stays farther from the body than that is large, so that it "
+                "changes nothing"
+            )
+
+
+def _ways(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
+    """(particle or 1, axis) by which a motion is away from its start, at the moments between which
+    it changes as one formula."""
+    motion, last = driven.group.motion, driven.group.last(steps) - driven.group.from_ + 1
+    if isinstance(motion, Oscillation):
+        return [np.array([motion.amplitude]), -np.array([motion.amplitude])]
+    moments = [n for n in (*motion.knots(), last) if 1 <= n <= last]
+    offsets = [np.zeros((1, driven.reference.shape[1]))]
+    return [*offsets, *(np.atleast_2d(motion.offset(n, driven.reference)) for n in moments)]
 
 
 def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:

@@ -9,20 +9,30 @@ import numpy as np
 
 from pbdkit.errors import ExperimentError
 from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import AppliesTwice, Components, Remembers, Setting, TearsCells
+from pbdkit.interfaces import (
+    AppliesTwice,
+    Components,
+    Remembers,
+    Setting,
+    StartsCracked,
+    TearsCells,
+)
+from pbdkit.interfaces.fracture_model import Segment
 from pbdkit.interfaces.lattice import Index
 from pbdkit.registry.blame import blaming
-from pbdkit.scene.bonds import BondTable, build_bond_table, missing_cuts
+from pbdkit.scene.bonds import BondTable, build_bond_table, missing_segments
 from pbdkit.scene.cell_materials import weighed
 from pbdkit.scene.cells import Patch, WeighedCells, patches
 from pbdkit.scene.declarations import check_diagnostics
 from pbdkit.scene.directions import check_directions
 from pbdkit.scene.doubts import (
     angles_in_radians,
+    carried_by_leaders,
     doubts_of,
     far_from_the_body,
     locking,
     narrow_voids,
+    never_near,
     without_effect,
 )
 from pbdkit.scene.field_constants import with_fields
@@ -166,7 +176,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     warnings += [*without_effect(experiment, raster), *far_from_the_body(experiment, raster)]
     warnings += [*angles_in_radians(experiment), *locking(experiment, raster)]
     warnings += narrow_voids(experiment.lattice, ground.left_out)
-    warnings += missing_cuts(raster, neighbourhood, experiment.cuts)
+    warnings += missing_segments(raster, neighbourhood, _segments(experiment))
     setting = setting_of(raster, neighbourhood)
     constants = ask_for_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
@@ -183,10 +193,22 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
     barriers = build_obstacles(raster, experiment)
     warnings += collisions(raster, leading, barriers, experiment.steps)
+    warnings += carried_by_leaders(raster, leading, loads, experiment.steps)
+    if not loads:
+        warnings += never_near(raster, barriers, leading, experiment.steps)
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     lower, upper = body_box(raster)
     facts = loads, setting, (lower + upper) / 2
     return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers))
+
+
+def _segments(experiment: Experiment) -> dict[str, Segment]:
+    """The cuts, and the cracks that are there from the start, by their fields."""
+    found = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
+    if isinstance(model := experiment.fracture, StartsCracked):
+        with blaming(model, "when asked for its cracks", "fracture"):
+            found |= {f"fracture.cracks.{n}": s for n, s in enumerate(model.segments())}
+    return found
 
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:
