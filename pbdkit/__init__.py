@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         AREA as AREA,
         ENERGY as ENERGY,
         FORCE as FORCE,
+        FRACTURE_ENERGY as FRACTURE_ENERGY,
         LENGTH as LENGTH,
         STRESS as STRESS,
         Anchors as Anchors,
@@ -107,13 +108,14 @@ _HOME = {
     ),
     "pbdkit.experiment.model": "Experiment",
     "pbdkit.interfaces": (
-        "AREA ENERGY FORCE LENGTH STRESS Anchors AppliesTwice BasisSite Bonds BreaksAtStrain "
-        "Calibrated Cell CellStress Component Components Diagnostic Draws FollowerRule "
-        "FractureModel FrameMap FramePolicy FrameSites Here KnowsStiffness Lattice LeaderRows "
-        "LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair Particles "
-        "Quantity Remembered Remembers RenewsBonds RenewsParticles Setting SharesParticles Slot "
-        "Softens SoftensCells SpaceVector StartsCracked Stiffness StoresEnergy TearsCells Torn "
-        "TouchingRows TurnsParticles Variable Vector dot length squared_length where"
+        "AREA ENERGY FORCE FRACTURE_ENERGY LENGTH STRESS Anchors AppliesTwice BasisSite Bonds "
+        "BreaksAtStrain Calibrated Cell CellStress Component Components Diagnostic Draws "
+        "FollowerRule FractureModel FrameMap FramePolicy FrameSites Here KnowsStiffness Lattice "
+        "LeaderRows LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair "
+        "Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
+        "SharesParticles Slot Softens SoftensCells SpaceVector StartsCracked Stiffness "
+        "StoresEnergy TearsCells Torn TouchingRows TurnsParticles Variable Vector dot length "
+        "squared_length where"
     ),
     "pbdkit.pages.report": "report",
     "pbdkit.registry.discovery": "hookimpl",

@@ -15,7 +15,15 @@ from pbdkit.drawing.labels import in_its_units
 from pbdkit.experiment.schema import experiment_schema
 from pbdkit.experiment.source import Source
 from pbdkit.interfaces import units as units_module
-from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Units
+from pbdkit.interfaces.units import (
+    AREA,
+    ENERGY,
+    FORCE,
+    FRACTURE_ENERGY,
+    LENGTH,
+    STRESS,
+    Units,
+)
 from pbdkit.registry.registry import Registry
 from pbdkit.results.layout import dataset_schema
 from pbdkit.results.netcdf_sink import NetcdfSink
@@ -221,7 +229,10 @@ STRESS_OF = [{"type": "stress", "youngs_modulus": 70e3}]
         ({"units": None}, "lattice.a: '0.5 mm' names a unit, and nothing says what a lattice unit"),
         ({"units": {"length": 0.25}}, "units.length: expected a length with its unit, as in 1 mm"),
         ({"units": {"length": "0 mm"}}, "units.length: should be greater than 0 and finite"),
-        ({"units": {"length": "3 kg"}}, "units.length: '3 kg' is no length; write for instance mm"),
+        (
+            {"units": {"length": "3 kg"}},
+            "units.length: '3 kg' is no length; write for instance mm",
+        ),
         ({"units": {"length": "3 mn"}}, "units.length: '3 mn': there is no unit 'mn'"),
         ({"units": {"length": "3 mm**9**9**9"}}, "units.length: '3 mm**9**9**9' is no number with"),
         ({"units": {"lenght": "3 mm"}}, "units.lenght: unknown key; did you mean 'length'?"),
@@ -301,3 +312,81 @@ def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
 def test_units_that_are_those_wanted_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pbdkit.interfaces.units._registry", lambda: pytest.fail("pint is used"))
     assert Units(length="2.5 mm", youngs_modulus="3000 MPa").length_mm == 2.5
+
+
+def dogbone(*settings: str) -> pbdkit.Experiment:
+    return pbdkit.load("modelling/dogbone-to-failure", settings=settings)
+
+
+def test_a_strength_is_divided_by_youngs_modulus() -> None:
+    assert dogbone("fracture.failure=66 MPa").fracture.failure == pytest.approx(0.02)
+    damage = "fracture={type: damage, onset: 0.033 GPa, failure: 0.2}"
+    assert dogbone(damage).fracture.onset == pytest.approx(0.01)
+    with pytest.raises(pbdkit.ExperimentError, match="'66 mm' is no stress; write for instance"):
+        dogbone("fracture.failure=66 mm")
+    plain = ["units={length: 1 mm}", "diagnostics=[]", "fracture.failure=66 MPa"]
+    with pytest.raises(
+        pbdkit.ExperimentError, match=r"fracture\.failure: a stress needs units\.you"
+    ):
+        dogbone(*plain)
+
+
+class Tough(pbdkit.FractureModel):
+    """Takes an energy."""
+
+    type: Literal["tough"] = "tough"
+    energy: Annotated[float, FRACTURE_ENERGY] = 0.1
+    can_break = False
+
+    def constants(self, slot: pbdkit.Slot) -> dict[str, float]:
+        return {}
+
+    @staticmethod
+    def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
+        return False
+
+    @staticmethod
+    def fictitious(u: Any, r: Any, p: Any) -> Any:
+        return u
+
+
+@pytest.mark.parametrize(
+    "energy",
+    ["6.6 N/mm", "6600 J/m^2", "6.6 kJ/m**2", "2 um", 0.004, "{otherwise: 6.6 N/mm}"],
+)
+def test_a_fracture_energy_is_one_of_an_area_or_a_length(energy: Any) -> None:
+    settings = ["units.length=0.5 mm", f"fracture={{type: tough, energy: {energy}}}"]
+    loaded = pbdkit.load("modelling/dogbone-to-failure", components=[Tough], settings=settings)
+    assert loaded.fracture.energy == pytest.approx(0.004)
+
+
+def test_what_is_no_fracture_energy_is_told_what_one_is() -> None:
+    with pytest.raises(
+        pbdkit.ExperimentError, match="'3 kg' is no fracture energy; write for instance N/mm"
+    ):
+        pbdkit.load(
+            "modelling/dogbone-to-failure",
+            components=[Tough],
+            settings=["fracture={type: tough, energy: 3 kg}"],
+        )
+
+
+def test_fields_and_courses_take_units_as_numbers_do() -> None:
+    steel = "regions={neck: {type: disc, radius: 3.0, centre: [30 mm, 10 mm]}}"
+    field = "fracture={type: strain, failure: {otherwise: 66 MPa, neck: 0.01}}"
+    (varying,) = dogbone(steel, field).fracture.varying.values()
+    assert varying.samples == {"otherwise": pytest.approx(0.02), "neck": 0.01}
+    course = "fracture={type: strain, failure: {steps: [0, 9], values: [66 MPa, 33 MPa]}}"
+    assert dogbone(course).courses["fracture", "failure"].at(9) == pytest.approx(0.01)
+    chance = (
+        "fracture={type: strain, failure: {mean: 66 MPa, scatter: 0.1, correlation_length: 4 mm}}"
+    )
+    (drawn,) = dogbone(chance).fracture.varying.values()
+    assert drawn.mean == pytest.approx(0.02)
+    with pytest.raises(pbdkit.ExperimentError, match="'66 mm' is no stress"):
+        dogbone("fracture={type: strain, failure: {otherwise: 66 mm}}")
+
+
+def test_cuts_take_lengths() -> None:
+    (cut,) = dogbone("units.length=0.5 mm", "cuts=[{from: [10 mm, 0.0], to: [1 cm, 2 mm]}]").cuts
+    assert cut.segment == ((20.0, 0.0), (20.0, 4.0))

@@ -22,9 +22,11 @@ from pbdkit.interfaces import (
     squared_length,
     where,
 )
+from pbdkit.interfaces.units import STRESS
 from pbdkit.interfaces.values import Drawn
 
-StrainLimit = Annotated[float, Field(gt=0.0, le=1e75)]
+StrainLimit = Annotated[float, Field(gt=0.0, le=1e75), STRESS]
+"""A strain; with a unit a stress, which is divided by Young's modulus."""
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
 PERCENT = 1.0
 """Strains from which on it is likely that per cent are meant."""
@@ -59,7 +61,9 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
 
     type: Literal["strain"] = "strain"
     failure: StrainLimit = Field(
-        description="The strain above which a bond breaks.", examples=[0.1]
+        description="The strain above which a bond breaks, or the stress where it is uniaxial, "
+        "along a bond, over Young's modulus.",
+        examples=[0.1],
     )
     scatter: Scatter = Field(0.0, description=SCATTER, examples=[0.2])
 

@@ -38,7 +38,15 @@ from pbdkit.interfaces.rule import (
     Torn,
     TurnsParticles,
 )
-from pbdkit.interfaces.units import AREA, ENERGY, FORCE, LENGTH, STRESS, Quantity
+from pbdkit.interfaces.units import (
+    AREA,
+    ENERGY,
+    FORCE,
+    FRACTURE_ENERGY,
+    LENGTH,
+    STRESS,
+    Quantity,
+)
 from pbdkit.interfaces.values import Bonds, Draws, Particles, Remembered, Remembers
 from pbdkit.interfaces.vector import (
     Components,
@@ -61,9 +69,9 @@ INTERFACES: dict[str, type[Component]] = {
 """The open interfaces by the field of the experiment in which their components stand."""
 
 __all__ = [
-    "AREA", "ENERGY", "FORCE", "INTERFACES", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
-    "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress", "Component",
-    "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap",
+    "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "INTERFACES", "LENGTH", "STRESS", "Anchors",
+    "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress",
+    "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap",
     "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows",
     "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair",
     "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles",

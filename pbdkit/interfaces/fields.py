@@ -19,7 +19,7 @@ from pbdkit.errors import did_you_mean
 from pbdkit.interfaces.component import Component
 from pbdkit.interfaces.course import Course, as_course
 from pbdkit.interfaces.random_field import random_fields
-from pbdkit.interfaces.units import PATTERN
+from pbdkit.interfaces.units import PATTERN, Quantity, or_text
 from pbdkit.interfaces.varying import ByRegion, Varying, as_varying
 
 RESERVED = ("otherwise", "file", "steps")
@@ -31,7 +31,7 @@ ALTERNATIVES: dict[str, Any] = {
         {
             "type": "object",
             "required": ["otherwise"],
-            "additionalProperties": {"type": "number"},
+            "additionalProperties": or_text({"type": "number"}),
         },
         {
             "type": "object",
@@ -54,7 +54,7 @@ ALTERNATIVES: dict[str, Any] = {
             "required": ["steps", "values"],
             "properties": {
                 "steps": {"type": "array", "items": {"type": "integer", "minimum": 0}},
-                "values": {"type": "array", "items": {"type": "number"}},
+                "values": {"type": "array", "items": or_text({"type": "number"})},
             },
             "additionalProperties": False,
         },
@@ -134,6 +134,7 @@ class TakesFields(Component):
     def _with_fields(cls, data: Any, handler: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, dict):
             return handler(data)
+        data = data | {name: cls._number_of(name, data[name], info) for name in data}
         varying: dict[str, Varying] = {**random_fields(data, cls.numbers(), info.context)}
         courses = dict[str, Course[float]]()
         for name in (cls.numbers() & data.keys()) - varying.keys():
@@ -167,6 +168,28 @@ class TakesFields(Component):
     def numbers(cls) -> set[str]:
         """The parameters that can differ from place to place, and change."""
         return {name for name, field in cls.model_fields.items() if field.annotation is float}
+
+    @classmethod
+    def _number_of(cls, name: str, given: Any, info: ValidationInfo) -> Any:
+        """What is given in place of a number, with numbers of lattice units for texts with a
+        unit."""
+        field = cls.model_fields.get(name)
+        quantity = (
+            next((m for m in field.metadata if isinstance(m, Quantity)), None) if field else None
+        )
+        if quantity is None or not isinstance(given, dict):
+            return given
+
+        def number(value: Any) -> Any:
+            if isinstance(value, list | tuple):
+                return [number(each) for each in value]
+            return quantity.number(value, info)
+
+        if "otherwise" in given:
+            return {key: number(value) for key, value in given.items()}
+        if "steps" in given and isinstance(given.get("values"), list | tuple):
+            return given | {"values": number(given["values"])}
+        return given | {"mean": number(given["mean"])} if "mean" in given else given
 
     @classmethod
     def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Any], context: Any) -> None:

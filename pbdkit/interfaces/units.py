@@ -42,6 +42,8 @@ class Quantity:
     is counted in, as variables of the dataset say it: of the lattice's length L, Young's modulus E
     and thickness t, L^length · E^youngs_modulus · t^thickness; `unit` is the same of mm and MPa.
     A stress unit is the one in which Young's modulus is given, a thickness unit that of thickness.
+    `also` is what the number may be written as besides, as a fracture energy that has been divided
+    by Young's modulus, a length.
     """
 
     meaning: str
@@ -50,18 +52,21 @@ class Quantity:
     length: int = 0
     youngs_modulus: int = 0
     thickness: int = 0
+    also: Quantity | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return core_schema.with_info_before_validator_function(self._number, handler(source))
+        return core_schema.with_info_before_validator_function(self.number, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return _or_text(handler(schema))
+        return or_text(handler(schema))
 
-    def _number(self, value: Any, info: ValidationInfo) -> Any:
+    def number(self, value: Any, info: ValidationInfo) -> Any:
         """The number of lattice units; what is no number with a unit stays as it is."""
         if not isinstance(value, str) or not TEXT.fullmatch(value):
             return value
-        return magnitude(value, self.unit, self.meaning) / _units(value, info).scale(self)
+        quantity = self.also if self.also and _is_of(value, self.also.unit) else self
+        found = magnitude(value, quantity.unit, quantity.meaning)
+        return found / _units(value, info).scale(quantity)
 
 
 LENGTH = Quantity("length", "lattice unit", "mm", length=1)
@@ -76,6 +81,11 @@ ENERGY = Quantity(
     "energy", "stress unit * thickness unit * lattice unit^2", "mJ",
     length=2, youngs_modulus=1, thickness=1,
 )  # fmt: skip
+FRACTURE_ENERGY = Quantity(
+    "fracture energy", "stress unit * lattice unit", "N/mm",
+    length=1, youngs_modulus=1, also=LENGTH,
+)  # fmt: skip
+"""Energy a unit of area; over Young's modulus a length."""
 BODY_FORCE = Quantity(
     "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
@@ -162,7 +172,7 @@ class FromUnits:
         return core_schema.with_info_before_validator_function(self._given, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return _or_text(handler(schema))
+        return or_text(handler(schema))
 
     def _given(self, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, str) and TEXT.fullmatch(value):
@@ -238,6 +248,15 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
         raise _fault(f"'{text}' is no {meaning}; {told}") from None
 
 
+def _is_of(text: str, unit: str) -> bool:
+    """Whether a text is a number with a unit of the same dimension."""
+    try:
+        magnitude(text, unit, "")
+    except PydanticCustomError:
+        return False
+    return True
+
+
 @cache
 def _registry() -> Any:
     """pint and its units; nothing of it is there where no experiment has units."""
@@ -258,7 +277,8 @@ def _units(text: str, info: ValidationInfo) -> Units:
     return units
 
 
-def _or_text(number: dict[str, Any]) -> dict[str, Any]:
+def or_text(number: dict[str, Any]) -> dict[str, Any]:
+    """The JSON Schema of a number, or of a text with a unit."""
     return {"anyOf": [number, {"type": "string", "pattern": PATTERN}]}
 
 
