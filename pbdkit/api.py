@@ -110,7 +110,8 @@ def run(
     Warns
     -----
     PbdkitWarning
-        As `pbdkit run` does, of what is doubtful in the scene or can diverge, and of a last state
+        As `pbdkit run` does, of what is doubtful in the scene or can diverge (but for what takes
+        an analysis: `analyse(experiment).warnings()`), and of a last state
         that is inside out.
     """
     found = as_experiment(experiment, components, settings)

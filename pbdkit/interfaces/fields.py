@@ -180,16 +180,20 @@ class TakesFields(Component):
         if quantity is None or not isinstance(given, dict):
             return given
 
-        def number(value: Any) -> Any:
+        def number(value: Any, key: str) -> Any:
             if isinstance(value, list | tuple):
-                return [number(each) for each in value]
-            return quantity.number(value, info)
+                return [number(each, key) for each in value]
+            try:
+                return quantity.number(value, info)
+            except PydanticCustomError as error:
+                told = {"text": error.message(), "key": (name, key)}
+                raise PydanticCustomError("fault", "{text}", told) from None
 
         if "otherwise" in given:
-            return {key: number(value) for key, value in given.items()}
+            return {key: number(value, key) for key, value in given.items()}
         if "steps" in given and isinstance(given.get("values"), list | tuple):
-            return given | {"values": number(given["values"])}
-        return given | {"mean": number(given["mean"])} if "mean" in given else given
+            return given | {"values": number(given["values"], "values")}
+        return given | {"mean": number(given["mean"], "mean")} if "mean" in given else given
 
     @classmethod
     def _refuse_wrong(cls, data: dict[str, Any], varying: dict[str, Any], context: Any) -> None:
