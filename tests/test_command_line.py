@@ -337,7 +337,11 @@ NEEDED = {
     "run paper/aa": (set(), {"pbdkit.interfaces", "pbdkit.components", "pbdkit.experiment.model"}),
     "run e.json --set rul=1": ({"numpy", "pydantic"}, {"pbdkit.scene.scene", "pbdkit.stepping"}),
     "check e.json": ({"numpy", "pydantic"}, {"pbdkit.results.netcdf", "pbdkit.runs.resumption"}),
-    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.prediction.lag"}),
+    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.increments"}),
+    "run e.json --quiet": (
+        {"h5py", "numpy", "pydantic"},
+        {"pbdkit.equilibrium", "pbdkit.prediction.lag"},
+    ),
     "status e.nc": ({"numpy"}, {"pbdkit.interfaces", "pbdkit.components"}),
     "verify e.nc": ({"numpy", "pydantic"}, {"pbdkit.stepping", "pbdkit.equilibrium"}),
 }

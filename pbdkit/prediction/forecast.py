@@ -260,6 +260,8 @@ def outlook(scene: Scene) -> list[str]:
     found = _unheld(scene)
     if scene.raster.count > LOOKED_AT or not scene.experiment.solver.makes_steps:
         return found
+    from pbdkit.prediction.analysis import Analysis
+
     analysis = Analysis(scene)
     with suppress(PbdkitError):  # where it is not known `check` says why
         found += [*analysis.obstructions(), *_too_short(analysis)]
