@@ -360,6 +360,12 @@ def test_a_fracture_energy_is_one_of_an_area_or_a_length(energy: Any) -> None:
     assert loaded.fracture.energy == pytest.approx(0.004)
 
 
+def test_cohesive_takes_what_is_measured_of_a_material() -> None:
+    given = "fracture={type: cohesive, energy: 0.5 N/mm, onset: 66 MPa}"
+    fracture = dogbone("units.length=0.5 mm", given).fracture
+    assert (fracture.energy, fracture.onset) == pytest.approx((0.5 / 3300 / 0.5, 66 / 3300))
+
+
 def test_what_is_no_fracture_energy_is_told_what_one_is() -> None:
     with pytest.raises(
         pbdkit.ExperimentError, match="'3 kg' is no fracture energy; write for instance N/mm"

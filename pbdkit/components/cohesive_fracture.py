@@ -11,7 +11,7 @@ from pbdkit.components.fracture import Parting
 from pbdkit.components.strain_fracture import StrainLimit, softened
 from pbdkit.errors import ExperimentError
 from pbdkit.interfaces import (
-    LENGTH,
+    FRACTURE_ENERGY,
     Calibrated,
     CellStress,
     Components,
@@ -51,8 +51,9 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     fictitious_at: Literal["cell"] = Field(
         "cell", alias="fictitious", description="As `placement`: `cell`."
     )
-    energy: Annotated[float, Field(gt=0.0, le=1e75), LENGTH] = Field(
-        description="G_c over Young's modulus: a length (lattice units).", examples=[0.05]
+    energy: Annotated[float, Field(gt=0.0, le=1e75), FRACTURE_ENERGY] = Field(
+        description="G_c over Young's modulus: a length (lattice units); with a unit also G_c.",
+        examples=[0.05],
     )
     onset: StrainLimit = Field(
         description="The tensile strength over Young's modulus: the largest principal stress over "
