@@ -276,7 +276,7 @@ def test_kernels_soften_as_numpy_does(lattice, rule, threads):
     damage = known.damage_left.values[-1]
     assert ((damage > 0.0) & (damage < 1.0)).sum() > 3
     assert (known.broken_step.values > 0).any()
-    for name in ("displacement", *NUMBERS, "broken_step"):
+    for name in ("u", *NUMBERS, "broken_step"):
         assert np.array_equal(found[name].values, known[name].values), name
 
 

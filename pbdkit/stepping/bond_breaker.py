@@ -25,7 +25,7 @@ Home = tuple[Any, ...]
 DIRECTIONS = 8
 TIE = 1e-6
 """Cells begin to soften together whose loads differ by no more than this share."""
-CALM = 1e-2
+CALM = 1e-3
 """Other cells begin once none that has begun changes its damage by more."""
 
 

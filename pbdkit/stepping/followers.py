@@ -103,13 +103,9 @@ class SlotFollowers(Followers):
         return out
 
     def energy(self, m: Floats, state: State) -> float:
-        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force,
-        without the forces that broken bonds exert where nothing is displaced."""
+        """The strain energy over Young's modulus and thickness: the rule's own, or -½ Σ u·force."""
         if not isinstance(self._scene.experiment.rule, StoresEnergy):
-            forces = self.forces(m, state)
-            if self._scene.has_fracture:
-                forces = forces - self.forces(np.zeros_like(m), state)
-            return self._work(m, forces)
+            return self._work(m, self.forces(m, state))
         seen, out = self._seen(m, state), np.zeros_like(m[0])
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
             (value,) = around.sums(evaluator.energy, seen, state)
@@ -121,7 +117,7 @@ class SlotFollowers(Followers):
         so that no digit depends on where the body has gone."""
         place = self._scene.raster.place_of(self._scene.raster.body_rows)
         u, forces = u.reshape(len(u), -1)[:, place], forces.reshape(len(u), -1)[:, place]
-        if self._scene.frame is None and not self._scene.has_fracture:
+        if self._scene.frame is None:
             u = u - u.mean(axis=1, keepdims=True)
         return -0.5 * float((u * forces).sum())
 

@@ -1,0 +1,108 @@
+"""Strength and energy of bars with a weak zone that are torn under `cohesive`.
+
+    python tests/reliability/cohesive_strength.py [square] [hexagonal] [--angle DEGREES]
+
+A bar is pulled along x to beyond its failure under `solver: equilibrium`. In a zone one band of
+cells wide the onset is 1.5 % lower. The angle is that of the lattice's axis to the bar; bars along
+an axis are grids, others polygons that the outline cuts. Printed are the largest force over area ·
+onset · E and the work over area · energy · E, for some ℓ = energy/onset² over the spacing.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parents[2])]
+
+import numpy as np
+
+import pbdkit
+
+ONSET, WEAK = 1e-3, 0.985
+RULES = {
+    "elastic, ν = 0": {"type": "elastic", "poisson_ratio": 0.0},
+    "elastic, ν = .2": {"type": "elastic", "poisson_ratio": 0.2},
+    "elastic, ν = 1/3": {"type": "elastic", "poisson_ratio": 1 / 3},
+    "springs": {"type": "springs"},
+}
+LENGTHS = (7, 30, 140, 500)
+
+
+def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=25):
+    """The experiment of a bar, and the force and the elongation of its recorded states."""
+    turn = np.radians(angle)
+    along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    half = [s * length / 2 * along + t * height / 2 * across for s, t in CORNERS]
+    spot = np.array([0.5, 0.5 if angle else 0.0])  # a cell lies in the middle of the zone
+
+    def zone(begin, end):
+        corners = [(begin, -height), (end, -height), (end, height), (begin, height)]
+        points = [(s * along + t * across + spot).tolist() for s, t in corners]
+        return {"type": "polygon", "vertices": points}
+
+    ends = length / 2 - 0.6
+    middle = 0.37 if angle else 0.55
+    way = 2.3 * ell * ONSET
+    motion = {"type": "velocity", "velocity": (way / increments * along).tolist()}
+    return {
+        "name": "bar",
+        "lattice": {"type": lattice, "a": 1.0, "origin": [0.0, 0.0]},
+        "body": {"type": "polygon", "vertices": [(p + spot).tolist() for p in half]},
+        "neighbours": {"type": "chebyshev" if lattice == "square" else "coordination"},
+        "rule": rule,
+        "frame": {"type": "natural"},
+        "regions": {
+            "weak": zone(-middle, middle),
+            "left": zone(-length, -ends),
+            "right": zone(ends, length),
+        },
+        "fracture": {
+            "type": "cohesive",
+            "energy": ell * ONSET**2,
+            "onset": {"otherwise": ONSET, "weak": WEAK * ONSET},
+        },
+        "leaders": [
+            {"select": {"region": "left"}, "motion": {"type": "hold"}},
+            {"select": {"region": "right"}, "motion": motion | {"steps": increments}},
+        ],
+        "steps": increments,
+        "solver": {"type": "equilibrium", "tolerance": 1e-5, "increments": increments},
+        "record": {"every": 1},
+        "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0, "thickness": 1.0}],
+    }
+
+
+CORNERS = (-1, -1), (1, -1), (1, 1), (-1, 1)
+"""Of the bar, in units of half its length and height."""
+
+
+def measured(lattice, rule, ell, angle=0.0, height=4.0, **more):
+    """(strength over onset · E, energy over that asked for, force at the end over the largest)."""
+    given = bar(lattice, rule, ell, angle, height=height, **more)
+    ds = pbdkit.run(given, progress=False)
+    turn = np.radians(angle)
+    force = np.abs(ds.reaction.sel(leader_group=1).values @ [np.cos(turn), np.sin(turn)])
+    way = ds.time.values * np.hypot(*given["leaders"][1]["motion"]["velocity"])
+    work = np.trapezoid(force, way)
+    peak = force.max()
+    return peak / height / ONSET, work / height / (ell * ONSET**2), force[-1] / peak
+
+
+def main() -> None:
+    """One line a bar."""
+    asked = sys.argv[1:]
+    angle = float(asked[asked.index("--angle") + 1]) if "--angle" in asked else 0.0
+    for lattice in ("square", "hexagonal"):
+        for name, rule in RULES.items() if lattice in asked else ():
+            for ell in LENGTHS:
+                strength, energy, left = measured(lattice, rule, ell, angle)
+                print(
+                    f"{lattice} at {angle:g}°, {name}, ℓ/h {ell}: strength {strength:.3f}, "
+                    f"energy {energy:.3f}, force left {left:.3f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
