@@ -43,7 +43,8 @@ OUT = Path("out.nc")
     [
         "kill_runs.py --trials 4 --kinds breaking",
         "two_writers.py --trials 3 --kinds small",
-        "mutate_stores.py --trials 2 --kinds breaking",
+        "mutate_stores.py --trials 3 --kinds breaking",
+        "mutate_sweeps.py --trials 4",
         "equilibria.py fracture --trials 3",
         "equilibria.py certificates --trials 5",
         "fit_coverage.py --trials 10 --processes 1 --kinds poisson",
@@ -240,16 +241,160 @@ def test_a_newer_store_is_refused_with_its_version(
     stopped(call, monkeypatch)
     with RunStore(store_of(OUT)) as store:
         about = store.facts("about")
-    put("about", json.dumps(about | {"format": "3"}).encode())
+    put("about", json.dumps(about | {"format": "4"}).encode())
     for command in ("resume", "status", "plot"):
         found = call(command, str(OUT))
-        assert (found.code, "is of format 3" in found.err) == (6, True), found
+        assert (found.code, "is of format 4" in found.err) == (6, True), found
 
 
 def test_a_store_that_a_killed_process_was_making_is_none(call: Any) -> None:
     Path("out.nc.run").touch()
     Path("out.nc.run-records").touch()
     assert call("status", str(OUT)).code == 2
+    assert call("run", "e.json", "-o", str(OUT)).code == 0
+    assert names() == {"e.json", "out.nc"}
+
+
+KEPT = "out.nc.run", "out.nc.run-records", "out.nc.run-wal"
+
+
+def killed(call: Any, patch: pytest.MonkeyPatch, *more: str, number: int = 6) -> dict[str, bytes]:
+    """What a run of e.json leaves that is killed at this commit; nothing else is left."""
+    found: dict[str, bytes] = {}
+    with patch.context() as inner:
+        copying = lambda: found.update({name: Path(name).read_bytes() for name in KEPT})  # noqa: E731
+        before_keeping(inner, number, copying)
+        assert call("run", "e.json", "-o", str(OUT), *more).code == 0
+    OUT.unlink()
+    return found
+
+
+def lay(files: dict[str, bytes]) -> None:
+    """These files, and no others of the run."""
+    for path in Path.cwd().glob("out.nc*"):
+        path.unlink()
+    for name, data in files.items():
+        Path(name).write_bytes(data)
+
+
+def kept() -> dict[str, bytes]:
+    """The files of the run, but for what SQLite makes to read."""
+    found = {path.name: path.read_bytes() for path in Path.cwd().glob("out.nc*")}
+    return {name: data for name, data in found.items() if data and not name.endswith("-shm")}
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    """With one bit changed."""
+    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+
+def test_damage_to_the_log_of_a_store_is_named_and_the_rest_is_kept(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bit of its head, or of its first frame, or all of it: what the log held is lost, and known
+    to be."""
+    right, files = whole(call), killed(call, monkeypatch)
+    log = files["out.nc.run-wal"]
+    for damage in (flipped(log, 17), flipped(log, 2000), None):
+        damaged = {**files, "out.nc.run-wal": damage} if damage else dict(files)
+        if damage is None:
+            del damaged["out.nc.run-wal"]
+        lay(damaged)
+        for command in ("status", "resume", "plot", "run e.json -o"):
+            found = call(*command.split(), str(OUT))
+            assert found.code == (2 if command.startswith("run") else 6), (command, found)
+            assert kept() == damaged, command
+        assert "--anyway goes on from the last commit" in call("status", str(OUT)).err
+        assert call("resume", str(OUT), "--anyway").code == 0
+        assert is_whole(right)
+    lay(files)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_what_is_missing_of_a_store_is_named_and_the_rest_is_kept(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, files = whole(call), killed(call, monkeypatch)
+    records = files["out.nc.run-records"]
+    for changed in (
+        {"out.nc.run": None},
+        {"out.nc.run": b""},
+        {"out.nc.run": files["out.nc.run"][:100]},
+        {"out.nc.run-records": None},
+        {"out.nc.run-records": bytes(len(records))},
+        {"out.nc.run-records": flipped(records, 30)},
+    ):
+        damaged = {name: data for name, data in (files | changed).items() if data is not None}
+        lay(damaged)
+        for command in ("status", "resume", "run e.json -o"):
+            found = call(*command.split(), str(OUT))
+            assert (found.code in (2, 6), "no unfinished run" in found.err) == (True, False), found
+            assert "damaged" in found.err or "unfinished" in found.err
+            assert kept() == {name: data for name, data in damaged.items() if data}, command
+        assert call("resume", str(OUT)).code == 6
+    lay(files)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+    lay({"out.nc.run": b"", "out.nc.run-records": records})
+    assert call("run", "e.json", "-o", str(OUT), "--force").code == 0
+    assert is_whole(right)
+
+
+def test_stores_that_are_put_together_from_two_are_named(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From another run of the same experiment, and from the same run before. Where the log holds
+    all that is in the main file, that is not needed."""
+    right, files = whole(call), killed(call, monkeypatch)
+    other = killed(call, monkeypatch)
+    for name in KEPT:
+        damaged = {**files, name: other[name]}
+        lay(damaged)
+        for command in ("status", "resume"):
+            found = call(command, str(OUT))
+            if found.code == 0 and name == "out.nc.run":
+                assert command == "status" or is_whole(right)
+                continue
+            assert (found.code, "damaged" in found.err) == (6, True), (name, found)
+            assert kept() == damaged
+    lay(files)
+    with monkeypatch.context() as patch:
+        patch.setattr(UnfinishedRun, "keep", stopping(UnfinishedRun.keep, 3))
+        assert call("resume", str(OUT)).code == 1
+    now = kept()
+    assert now.keys() == {"out.nc.run", "out.nc.run-records"}
+    lay({**now, "out.nc.run": files["out.nc.run"]})
+    found = call("resume", str(OUT))
+    assert (found.code, "commits of" in found.err) == (6, True), found
+    lay(now)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def stopping(keep: Any, number: int) -> Any:
+    """Keeps so many times, and fails then."""
+    left = [number]
+
+    def keeping(*args: Any) -> None:
+        keep(*args)
+        left[0] -= 1
+        if left[0] == 0:
+            raise FailingError("at last")
+
+    return keeping
+
+
+@pytest.mark.parametrize("cut", [0, 100, 4096])
+def test_a_store_that_was_never_whole_is_in_nobodys_way(call: Any, cut: int) -> None:
+    """As where the disk got full, or the power went, while it was made."""
+    with RunStore(store_of(OUT), mode="rwc"):
+        data = store_of(OUT).read_bytes()
+    lay({"out.nc.run": data[:cut], "out.nc.run-records": b""})
+    before = kept()
+    for command in ("status", "resume"):
+        assert call(command, str(OUT)).code == 2
+        assert kept() == before
     assert call("run", "e.json", "-o", str(OUT)).code == 0
     assert names() == {"e.json", "out.nc"}
 

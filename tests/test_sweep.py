@@ -3,11 +3,13 @@
 import json
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
+import warnings
 from asyncio import CancelledError
 from pathlib import Path
 from typing import Literal
@@ -19,6 +21,7 @@ from reliability.sweep_under_fire import under_fire
 
 import pbdkit
 from pbdkit.experiment.source import Source
+from pbdkit.storage import sqlite_file
 from pbdkit.sweeps import store as stores
 from pbdkit.sweeps.course import carry_out
 from pbdkit.sweeps.crew import Alone, Cluster
@@ -251,9 +254,156 @@ def test_the_store_of_somebody_else_is_left_alone(small, tmp_path):
     with pytest.raises(pbdkit.StorageError, match="is no store of a sweep"):
         swept(small, vary={"steps": [2]}, folder=tmp_path)
     assert path.read_bytes() == before
-    path.write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 20)
-    with pytest.raises(pbdkit.StorageError, match=r"sweep\.sqlite: .*remove it"):
+    path.write_bytes(b"words " * 1000)
+    with pytest.raises(pbdkit.StorageError, match="is no store of a sweep"):
         swept(small, vary={"steps": [2]}, folder=tmp_path)
+    assert path.read_bytes() == b"words " * 1000
+
+
+def test_a_database_that_is_cut_gives_no_member_the_values_of_another(small, tmp_path):
+    """SQLite reads zeros there, and takes what follows for row 0."""
+    asked = {"vary": {"solver.relaxation": [0.4, 0.7, 1.0]}, "folder": tmp_path}
+    small["body"] = {"type": "grid", "columns": 6, "rows": 4}
+    asked["keep"] = {"variables": ["pe1"], "times": "last"}
+    first, path = swept(small, **asked), tmp_path / stores.DATABASE
+    whole = path.read_bytes()
+    for left in (156, 500, 900):
+        path.write_bytes(whole[: len(whole) - 4096 + left])
+        damaged = path.read_bytes()
+        with pytest.warns(pbdkit.PbdkitWarning, match="is damaged: .* stay held|it runs again"):
+            same(first, swept(small, **asked))
+        for aside in tmp_path.glob("set-aside-*"):
+            assert (aside / stores.DATABASE).read_bytes() == damaged
+            shutil.rmtree(aside)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            same(first, swept(small, **asked))
+
+
+def test_of_a_damaged_database_what_is_sound_stays_held(small, tmp_path, run_only):
+    asked = {"vary": {"steps": [5, 6, 7]}, "folder": tmp_path}
+    first, path = swept(small, **asked), tmp_path / stores.DATABASE
+    data = bytearray(path.read_bytes())
+    data[8192:8704] = bytes(512)  # the index of the keys
+    path.write_bytes(data)
+    run_only.clear()
+    with pytest.warns(pbdkit.PbdkitWarning, match="3 members of it are sound and stay held"):
+        same(first, swept(small, **asked))
+    assert run_only == []
+
+
+def test_members_whose_log_was_lost_are_said_to_be(small, tmp_path, run_only):
+    asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
+    with stores.Store(tmp_path):
+        empty = (tmp_path / stores.DATABASE).read_bytes()
+    first = swept(small, **asked)
+    for without_log in (empty, None):
+        (tmp_path / stores.DATABASE).unlink()
+        if without_log:
+            (tmp_path / stores.DATABASE).write_bytes(without_log)
+        run_only.clear()
+        with pytest.warns(pbdkit.PbdkitWarning, match="(0 members of|and) 2"):
+            same(first, swept(small, **asked))
+        assert len(run_only) == 2
+
+
+def test_a_database_that_was_never_whole_is_in_nobodys_way(small, tmp_path):
+    """As where the disk got full, or the power went, while it was made."""
+    path = tmp_path / stores.DATABASE
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+    database.close()
+    page = path.read_bytes()
+    for data in (page, page[:100], b""):
+        path.write_bytes(data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            swept(small, vary={"steps": [2]}, folder=tmp_path).close()
+        path.unlink()
+        (tmp_path / stores.LOCK).unlink()
+
+
+@pytest.mark.parametrize("call_fails", range(1, 9))
+def test_a_fault_while_the_database_is_made_leaves_a_folder_to_go_on_with(
+    small, tmp_path, monkeypatch, call_fails
+):
+    """At each statement of its making, and at its new name."""
+    real, left = stores.connect, [call_fails]
+
+    class Failing(sqlite3.Connection):
+        def execute(self, *args):
+            left[0] -= 1
+            if left[0] == 0:
+                raise sqlite3.OperationalError("database or disk is full")
+            return super().execute(*args)
+
+    def connect(path, mode):
+        real(path, mode).close()
+        return sqlite3.connect(path, isolation_level=None, factory=Failing)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stores, "connect", connect)
+        with pytest.raises(pbdkit.StorageError, match="disk is full"):
+            swept(small, vary={"steps": [2]}, folder=tmp_path)
+    swept(small, vary={"steps": [2]}, folder=tmp_path).close()
+    assert {path.name for path in tmp_path.iterdir()} == {"lock", "sweep.nc", "sweep.sqlite"}
+
+
+def test_what_killed_sweeps_were_writing_is_removed(small, tmp_path):
+    (tmp_path / stores.LARGE).mkdir()
+    left = [f".host.17.{'0f' * 16}.nc", f"{stores.LARGE}/.host.17.{'0f' * 16}"]
+    for name in (*left, ".notes"):
+        (tmp_path / name).touch()
+    swept(small, vary={"steps": [2]}, folder=tmp_path)
+    assert not any((tmp_path / name).exists() for name in left)
+    assert (tmp_path / ".notes").exists()
+
+
+def test_a_locked_database_is_waited_for_and_said_to_be_locked(small, tmp_path, monkeypatch):
+    asked = {"vary": {"steps": [2]}, "folder": tmp_path}
+    swept(small, **asked).close()
+    assert sqlite_file.PATIENCE_S == 60.0
+    monkeypatch.setattr(sqlite_file, "PATIENCE_S", 0.1)
+    other = sqlite3.connect(tmp_path / stores.DATABASE, isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(pbdkit.StorageError, match="another program has kept it locked") as told:
+        swept(small, **asked | {"vary": {"steps": [2, 3]}})
+    other.close()
+    assert "remove" not in str(told.value)
+    assert swept(small, **asked).status.values.tolist() == ["complete"]
+
+
+def meanwhile(monkeypatch, act):
+    """Does something once the first member of a sweep has been run."""
+    work, left = Alone.work, [act]
+
+    def working(self, jobs, stopping):
+        for report in work(self, jobs, stopping):
+            yield report
+            if left:
+                left.pop()()
+
+    monkeypatch.setattr(Alone, "work", working)
+
+
+def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
+    asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path}
+    meanwhile(monkeypatch, lambda: (tmp_path / stores.DATABASE).unlink())
+    with pytest.warns(pbdkit.PbdkitWarning, match="was removed or replaced while the sweep ran"):
+        first = swept(small, **asked)
+    with pytest.warns(pbdkit.PbdkitWarning, match="is missing, or no database, and 2 members"):
+        same(first, swept(small, **asked))
+
+
+def test_a_folder_that_is_moved_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
+    asked = {"vary": {"steps": [2, 3]}, "folder": tmp_path / "here"}
+    meanwhile(monkeypatch, lambda: (tmp_path / "here").rename(tmp_path / "there"))
+    with pytest.raises(pbdkit.StorageError, match="here: was moved or removed while"):
+        swept(small, **asked)
+    (tmp_path / "there").rename(tmp_path / "here")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert swept(small, **asked).sizes["steps"] == 2
 
 
 WRONG = [

@@ -75,9 +75,9 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 def refuse_unfinished(path: Path, *, force: bool) -> None:
     """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
     process is writing it."""
-    from pbdkit.storage.run_files import is_unfinished
+    from pbdkit.storage.run_files import make_room
 
-    if is_unfinished(path, discard=force):
+    if not make_room(path, discard=force):
         raise ExperimentError(
             f"{path}: an unfinished run of it is here; `pbdkit resume {path}` goes on with it, "
             "--force discards it, -o names another file"

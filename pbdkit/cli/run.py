@@ -93,7 +93,11 @@ def run(
 @click.command()
 @result_argument("output")
 @click.option("--steps", type=click.IntRange(min=1), help="Continue a finished run to this step.")
-@click.option("--anyway", is_flag=True, help="Also where the experiment or a version changed.")
+@click.option(
+    "--anyway",
+    is_flag=True,
+    help="Also where the experiment or a version changed, or where the last commits are lost.",
+)
 @quiet_option
 @json_option
 def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:

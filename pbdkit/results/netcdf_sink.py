@@ -20,6 +20,7 @@ from pbdkit.results.sink import KeepingSink
 from pbdkit.storage.destination import Destination
 from pbdkit.storage.file_system import FULL, is_full
 from pbdkit.storage.paged_file import PagedFile
+from pbdkit.storage.run_files import damaged
 from pbdkit.storage.seal import is_whole
 from pbdkit.storage.standing import Standing
 from pbdkit.storage.unfinished import UnfinishedRun
@@ -93,7 +94,10 @@ class NetcdfSink(KeepingSink):
         self.unfinished, self._temporary = unfinished, unfinished.records
         file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
         with self._storing():
-            self._complete(file, status, settled=is_whole(file.disk))
+            settled = is_whole(file.disk)
+            if settled and not file.is_settled():
+                raise damaged(unfinished.records, "it is another result")
+            self._complete(file, status, settled=settled)
 
     def put(self, values: Values) -> None:
         """Into the file, by whole chunks."""

@@ -15,7 +15,7 @@ from pbdkit.results.layout import SCHEMA_VERSION, base_columns
 from pbdkit.results.members import SWEEP, choices, member
 from pbdkit.results.older_layout import in_this_layout
 from pbdkit.results.other_files import refuse_other_file
-from pbdkit.storage.run_files import STORE, store_of
+from pbdkit.storage.run_files import STORE, has_committed
 from pbdkit.storage.seal import BrokenSealError, SealedFile, opened, seal_of
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def _output_of(file: Path) -> Path | None:
     """The output of the unfinished run that is meant, by its own name or that of its store."""
     if file.name.endswith(STORE) and file.is_file():
         return file.with_name(file.name.removesuffix(STORE))
-    return None if file.exists() or not store_of(file).is_file() else file
+    return file if not file.exists() and has_committed(file) else None
 
 
 @contextmanager

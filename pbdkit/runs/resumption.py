@@ -23,7 +23,7 @@ from pbdkit.runs.earlier_run import asked, chosen_parameters, history, longer
 from pbdkit.runs.processes import Processes
 from pbdkit.runs.tuning import with_solver
 from pbdkit.scene.scene import Scene
-from pbdkit.storage.run_files import is_unfinished
+from pbdkit.storage.run_files import is_unfinished, make_room
 from pbdkit.storage.unfinished import UnfinishedRun
 
 SAME_WEIGHT = 1e-6
@@ -76,6 +76,7 @@ def _is_unfinished(output: Path, steps: int | None) -> bool:
         raise ExperimentError(f"{output}: there is no unfinished run of it, and no result")
     if steps is None:
         raise ExperimentError(f"{output}: is finished; --steps N continues it to step N")
+    make_room(output)
     return False
 
 
@@ -97,7 +98,7 @@ def _unfinished(
     try:
         with together.agreeing():
             if together.first:
-                left = UnfinishedRun.open(output, writing=True)
+                left = UnfinishedRun.open(output, writing=True, anyway=anyway)
                 source, origin = asked(left, output, steps, anyway)
                 chosen = chosen_parameters(left.facts)
                 is_same = steps in (None, left.about.get("steps"))

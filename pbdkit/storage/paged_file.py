@@ -10,6 +10,7 @@ from typing import Any
 
 from pbdkit.storage.file_system import write_all
 from pbdkit.storage.new_file import NewFile
+from pbdkit.storage.records_header import HEADER_BYTES
 from pbdkit.storage.seal import BLOCK, BrokenSealError, Extent, digest, is_whole, put_seal
 
 PAGE = 4096
@@ -117,7 +118,7 @@ class PagedFile(NewFile):
 
     def forget(self) -> None:
         """What was written after the last commit, by a process that was killed. Raises OSError."""
-        self.disk.truncate(max((extent.stop for extent in self.extents), default=0))
+        self.disk.truncate(max((extent.stop for extent in self.extents), default=HEADER_BYTES))
 
     def commit(self) -> None:
         """What is there now stays: pages, extents and size were noted elsewhere."""
@@ -136,6 +137,14 @@ class PagedFile(NewFile):
         self.sync()
         if not is_whole(self.disk):
             raise OSError(f"{self.disk.name}: the disk gives back what was not written")
+
+    def is_settled(self) -> bool:
+        """Whether the pages are in their places on the disk, of which the seal follows the last."""
+        for number, page in self.pages.items():
+            length = min(PAGE, max(0, self.size - number * PAGE))
+            if self._on_disk(number * PAGE, length) != page[:length]:
+                return False
+        return True
 
     def _settled(self, extent: Extent) -> Extent:
         """With the digest that it has now, should a page lie over it."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +18,21 @@ import xxhash
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import FULL, is_full, is_local
 from pbdkit.storage.pieced_array import Array, PiecedArray
+from pbdkit.storage.sqlite_file import connect, fault_of, is_database, look
 
-FORMAT = "2"
+FORMAT = "3"
 """Of the store; a newer one is refused."""
-TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, data BLOB NOT NULL, digest BLOB NOT NULL)"
+TABLE = "CREATE TABLE pieces (key TEXT PRIMARY KEY, digest BLOB NOT NULL, data BLOB NOT NULL)"
 SCHEMA = [(TABLE,), (None,)]
-"""The table, and the index of its keys."""
+"""The table, and the index of its keys. Digests can be read without the data behind them."""
+IDENTITY, COMMIT = "identity", "commit"
+"""The keys of a random number, which every digest depends on, and of the number of the commit with
+the digest of all other digests."""
+IDENTITY_BYTES = 16
 PART_BYTES = 2**20
 """Bytes a piece of an array."""
 LONGEST = 2**26
 """Bytes of anything in the file that this program believes."""
-PATIENCE_S = 60.0
-"""So long a commit waits for somebody who reads."""
 JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
 """How a journal of SQLite ends that names another one."""
 MARK = 0x70626472
@@ -41,40 +45,29 @@ class RunStore:
     """Pieces by key in one SQLite file. A commit is there whole or not at all, whatever stops the
     process or the machine; what it returns from is on the disk.
 
-    Raises StorageError, with the file's name, for whatever SQLite or a digest has against it.
+    What is read is of one commit of one store: pieces of another commit or of another store, in
+    whichever way they came into the file, are damage. Raises StorageError, with the file's name,
+    for whatever SQLite or a digest has against it.
     """
 
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
-        """`mode` is ro, rw, or rwc to make it. To read what a killed process was writing, SQLite
-        may have to write, so that nobody opens it but for both."""
+        """`mode` is ro, rw, or rwc to make it. With ro nothing on the disk changes, whatever is
+        wrong; with rw a damaged log is dropped, so that `check` and the header of the records come
+        first."""
         self.path, self._writes = path, mode != "ro"
+        self.identity, self.commits = b"", 0
+        """The latter is the number of commits that it holds."""
+        self._verified: dict[str, bytes] = {}
+        self._listed: dict[str, bytes] = {}
+        """The digests of what was written or read by now, and those of all pieces, by key."""
+        self._settled, self._closing = False, ExitStack()
         _refuse_others(path)
-        self._digests: dict[str, bytes] = {}
-        with self._sqlite():
-            # Nobody but the process's own writer thread uses it, one call after the other.
-            self._file = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={'rwc' if mode == 'rwc' else 'rw'}",
-                timeout=PATIENCE_S,
-                isolation_level=None,
-                check_same_thread=False,
-                uri=True,
-            )
-            self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
-            for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
-                self._file.execute(f"PRAGMA {setting}")
-            schema = self._file.execute("SELECT sql FROM sqlite_master").fetchall()
-            self.made = mode == "rwc" or schema != []
-            """False where it was left while it was made."""
-            if self._writes:
-                self._file.execute(f"PRAGMA journal_mode = {_journal(path)}")
-            if mode == "rwc":
-                self._file.execute(f"PRAGMA application_id = {MARK}")
-                self._file.execute(TABLE)
-            elif schema not in ([], SCHEMA):
-                raise StorageError(f"{path}: is no store of a run")
-            if mode == "ro":  # all that is read is of one commit
-                self._file.execute("PRAGMA query_only = ON")
-                self._file.execute("BEGIN")
+        try:
+            with self._sqlite():
+                self._open(mode)
+        except BaseException:
+            self._closing.close()
+            raise
 
     def __enter__(self) -> RunStore:
         return self
@@ -84,44 +77,53 @@ class RunStore:
 
     def commit(self, pieces: Iterable[Piece], gone: Iterable[str] = ()) -> None:
         """Puts pieces in the place of those of the same keys, and takes others away."""
-        new: dict[str, bytes] = {}
         with self._sqlite():
             self._file.execute("BEGIN IMMEDIATE")
             try:
-                self._file.executemany("DELETE FROM pieces WHERE key = ?", ((k,) for k in gone))
+                listed, put = dict(self._listed), dict[str, bytes]()
+                for key in gone:
+                    self._file.execute("DELETE FROM pieces WHERE key = ?", (key,))
+                    listed.pop(key, None)
                 for key, data in pieces:
-                    new[key] = found = _digest(key, data)
-                    if self._digests.get(key) != found:
-                        row = (key, data, found)
-                        self._file.execute("REPLACE INTO pieces VALUES (?, ?, ?)", row)
+                    put[key] = self._put(key, data)
+                listed, number = listed | put, self.commits + 1
+                whole = {"number": number, "pieces": _digest_of_all(listed)}
+                self._put(COMMIT, json_piece(whole))
                 self._file.execute("COMMIT")
             except BaseException:
                 with suppress(sqlite3.Error):
                     self._file.execute("ROLLBACK")
                 raise
-        self._digests |= new
+            self._listed, self.commits = listed, number
+            self._verified |= put
+            if not self._settled:  # table and first commit last, should the log be lost
+                _, frames, moved = self._file.execute("PRAGMA wal_checkpoint").fetchone()
+                self._settled = frames == moved
 
     def keys(self, begin: str) -> list[str]:
         """The keys that begin so."""
-        with self._sqlite():
-            rows = self._file.execute(
-                "SELECT key FROM pieces WHERE substr(key, 1, ?) = ?", (len(begin), begin)
-            )
-            return [str(key) for (key,) in rows]
+        return [key for key in self._listed if key.startswith(begin)]
 
     def piece(self, key: str) -> bytes:
         """What was committed last under a key."""
         with self._sqlite():
-            row = self._file.execute(
-                "SELECT data, digest FROM pieces WHERE key = ?", (key,)
-            ).fetchone()
+            query = "SELECT data, digest FROM pieces WHERE key = ?"
+            row = self._file.execute(query, (key,)).fetchone()
         if row is None:
             raise StorageError(f"{self.path}: is damaged: '{key}' is missing")
         data, found = row
-        if not isinstance(data, bytes) or _digest(key, data) != found:
+        if not isinstance(data, bytes) or self._digest(key, data) != found:
             raise StorageError(f"{self.path}: is damaged: '{key}' is not what was written")
-        self._digests[key] = found
+        self._verified[key] = found
         return data
+
+    def check(self) -> None:
+        """Reads all of it. Raises StorageError where anything is not what was written."""
+        with self._sqlite():
+            if fault := fault_of(self._file):
+                raise StorageError(f"{self.path}: is damaged: {fault}")
+        for key in self._listed:
+            self.piece(key)
 
     def facts(self, key: str) -> Any:
         """What was committed there as JSON."""
@@ -135,8 +137,68 @@ class RunStore:
         with suppress(sqlite3.Error):
             if self._writes:
                 self._file.execute("PRAGMA journal_mode = DELETE")
-        with suppress(sqlite3.Error):
-            self._file.close()
+        with suppress(sqlite3.Error, OSError):
+            self._closing.close()
+
+    def _open(self, mode: str) -> None:
+        if mode != "rwc" and not is_database(self.path):
+            raise StorageError(f"{self.path}: is damaged: it is missing, or no database")
+        if mode == "ro":
+            try:
+                self._file = look(self.path, self._closing)
+            except OSError as error:
+                raise StorageError(f"{self.path}: cannot be read: {error}") from None
+        else:
+            self._file = self._closing.enter_context(closing(connect(self.path, mode)))
+        self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+        if mode == "rwc":
+            self._make()
+            return
+        schema = self._file.execute("SELECT sql FROM sqlite_master").fetchall()
+        if schema not in ([], SCHEMA):
+            raise StorageError(f"{self.path}: is no store of a run, or one of an earlier pbdkit")
+        if self._writes:
+            self._file.execute(f"PRAGMA journal_mode = {_journal(self.path)}")
+        if schema:
+            self._list()
+
+    def _make(self) -> None:
+        self.identity = secrets.token_bytes(IDENTITY_BYTES)
+        self._file.execute(f"PRAGMA journal_mode = {_journal(self.path)}")
+        self._file.execute("BEGIN")
+        self._file.execute(f"PRAGMA application_id = {MARK}")
+        self._file.execute(TABLE)
+        self._listed[IDENTITY] = self._put(IDENTITY, self.identity)
+        self._file.execute("COMMIT")
+
+    def _put(self, key: str, data: bytes | memoryview) -> bytes:
+        """Writes a piece, unless it stands there already; its digest."""
+        found = self._digest(key, data)
+        if self._verified.get(key) != found:
+            self._file.execute("REPLACE INTO pieces VALUES (?, ?, ?)", (key, found, data))
+        return found
+
+    def _list(self) -> None:
+        """The pieces of the last commit, and whose they are. Raises StorageError where they are not
+        those that were committed together."""
+        rows = self._file.execute("SELECT key, CAST(digest AS BLOB) FROM pieces").fetchall()
+        query = "SELECT CAST(data AS BLOB) FROM pieces WHERE key = ?"
+        self.identity, *_ = self._file.execute(query, (IDENTITY,)).fetchone() or (b"",)
+        self.piece(IDENTITY)
+        self._listed = {str(key): digest or b"" for key, digest in rows}
+        if len(rows) == 1:
+            return
+        whole = self.facts(COMMIT)
+        del self._listed[COMMIT]
+        number = whole.get("number") if isinstance(whole, dict) else None
+        if type(number) is not int or whole.get("pieces") != _digest_of_all(self._listed):
+            raise StorageError(f"{self.path}: is damaged: not all of it is of one commit")
+        self.commits = number
+
+    def _digest(self, key: str, data: bytes | memoryview) -> bytes:
+        own = xxhash.xxh3_128(self.identity + key.encode())
+        own.update(data)
+        return own.digest()
 
     @contextmanager
     def _sqlite(self) -> Iterator[None]:
@@ -211,11 +273,6 @@ class StoredArray:
             done += len(some)
 
 
-def files_of(path: Path) -> list[Path]:
-    """The files that SQLite keeps of a store."""
-    return [path.with_name(path.name + more) for more in ("", "-journal", "-wal", "-shm")]
-
-
 def _refuse_others(path: Path) -> None:
     """Raises StorageError where the journal names a further file, which SQLite would remove once
     it has rolled back: no store has such a journal."""
@@ -230,7 +287,5 @@ def _journal(path: Path) -> str:
     return "WAL" if is_local(path) else "TRUNCATE"
 
 
-def _digest(key: str, data: bytes | memoryview) -> bytes:
-    own = xxhash.xxh3_128(key.encode())
-    own.update(data)
-    return own.digest()
+def _digest_of_all(listed: dict[str, bytes]) -> str:
+    return xxhash.xxh3_128_hexdigest(b"".join(sorted(listed.values())))

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from pbdkit.errors import StorageError
 from pbdkit.storage.file_system import opened_alone, sync_folder
 from pbdkit.storage.paged_file import PAGE, PagedFile
+from pbdkit.storage.records_header import SETTLED, Header, read_header, write_header
 from pbdkit.storage.run_files import (
     being_written,
+    damaged,
     records_of,
     remove_store,
     remove_unfinished,
@@ -81,8 +83,9 @@ class UnfinishedRun:
             raise
 
     @classmethod
-    def open(cls, output: Path, *, writing: bool) -> UnfinishedRun:
-        """The one that is there. Raises ExperimentError where another process writes it."""
+    def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
+        """The one that is there; commits may be lost where it is opened `anyway`. Nothing on the
+        disk changes where it is damaged. Raises ExperimentError where another process writes it."""
         store, records = store_of(output), records_of(output)
         try:
             disk = opened_alone(records) if writing else io.FileIO(records, "rb")
@@ -91,8 +94,19 @@ class UnfinishedRun:
         if disk is None:
             raise being_written(output)
         try:
-            opened = cls(output, disk, RunStore(store, mode="rw" if writing else "ro"))
-            opened._refuse_newer()
+            header = read_header(disk)
+            opened = cls(output, disk, RunStore(store))
+            try:
+                opened._refuse_newer()
+                opened._refuse_other(header, anyway)
+                if writing:
+                    opened._store.check()
+            except BaseException:
+                opened.release()
+                raise
+            if writing:
+                opened.release()
+                opened._store = RunStore(store, mode="rw")
         except BaseException:
             disk.close()
             raise
@@ -122,6 +136,7 @@ class UnfinishedRun:
         self._commit(file, [("facts", json_piece({"finished": status}))], set())
 
     def _commit(self, file: PagedFile, pieces: Iterable[Piece], gone: set[str]) -> None:
+        self._note_commits()
         file.sync()
         numbers = file.changed if self.kept else file.pages
         pages = [(f"{PAGES}{n}", bytes(file.pages[n])) for n in numbers]
@@ -130,6 +145,7 @@ class UnfinishedRun:
         layout = {"size": file.size, "pages": len(file.pages), "extents": len(file.extents)}
         described = [*pages, *(extents if added else []), ("file", json_piece(layout))]
         self._store.commit(chain(pieces, described), gone)
+        self._note_commits()
         file.commit()
         if not self.kept:
             sync_folder(self.output.absolute().parent)
@@ -201,6 +217,26 @@ class UnfinishedRun:
         if not isinstance(found, dict):
             raise StorageError(f"{self._store.path}: is damaged: '{key}' is no map of keys")
         return found
+
+    def _note_commits(self) -> None:
+        """In the records: how many the store must have from now on."""
+        write_header(self.disk, Header(self._store.identity, self._store.commits))
+
+    def _refuse_other(self, header: Header | None, anyway: bool) -> None:
+        """Raises StorageError where the records, which have this header, belong to another run, and
+        unless it is opened `anyway`, where they tell of commits that the store does not have."""
+        commits, store = self._store.commits, self._store.path
+        if header is None or (header is SETTLED and "finished" not in self.facts):
+            raise damaged(self.records, "its first bytes are not what was written")
+        if header is not SETTLED and header.identity != self._store.identity:
+            raise damaged(store, f"it belongs to another run than {self.records}")
+        if commits < header.commits and not anyway:
+            raise StorageError(
+                f"{store}: is damaged: it holds {commits} commits of {header.commits}, and the "
+                "last lie in a log that was damaged, cut or removed; nothing was changed; `pbdkit "
+                f"resume {self.output}` with --anyway goes on from the last commit that it holds, "
+                f"of step {self.facts.get('step')}"
+            )
 
     def _refuse_newer(self) -> None:
         found = self.about.get("format")

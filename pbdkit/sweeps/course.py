@@ -68,7 +68,7 @@ def carry_out(
         return Summary([], {}, 0, [], None)
     jobs = {member.job.key: member.job for member in members}
     with Store(folder) as store:
-        ends, faults = store.held()
+        ends = store.held()
         todo = [job for key, job in jobs.items() if key not in ends]
         passing: dict[str, Report] = {}
         run = 0
@@ -82,12 +82,13 @@ def carry_out(
                 passing[report.key] = report
             ends[report.key], run = (report.status, report.message), run + 1
         store.commit()
+        store.look_around()
         if run < len(todo):
-            return Summary(members, ends, run, faults, None)
+            return Summary(members, ends, run, store.faults, None)
         dataset = joined(grid, members, lambda key: passing.get(key) or store.report(key))
         dataset.attrs = _attributes(asked, versions)
         write_dataset(dataset, folder / RESULT, replace=True)
-    return Summary(members, ends, run, faults, folder / RESULT)
+    return Summary(members, ends, run, store.faults, folder / RESULT)
 
 
 class _StoppedError(Exception):

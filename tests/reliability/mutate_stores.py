@@ -1,9 +1,12 @@
-"""Stores of unfinished runs that were changed: flipped bits, cut, zeroed, swapped, rows of others.
+"""Stores of unfinished runs that were damaged: bits flipped, files cut, zeroed, swapped, missing,
+or put together from two runs or from two moments of one run.
 
     python tests/reliability/mutate_stores.py [--trials N] [--seed S] [--only NUMBER]
 
-Each is asked for its status, opened with all its values, drawn, and gone on with. Each call ends in
-a documented error or gives what the unchanged one gives, soon, and touches nothing but the output.
+Each is asked for its status, opened with all its values, some are drawn, and some run again without
+--force; then it is gone on with. Each call ends in a documented error or gives what the undamaged
+one gives, to the bit, and soon. No file is changed or removed where the damage is refused: with the
+undamaged files in the place of the damaged ones the run is gone on with to the right result.
 """
 
 from __future__ import annotations
@@ -17,12 +20,14 @@ import signal
 import sqlite3
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot  # noqa: F401  # the children find it loaded
 import numpy as np
+from damage import damage
 from trials import (
     EXPERIMENTS,
     OUTPUT,
@@ -30,80 +35,66 @@ from trials import (
     differences,
     done,
     ended,
+    often,
     recorded,
     reference,
     row,
     started,
+    warm_up,
     write_experiment,
 )
 
 import pbdkit
-from pbdkit import cli
 from pbdkit.errors import PbdkitError
-from pbdkit.storage import run_store
+from pbdkit.results.overlapping_sink import OverlappingSink
+from pbdkit.storage.run_files import store_of
+from pbdkit.storage.run_store import RunStore
+from pbdkit.storage.unfinished import UnfinishedRun
 
 KINDS = ("breaking", "settling", "increments", "large")
 DOCUMENTED = (0, 2, 3, 4, 6)
 PATIENCE_S = 20.0
-BLOCK = 512
 
 
-def unfinished(kind: str, folder: Path) -> None:
-    """A run that was killed after some commits, in a folder of its own."""
+def unfinished(parts: dict[str, Any], folder: Path) -> None:
+    """A run that was killed after some commits, in a folder of its own; beside it, under `earlier`,
+    what there was of it some commits before."""
     folder.mkdir()
     os.chdir(folder)
-    write_experiment(EXPERIMENTS[kind], folder)
-    wait_s = 0.15
-    while True:
-        pid = called("run", "e.json", "-o", OUTPUT, log=Path("log"))
-        end = time.monotonic() + 20.0
-        while not Path(OUTPUT + ".run-wal").exists() and time.monotonic() < end:
-            time.sleep(0.002)
-        time.sleep(wait_s)
-        os.kill(pid, signal.SIGKILL)
-        ended(pid)
-        if done("status", OUTPUT, log=Path("log"))[0] == 0:
-            return
-        wait_s *= 0.5 if Path(OUTPUT).exists() else 1.5  # it was done already, or had hardly begun
-        for path in folder.glob("*out.nc*"):
-            path.unlink()
+    write_experiment(parts, folder)
+    for command, commits in ((["run", "e.json", "-o", OUTPUT], 2), (["resume", OUTPUT], 3)):
+        code, said = done(*command, log=Path("log"), before=dying(commits))
+        assert code == -signal.SIGKILL, said
+        if commits == 2:
+            shutil.copytree(folder, folder / "earlier")
 
 
-def flip(draw: random.Random, data: bytearray) -> None:
-    for _ in range(draw.choice([1, 1, 3, 50])):
-        data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+def dying(commits: int) -> Callable[[], None]:
+    """What makes a process commit whenever it can, and end after so many commits."""
 
+    def begin() -> None:
+        often()
+        OverlappingSink.due = lambda self: True  # type: ignore[method-assign]
+        keep, left = UnfinishedRun.keep, [commits]
 
-def cut(draw: random.Random, data: bytearray) -> None:
-    del data[draw.randrange(len(data)) :]
+        def keeping(*args: Any) -> None:
+            keep(*args)
+            left[0] -= 1
+            if left[0] == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
 
+        UnfinishedRun.keep = keeping  # type: ignore[method-assign]
 
-def zero(draw: random.Random, data: bytearray) -> None:
-    at = draw.randrange(0, len(data), BLOCK)
-    length = min(len(data) - at, BLOCK * draw.choice([1, 8, 64]))
-    data[at : at + length] = bytes(length)
-
-
-def swap(draw: random.Random, data: bytearray) -> None:
-    size = draw.choice([BLOCK, 4096])
-    one, two = (draw.randrange(0, max(1, len(data) - size), size) for _ in range(2))
-    data[one : one + size], data[two : two + size] = (
-        data[two : two + size],
-        data[one : one + size],
-    )
-
-
-def lengthen(draw: random.Random, data: bytearray) -> None:
-    data += draw.randbytes(draw.choice([1, 4096]))
+    return begin
 
 
 def damage_file(draw: random.Random, others: list[Path]) -> str:
     path = draw.choice(sorted(p for p in Path.cwd().glob(OUTPUT + ".run*") if p.stat().st_size))
-    how = draw.choice([flip, flip, cut, zero, swap, lengthen])
-    data = bytearray(path.read_bytes())
-    how(draw, data)
-    path.write_bytes(data)
-    return f"{how.__name__} {path.name}"
+    return f"{damage(draw, path)} {path.name}"
+
+
+def damage_two(draw: random.Random, others: list[Path]) -> str:
+    return f"{damage_file(draw, others)}, {damage_file(draw, others)}"
 
 
 def remove_file(draw: random.Random, others: list[Path]) -> str:
@@ -116,29 +107,23 @@ def of_other(draw: random.Random, others: list[Path]) -> str:
     other = draw.choice(others)
     path = draw.choice(sorted(other.glob(OUTPUT + ".run*")))
     shutil.copy(path, path.name)
-    return f"other run's {path.name}"
+    return f"{path.name} of {other.name}"
 
 
 def rows(draw: random.Random, others: list[Path]) -> str:
     """Rows with their digests right, as somebody would write them who knows how."""
-    with sqlite3.connect(OUTPUT + ".run") as file:
-        table = dict(file.execute("SELECT key, data FROM pieces").fetchall())
-        key = draw.choice(sorted(table))
-        with sqlite3.connect(others[0] / (OUTPUT + ".run")) as other:
-            theirs = dict(other.execute("SELECT key, data FROM pieces").fetchall())
-        choices: list[bytes | None] = [None, b"", b"{}", b"[" * 100_000, b"1e999", table[key][:-1]]
-        choices += [theirs.get(key), theirs[draw.choice(sorted(theirs))], bytes(len(table[key]))]
-        data = draw.choice(choices)
-        if draw.random() < 0.5:
-            key, data = draw.choice(["about", "facts", "file"]), None
-        if data is None and key in ("about", "facts", "file"):
-            data = changed_fact(draw, table[key].decode()).encode()
-        if data is None:
-            file.execute("DELETE FROM pieces WHERE key = ?", (key,))
-        else:
-            digest = run_store._digest(key, data)
-            file.execute("REPLACE INTO pieces VALUES (?, ?, ?)", (key, data, digest))
-    file.close()
+    with RunStore(store_of(Path(OUTPUT))) as store, RunStore(store_of(others[0] / OUTPUT)) as other:
+        table = {key: store.piece(key) for key in store.keys("")}
+        theirs = {key: other.piece(key) for key in other.keys("")}
+    key = draw.choice(sorted(table))
+    choices: list[bytes | None] = [None, b"", b"{}", b"[" * 100_000, b"1e999", table[key][:-1]]
+    choices += [theirs.get(key), theirs[draw.choice(sorted(theirs))], bytes(len(table[key]))]
+    data = draw.choice(choices)
+    if draw.random() < 0.5:
+        key = draw.choice(["about", "facts", "file"])
+        data = changed_fact(draw, table[key].decode()).encode()
+    with RunStore(store_of(Path(OUTPUT)), mode="rw") as store:
+        store.commit([] if data is None else [(key, data)], [key])
     return f"row {key}: {str(data)[:60]}"
 
 
@@ -169,6 +154,11 @@ def hostile(draw: random.Random, others: list[Path]) -> str:
         tail += (sum(name)).to_bytes(4, "big") + magic
         Path(OUTPUT + ".run-journal").write_bytes(header.ljust(512, b"\0") + tail)
         return what
+    if what == "newer":
+        with RunStore(store_of(Path(OUTPUT)), mode="rw") as store:
+            about = store.facts("about") | {"format": "4"}
+            store.commit([("about", json.dumps(about).encode())])
+        return what
     with sqlite3.connect(OUTPUT + ".run") as file:
         if what == "trigger":
             sql = "CREATE TRIGGER t AFTER INSERT ON pieces BEGIN DELETE FROM pieces; END"
@@ -176,61 +166,128 @@ def hostile(draw: random.Random, others: list[Path]) -> str:
         elif what == "view":
             file.execute("ALTER TABLE pieces RENAME TO p")
             file.execute("CREATE VIEW pieces AS SELECT key, zeroblob(1e9) data, digest FROM p")
-        elif what == "attach":
-            file.execute("CREATE TABLE more (x DEFAULT (load_extension('precious')))")
         else:
-            about = file.execute("SELECT data FROM pieces WHERE key = 'about'").fetchone()[0]
-            data = about.replace(b'"format": "2"', b'"format": "3"')
-            digest = run_store._digest("about", data)
-            file.execute("REPLACE INTO pieces VALUES ('about', ?, ?)", (data, digest))
+            file.execute("CREATE TABLE more (x DEFAULT (load_extension('precious')))")
     file.close()
     return what
 
 
 HOW: list[Callable[[random.Random, list[Path]], str]] = [
     *[damage_file] * 8,
-    *[rows] * 4,
-    remove_file,
-    of_other,
+    *[damage_two] * 2,
+    *[remove_file] * 2,
+    *[of_other] * 3,
+    *[rows] * 2,
     hostile,
 ]
+BY_DESIGN = (rows, hostile)
+"""What somebody wrote who knows how: it may be another run, and is not put right again."""
 
 
 def read_all() -> None:
-    """Every value, and a picture."""
+    """Every value."""
     for name, values in zip(("times", "positions"), recorded(Path(OUTPUT)), strict=True):
         np.save(f"{name}.npy", values)
     with pbdkit.open(OUTPUT) as dataset:
         dataset.load()
-    cli.main(["plot", OUTPUT, "-o", "picture.png"])
 
 
-def tried(whole: Path, others: list[Path], seed: str) -> list[str]:
-    """What is wrong with how a changed copy in the current folder is dealt with."""
-    draw = random.Random(seed)
-    precious = Path("precious")
-    precious.write_bytes(b"not yours")
-    how = draw.choice(HOW)(draw, others)
-    found, told = [], how.startswith(("row", "other"))  # then it is another run, or says it is
-    for name, call in (
-        ("status", ["status", OUTPUT]),
-        ("open", None),
-        ("resume", ["resume", OUTPUT]),
-    ):
+class Trial:
+    """A damaged copy of an unfinished run in the current folder, and how it is dealt with."""
+
+    def __init__(self, whole: Path, base: Path, others: list[Path], seed: str) -> None:
+        self.whole, self.base, self.draw = whole, base, random.Random(seed)
+        self.found: list[str] = []
+        self.outcome = ""
+        Path("precious").write_bytes(b"not yours")
+        how = self.draw.choice(HOW)
+        self.by_design = how in BY_DESIGN
+        self.how = how(self.draw, others)
+        self.files = files()
+
+    def run(self) -> list[str]:
+        """What is wrong."""
+        looks = [("status", ["status", OUTPUT]), ("open", None)]
+        if self.draw.random() < 0.1:
+            looks.append(("plot", ["plot", OUTPUT, "-o", "picture.png"]))
+        for name, call in looks:
+            code, _ = self.call(name, call)
+            if files() != self.files:
+                self.found.append(f"{name} changed {changed(self.files, files())}")
+            if name == "open" and code == 0 and not self.by_design and is_other(self.whole):
+                self.found.append("what was read is not what the run recorded, and nothing said")
+        code, said = self.call("resume", ["resume", OUTPUT])
+        if code == 0:
+            self.outcome = "gone on with"
+            if not self.by_design and (wrong := result_is_other(self.whole)):
+                self.found.append(f"gone on with to another result: {wrong}")
+        elif "there is no unfinished run" in said:
+            self.found.append(f"forgotten: {said}")
+        else:
+            self.outcome = "named"
+            self.refused(said)
+        precious = Path("precious")
+        if not precious.exists() or precious.read_bytes() != b"not yours":
+            self.found.append("touched another file")
+        return [f"{self.how}: {finding}" for finding in self.found]
+
+    def call(self, name: str, call: list[str] | None) -> tuple[int, str]:
+        """One command, or the reading of all."""
         begun, log = time.monotonic(), Path(f"log-{name}")
         pid = called(*call, log=log) if call else started(reading, log)
         code, said = ended(pid), log.read_text(errors="replace")
         if code == -1000 or time.monotonic() - begun > PATIENCE_S:
-            found.append(f"{name} hung")
+            self.found.append(f"{name} hung")
         elif code not in DOCUMENTED or "Traceback" in said:
-            found.append(f"{name} ended with {code}: {said[-1500:]}")
-        elif name == "open" and code == 0 and not told and is_other(whole):
-            found.append("what was read is not what the run recorded, and nothing said")
-        elif name == "resume" and code == 0 and not told and (wrong := result_is_other(whole)):
-            found.append(f"gone on with to another result: {wrong}")
-    if not precious.exists() or precious.read_bytes() != b"not yours":
-        found.append("touched another file")
-    return [f"{how}: {finding}" for finding in found]
+            self.found.append(f"{name} ended with {code}: {said[-1500:]}")
+        return code, said
+
+    def refused(self, said: str) -> None:
+        """After `resume` has refused it."""
+        if gone := {*self.files} - {*files()} - {OUTPUT + ".run-wal"}:
+            self.found.append(f"resume removed {sorted(gone)}")
+        if self.by_design:
+            return
+        if self.draw.random() < 0.25:
+            before = files()
+            code, told = self.call("run", ["run", "e.json", "-o", OUTPUT])
+            if code == 0 or files() != before:
+                what = f"changed {changed(before, files())}"
+                self.found.append(f"run ended with {code}, {what}: {told}")
+        if "--anyway goes on from the last commit" in said:
+            self.outcome = "named, gone on with on request"
+            code, told = self.call("anyway", ["resume", OUTPUT, "--anyway"])
+            if code == 0 and (wrong := result_is_other(self.whole)):
+                self.found.append(f"gone on with anyway to another result: {wrong}")
+            if code:
+                self.outcome = "named"
+        if not Path(OUTPUT).exists():
+            self.put_right()
+
+    def put_right(self) -> None:
+        """What was damaged is as it was again, and all else as the commands left it."""
+        for path in Path.cwd().glob(OUTPUT + ".run*"):
+            if path.name not in {p.name for p in self.base.iterdir()}:
+                path.unlink()
+        for path in self.base.glob(OUTPUT + ".run*"):
+            if self.files.get(path.name) != path.read_bytes():
+                shutil.copy(path, path.name)
+        code, said = self.call("resume again", ["resume", OUTPUT])
+        if code or (wrong := result_is_other(self.whole)):
+            said = said if code else str(wrong)
+            self.found.append(f"with the undamaged files again: {code}, {said[-500:]}")
+
+
+def files() -> dict[str, bytes]:
+    """All that is there of the run, but for empty files and the memory that SQLite shares."""
+    paths = [*Path.cwd().glob(OUTPUT + "*"), *Path.cwd().glob(f".{OUTPUT}.*")]
+    found = {path.name: path.read_bytes() for path in paths if not path.name.endswith("-shm")}
+    return {name: data for name, data in found.items() if data}
+
+
+def changed(before: dict[str, bytes], now: dict[str, bytes]) -> list[str]:
+    """The names of what is not as it was."""
+    return sorted(name for name in before | now if before.get(name) != now.get(name))
 
 
 def is_other(whole: Path) -> bool:
@@ -264,32 +321,46 @@ def main() -> None:
     asked.add_argument("--kinds", nargs="+", default=[*KINDS])
     given = asked.parse_args()
     numbers = range(given.trials) if given.only is None else [given.only]
-    failed = all_tried(given.seed, numbers, given.kinds)
-    row("changed stores: crash 0, hang 0, silent difference 0", f"{failed} in {len(numbers)}")
+    outcomes = all_tried(given.seed, numbers, given.kinds)
+    failed = outcomes.pop("failed", 0)
+    told = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.most_common())
+    goal = "damaged stores: crash, hang, silent difference, changed or removed while refused: 0"
+    row(goal, f"{failed} in {len(numbers)}: {told}")
     raise SystemExit(failed > 0)
 
 
-def all_tried(seed: int, numbers: Any, kinds: list[str]) -> int:
-    """With how many something was wrong."""
-    failed, here = 0, Path.cwd()
+def twin(parts: dict[str, Any]) -> dict[str, Any]:
+    """The same experiment pulled a little faster: every piece has the same key and size."""
+    found: dict[str, Any] = json.loads(json.dumps(parts))
+    found["leaders"][1]["motion"]["velocity"][0] *= 1.01
+    return found
+
+
+def all_tried(seed: int, numbers: Any, kinds: list[str]) -> Counter[str]:
+    """How they ended; `failed` are those with which something was wrong."""
+    outcomes, here = Counter[str](), Path.cwd()
     with tempfile.TemporaryDirectory() as name:
         base = Path(name)
+        warm_up(base / "warm")
         wholes = {kind: reference(EXPERIMENTS[kind], base / f"whole-{kind}")[0] for kind in kinds}
         for kind in kinds:
-            unfinished(kind, base / kind)
+            unfinished(EXPERIMENTS[kind], base / kind)
+            unfinished(twin(EXPERIMENTS[kind]), base / f"twin-{kind}")
         for number in numbers:
             kind = kinds[number % len(kinds)]
             folder = base / str(number)
-            shutil.copytree(base / kind, folder)
+            shutil.copytree(base / kind, folder, ignore=shutil.ignore_patterns("earlier"))
             os.chdir(folder)
-            others = [base / other for other in kinds if other != kind] or [base / kind]
-            found = tried(wholes[kind], others, f"{seed}/{number}")
+            others = [base / f"twin-{kind}", base / kind / "earlier"]
+            others += [base / other for other in kinds if other != kind]
+            trial = Trial(wholes[kind], base / kind, others, f"{seed}/{number}")
+            found = trial.run()
             for finding in found:
                 print(f"{number} ({kind}): {finding}", flush=True)
-            failed += bool(found)
+            outcomes["failed" if found else trial.outcome] += 1
             os.chdir(here)
             shutil.rmtree(folder)
-    return failed
+    return outcomes
 
 
 if __name__ == "__main__":

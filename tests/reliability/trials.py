@@ -3,6 +3,7 @@ that can be killed, and the comparison of two results, bit for bit."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, suppress
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +124,18 @@ def ended(pid: int, patience_s: float = 60.0) -> int:
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
     return -1000
+
+
+def warm_up(folder: Path) -> None:
+    """Calls the program in this process, so that those that it forks find all modules loaded."""
+    folder.mkdir()
+    os.chdir(folder)
+    name = write_experiment(BASE | BREAKING | {"steps": 2}, folder)
+    last = ["resume", OUTPUT, "--steps", "3", "--quiet"]
+    for line in (["run", name, "-o", OUTPUT, "--quiet"], ["status", OUTPUT], last):
+        with suppress(SystemExit), redirect_stderr(io.StringIO()):
+            main(line)
+    recorded(Path(OUTPUT))
 
 
 def called(*arguments: str, log: Path, before: Callable[[], object] = often) -> int:

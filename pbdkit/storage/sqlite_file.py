@@ -1,0 +1,84 @@
+"""SQLite files: opened for writing, or looked at without a change to anything on the disk."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+BEGINNING = b"SQLite format 3\0"
+SMALLEST_PAGE = 512
+PATIENCE_S = 60.0
+"""Seconds to wait for another program that has locked the file."""
+LOGS = ("-journal", "-wal")
+"""What SQLite adds to the name of the file, for commits that are not in it, or not yet."""
+SHARED_MEMORY = "-shm"
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files that SQLite keeps of a database, there or not."""
+    return [path.with_name(path.name + more) for more in ("", *LOGS, SHARED_MEMORY)]
+
+
+def is_database(path: Path) -> bool:
+    """Whether a file begins as an SQLite database does. Raises OSError.
+
+    Of what does not, SQLite would remove the log, should there be one.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(SMALLEST_PAGE)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return len(head) == SMALLEST_PAGE and head.startswith(BEGINNING)
+
+
+def connect(path: Path, mode: str) -> sqlite3.Connection:
+    """Open a database whose schema is not to be trusted; `mode` is ro, rw, or rwc to make it.
+
+    Raises sqlite3.Error.
+    """
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}",
+        timeout=PATIENCE_S,
+        isolation_level=None,
+        check_same_thread=False,
+        uri=True,
+    )
+    for setting in ("trusted_schema = OFF", "cell_size_check = ON", "synchronous = FULL"):
+        connection.execute(f"PRAGMA {setting}")
+    return connection
+
+
+def look(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
+    """Open a database to read one commit of it; `closing` closes it. Raises sqlite3.Error, OSError.
+
+    A connection that may write would drop a damaged write-ahead log when it is closed. What a
+    killed process was writing with a journal has to be undone before it can be read: that is done
+    in a copy.
+    """
+    connection = closing.enter_context(contextlib.closing(connect(path, "ro")))
+    try:
+        connection.execute("BEGIN")
+        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError as error:
+        if error.sqlite_errorcode != sqlite3.SQLITE_READONLY_ROLLBACK:
+            raise
+        folder = Path(closing.enter_context(TemporaryDirectory(prefix="pbdkit-")))
+        for file in files_of(path)[:-1]:
+            if file.exists():
+                shutil.copyfile(file, folder / file.name)
+        connection = closing.enter_context(contextlib.closing(connect(folder / path.name, "rw")))
+        connection.execute("BEGIN")
+    return connection
+
+
+def fault_of(connection: sqlite3.Connection) -> str:
+    """What SQLite finds wrong in a database, first of all; empty where nothing is."""
+    try:
+        (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    except sqlite3.DatabaseError as error:
+        return str(error)
+    return "" if found == "ok" else str(found).splitlines()[-1]
