@@ -10,7 +10,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.results.result_file import fault_of
 from pbdkit.storage.destination import kind_of, written
 from pbdkit.storage.paged_file import PagedFile
-from pbdkit.storage.run_files import is_unfinished
+from pbdkit.storage.run_files import make_room
 
 if TYPE_CHECKING:
     import xarray
@@ -78,7 +78,7 @@ def refuse_taken(path: Path, *, force: bool) -> None:
         raise ExperimentError(f"{path}: is {kind}, which is not replaced; name another file")
     if os.path.lexists(path) and not force:
         raise ExperimentError(f"{path}: exists; force=True replaces it")
-    if is_unfinished(path, discard=force):
+    if not make_room(path, discard=force):
         raise ExperimentError(
             f"{path}: an unfinished run of it is here; pbdkit.resume({str(path)!r}) goes on with "
             "it, force=True discards it"
