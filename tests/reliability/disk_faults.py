@@ -33,6 +33,8 @@ LIBRARY = "PBDKIT_DISK_FAULTS"
 """The variable of the environment that names the library, which is preloaded then."""
 KINDS = {"EIO": 1, "short": 2, "full": 3}
 SKIPPED = 77
+MEMORY = Path("/dev/shm")
+"""A file system that need not wait for a disk."""
 
 
 def preloaded() -> Any:
@@ -93,10 +95,11 @@ FIT = {
     "unknown": {"rule.poisson_ratio": [0.0, 0.49]},
     "measured": {"file": "field.csv", "noise": 1e-3},
 }
-STORES = re.compile(r"out\.nc\.run(-wal|-shm|-journal|-records)?|s(/lock|/sweep\.sqlite.*)?")
+STORES = re.compile(r"out\.nc\.run(-wal|-shm|-journal|-records)?|s(/lock|/sweep\.sqlite.*|/set-aside.*)?")
 """What an exit of 6 may leave: an unfinished run, members that are finished."""
-LOGS = re.compile(r".*\.sqlite-(wal|shm)")
-"""What SQLite leaves where it cannot close a database, and takes up again."""
+LOGS = re.compile(r".*\.sqlite-(wal|shm)|s/set-aside.*")
+"""What SQLite leaves where it cannot close a database, and takes up again; and what a sweep sets
+aside of a database that it cannot read."""
 
 
 @dataclass
@@ -414,7 +417,7 @@ def _main() -> None:
     total = broke = 0
     every = commands()
     for name in given.commands.split(",") if given.commands else every:
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
             bench = Bench(every[name], Path(folder).resolve())
             for kind in given.kinds.split(","):
                 count, findings = bench.tried(kind, given.first, given.every)
