@@ -95,7 +95,9 @@ FIT = {
     "unknown": {"rule.poisson_ratio": [0.0, 0.49]},
     "measured": {"file": "field.csv", "noise": 1e-3},
 }
-STORES = re.compile(r"out\.nc\.run(-wal|-shm|-journal|-records)?|s(/lock|/sweep\.sqlite.*|/set-aside.*)?")
+STORES = re.compile(
+    r"out\.nc\.run(-wal|-shm|-journal|-records)?|s(/lock|/sweep\.sqlite.*|/set-aside.*)?"
+)
 """What an exit of 6 may leave: an unfinished run, members that are finished."""
 LOGS = re.compile(r".*\.sqlite-(wal|shm)|s/set-aside.*")
 """What SQLite leaves where it cannot close a database, and takes up again; and what a sweep sets
