@@ -29,7 +29,7 @@ RULES = {
 LENGTHS = (7, 30, 140, 500)
 
 
-def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=25):
+def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
     """The experiment of a bar, and the force and the elongation of its recorded states."""
     turn = np.radians(angle)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
@@ -43,8 +43,12 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=25):
 
     ends = length / 2 - 0.6
     middle = 0.37 if angle else 0.55
-    way = 2.3 * ell * ONSET
-    motion = {"type": "velocity", "velocity": (way / increments * along).tolist()}
+    ways = np.array([1.1 * length, 2.3 * ell + length]) * ONSET
+    motion = {
+        "type": "path",
+        "steps": [increments // 2, increments],
+        "displacements": (ways[:, None] * along).tolist(),
+    }
     return {
         "name": "bar",
         "lattice": {"type": lattice, "a": 1.0, "origin": [0.0, 0.0]},
@@ -56,15 +60,22 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=25):
             "weak": zone(-middle, middle),
             "left": zone(-length, -ends),
             "right": zone(ends, length),
+            "near-left": zone(-length, -ends + 1.1),
+            "near-right": zone(ends - 1.1, length),
         },
         "fracture": {
             "type": "cohesive",
             "energy": ell * ONSET**2,
-            "onset": {"otherwise": ONSET, "weak": WEAK * ONSET},
+            "onset": {
+                "otherwise": ONSET,
+                "weak": WEAK * ONSET,
+                "near-left": 2.0 * ONSET,  # clamps concentrate the stress
+                "near-right": 2.0 * ONSET,
+            },
         },
         "leaders": [
             {"select": {"region": "left"}, "motion": {"type": "hold"}},
-            {"select": {"region": "right"}, "motion": motion | {"steps": increments}},
+            {"select": {"region": "right"}, "motion": motion},
         ],
         "steps": increments,
         "solver": {"type": "equilibrium", "tolerance": 1e-5, "increments": increments},
@@ -83,7 +94,9 @@ def measured(lattice, rule, ell, angle=0.0, height=4.0, **more):
     ds = pbdkit.run(given, progress=False)
     turn = np.radians(angle)
     force = np.abs(ds.reaction.sel(leader_group=1).values @ [np.cos(turn), np.sin(turn)])
-    way = ds.time.values * np.hypot(*given["leaders"][1]["motion"]["velocity"])
+    motion = given["leaders"][1]["motion"]
+    ways = np.hypot(*np.transpose(motion["displacements"]))
+    way = np.interp(ds.time.values, [0, *motion["steps"]], [0.0, *ways])
     work = np.trapezoid(force, way)
     peak = force.max()
     return peak / height / ONSET, work / height / (ell * ONSET**2), force[-1] / peak
