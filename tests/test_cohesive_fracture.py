@@ -81,7 +81,7 @@ def along(degrees):
     return np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
 
 
-def uniaxial(rule, normal):
+def strain_of_uniaxial(rule, normal):
     """The strain under a uniaxial stress of Young's modulus along x."""
     (xx, yy, xy, shear, *_), nu = rule.elasticity(), rule.through_thickness()
     C = np.array([[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, shear]])
@@ -114,24 +114,22 @@ CELLS = [
 
 @pytest.mark.parametrize(("lattice", "rule"), CELLS)
 def test_a_cell_bears_the_onset_and_takes_the_energy(lattice, rule):
-    """Under uniaxial stress across the crack: that peaks at onset times the modulus along it, and
-    its work on the band of cells that the crack crosses is energy · E."""
+    """Strained across the crack alone, as a band between cells that stay elastic: the stress peaks
+    at onset times the modulus along its normal, and its work on the band is energy · E."""
     onset, energy = 1e-3, 6e-6
     fracture = {"type": "cohesive", "energy": energy, "onset": onset}
-    for degrees in LATTICES[lattice]:
+    for degrees in LATTICES[lattice][: 2 if rule == "orthotropic" else None]:
         given = Strained(rule=RULES[rule], lattice=lattice, fracture=fracture)
         normal = along(degrees)
-        strain, modulus = uniaxial(given.scene.experiment.rule, normal)
+        uniaxial, modulus = strain_of_uniaxial(given.scene.experiment.rule, normal)
         polygon = given.scene.neighbourhood.tiling.polygons[0]
         width = np.ptp(np.array(polygon.rest) @ normal)
-        flexible = float(normal @ strain @ normal)
-        strength = onset * (modulus if rule == "plane strain" else modulus / flexible)
-        last = 2.05 * energy / (strength * width * flexible)
-        ways = np.linspace(0.0, last, 120)
+        along_normal = 1.0 if rule == "plane strain" else float(normal @ uniaxial @ normal)
+        strength, strain = onset * modulus / along_normal, np.outer(normal, normal)
+        ways = np.linspace(0.0, 2.1 * energy / (strength * width), 120)
         pulls = [float(normal @ given.stress(way * strain) @ normal) for way in ways]
-        stretch = ways * flexible
         assert max(pulls) == pytest.approx(strength, rel=0.02)
-        assert np.trapezoid(pulls, stretch) * width == pytest.approx(energy, rel=0.02)
+        assert np.trapezoid(pulls, ways) * width == pytest.approx(energy, rel=0.02)
         assert abs(pulls[-1]) < 1e-3 * onset
         assert given.broken > 0
 
@@ -283,7 +281,7 @@ def test_kernels_soften_as_numpy_does(lattice, rule, threads):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        (body(9.0), ["0.0006 is too little for this spacing", "make the spacing smaller than"]),
+        (body(14.0), ["0.0006 is too little for this spacing", "make the spacing smaller than"]),
         (body(0.1, {"type": "barycentre"}) | {"frame": {"type": "mean"}},
          ["'cohesive' needs a rule that is calibrated to a material", "which 'barycentre'",
           "or fracture: {type: damage}"]),
@@ -301,10 +299,10 @@ def test_what_does_not_go_with_it_is_told(parts, words):
 
 def test_the_remedies_for_a_large_spacing_are_true():
     with pytest.raises(pbdkit.ExperimentError) as error:
-        build_scene(pbdkit.Experiment(**body(9.0)))
+        build_scene(pbdkit.Experiment(**body(14.0)))
     words = str(error.value).split()
     share, onset = float(words[words.index("than") + 1]), float(words[words.index("below") + 1][:6])
-    for size, more in ((9.0 * share * 0.99, {}), (9.0, {"onset": onset * 0.99})):
+    for size, more in ((14.0 * share * 0.99, {}), (14.0, {"onset": onset * 0.99})):
         build_scene(pbdkit.Experiment(**body(size, fracture=COHESIVE | more)))
 
 
@@ -312,8 +310,8 @@ def test_a_beam_tears_as_griffith_says():
     """A sample of `fracture_energy.py`; the whole is in docs/fracture.md."""
     import fracture_energy
 
-    share = fracture_energy.beam(15, far=1.3, count=16)
-    assert share.mean() == pytest.approx(1.0, abs=0.03)
+    share = fracture_energy.beam(29, far=1.3, count=8)
+    assert share.mean() == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("last", [0, 5])

@@ -39,9 +39,10 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     reaches the onset, the direction of that is the normal e of the cell's crack, for good. Bonds of
     the cell that cross the crack, |n · e| > 0.3, lose their pull in the cell by the largest stress
     κ over Young's modulus since: D = failure / (failure - onset) (1 - onset / κ); the others do
-    not. The failure strain is 2 energy / (onset · width), the width of the cell along e being that
-    of the band of cells which a straight crack crosses (Bažant and Oh 1983, Oliver 1989). A bond is
-    broken where D is 1 in all cells beside it. Cracks do not close under pressure.
+    not. The failure strain is such that a band of cells which a straight crack crosses, and which
+    does not contract along it, takes up the energy: its width is that of the cell along e (Bažant
+    and Oh 1983, Oliver 1989). A bond is broken where D is 1 in all cells beside it. Cracks do not
+    close under pressure.
     """
 
     type: Literal["cohesive"] = "cohesive"
@@ -66,19 +67,21 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         return {"onset_strain": self.onset}
 
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """`release` = 2 energy / onset over the modulus of the cell along x, a length; the
-        compliances `along_y` and `across` over that along x; and the bonds of a cell, `x0` to `y2`.
+        """`release`, 2 energy / onset times the stiffness along x over the squared modulus along x,
+        a length; the compliances `along_y` and `across` over that along x, and the stiffnesses
+        `stiff_y` and `stiff_across`; and the bonds of a cell, `x0` to `y2`.
 
         ExperimentError where the failure strain of some crack is not above the onset, since the
         spacing is too large for so little energy.
         """
-        modulus, along_y, across = _compliance(rule)
+        release, ratios = _material(rule)
         bonds = _bonds_of_a_cell(setting)
         angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
         cos, sin = np.cos(2 * angles), np.sin(2 * angles)
         size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
-        size = float((size / _flexibility(cos, sin, along_y, across)).max())
-        room = 2.0 * self.energy / (modulus * size * self.onset**2)
+        flexibility, stiffness = (_along(cos, sin, *pair) for pair in (ratios[:2], ratios[2:]))
+        size = float((size / (flexibility * flexibility * stiffness)).max())
+        room = 2.0 * self.energy * release / (size * self.onset**2)
         if np.any(room <= 1.0):
             raise ExperimentError(
                 f"{self.energy:g} is too little for this spacing: a cell would have to be torn "
@@ -90,8 +93,8 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
             )
         cell = {f"x{n}": float(r.x) for n, r in enumerate(bonds)}
         cell |= {f"y{n}": float(r.y) for n, r in enumerate(bonds)}
-        compliance = {"along_y": along_y, "across": across}
-        return {"release": 2.0 * self.energy / (modulus * self.onset), **compliance, **cell}
+        known = dict(zip(("along_y", "across", "stiff_y", "stiff_across"), ratios, strict=True))
+        return {"release": 2.0 * self.energy * release / self.onset, **known, **cell}
 
     def remembered(self) -> tuple[Remembered, ...]:
         """`damage_left` and `damage_right`, and the strains at which the cells are torn, negative
@@ -117,7 +120,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
     def load(stress: CellStress, c: Any, p: Any) -> Any:
         """κ over the onset."""
         largest, cos, sin = _principal(stress)
-        return largest * _flexibility(cos, sin, c.along_y, c.across) / c.onset_strain
+        return largest * _along(cos, sin, c.along_y, c.across) / c.onset_strain
 
     @staticmethod
     def breaks(d: Any, r: Any, c: Any, p: Any) -> Any:
@@ -128,14 +131,15 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
 def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> Any:
     """The damage of a bond in a cell under a stress, and the failure strain, from those before."""
     largest, cos, sin = _principal(stress)
-    flexibility = _flexibility(cos, sin, c.along_y, c.across)
+    flexibility = _along(cos, sin, c.along_y, c.across)
     strain = largest * flexibility
     size = _projection(Vector(c.x0, c.y0), cos, sin)
     other = _projection(Vector(c.x1, c.y1), cos, sin)
     size = where(other > size, other, size)
     other = _projection(Vector(c.x2, c.y2), cos, sin)
     size = np.sqrt(where(other > size, other, size))
-    fails = c.release * flexibility / size
+    stiffness = _along(cos, sin, c.stiff_y, c.stiff_across)
+    fails = c.release * flexibility * flexibility * stiffness / size
     crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
     begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
     failure = where(begins, where(crossed, fails, -fails), failure)
@@ -159,20 +163,21 @@ def _projection(r: Any, cos: Any, sin: Any) -> Any:
     return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
 
 
-def _flexibility(cos: Any, sin: Any, along_y: Any, across: Any) -> Any:
-    """The strain along that direction under a unit of stress along it, over that along x."""
+def _along(cos: Any, sin: Any, along_y: Any, across: Any) -> Any:
+    """A compliance or a stiffness along that direction, over that along x."""
     x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
     return x * x + along_y * y * y + across * 0.25 * sin * sin
 
 
-def _compliance(rule: Calibrated) -> tuple[float, float, float]:
-    """Of a rule's material the modulus along x, such that a stress of onset times Young's modulus
-    takes the energy with it; and S_yy and 2 S_xy + S_shear over S_xx in its plane."""
-    material, nu = rule.elasticity(), rule.through_thickness()
+def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float]]:
+    """Of a rule's material the stiffness along x over the squared modulus along x; and S_yy and
+    2 S_xy + S_shear over S_xx, C_yy and 2 C_xy + 4 C_shear over C_xx, in its plane."""
+    material = rule.elasticity()
     assert material is not None
     xx, yy, xy, shear, *_ = material
     across = (xx * yy - xy * xy) / (yy * shear) - 2.0 * xy / yy
-    return material.own_modulus(nu) * (1.0 - nu * nu), xx / yy, across
+    ratios = xx / yy, across, yy / xx, (2.0 * xy + 4.0 * shear) / xx
+    return xx / material.own_modulus(rule.through_thickness()) ** 2, ratios
 
 
 def _bonds_of_a_cell(setting: Setting) -> tuple[Components, Components, Components]:
