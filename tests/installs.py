@@ -113,7 +113,7 @@ CASES = (
     Case("plugins new pbdkit-fresh", told="pbdkit-fresh"),
     Case("sweep sweep.yaml", told="2 of 2 members"),
     Case("fit fit.yaml", told="poisson_ratio"),
-    Case("bench start --steps 2", told="left out: compiled, 1 threads"),
+    Case("bench start --steps 2", told="numba is not installed: pip install 'pbdkit[fast]'"),
     Case("import pbdkit; print(pbdkit.open('start.nc').pbd)"),
     Case("import pbdkit; pbdkit.rerun(pbdkit.open('start.nc'), progress=False)"),
     Case("import pbdkit; pbdkit.run('material/bar', progress=False)"),
