@@ -84,14 +84,18 @@ def worded(
         if package and str(frame.f_globals.get("__name__")).split(".")[0] == package:
             # which takes the separators of every system
             place = f" ({PureWindowsPath(frame.f_code.co_filename).name}, line {line})"
-    return one_line(told) + remedy(error, component) + place
+    advice = ""
+    with suppress(Exception):  # foreign errors and objects can fail to be looked at
+        advice = remedy(error, component)
+    return one_line(told) + advice + place
 
 
 def remedy(error: BaseException, component: type[Component] | None = None) -> str:
     """Return what elementwise functions are to do instead, where the fault is a frequent one."""
     if isinstance(error, ValueError) and "truth value of an array" in str(error):
         return "; choose with `pbdkit.where` in the place of `if`, `and` and `or`"
-    if "'NoneType'" in str(error) and not getattr(component, "uses_reference", True):
+    of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
+    if of_none and not getattr(component, "uses_reference", True):
         return f"; {NO_REFERENCE}"
     if not isinstance(error, AttributeError):
         return ""
