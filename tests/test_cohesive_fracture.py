@@ -306,6 +306,19 @@ def test_the_remedies_for_a_large_spacing_are_true():
         build_scene(pbdkit.Experiment(**body(size, fracture=COHESIVE | more)))
 
 
+def test_a_bar_bears_its_strength_and_takes_its_energy():
+    """A sample of `cohesive_strength.py`: the onset is 1.5 % lower in a zone."""
+    import cohesive_strength
+
+    rule = cohesive_strength.RULES["elastic, ν = .2"]
+    strength, energy, left = cohesive_strength.measured(
+        "square", rule, 30, height=2.0, length=5.0, increments=20
+    )
+    assert strength == pytest.approx(0.985, abs=0.01)
+    assert energy == pytest.approx(1.0, abs=0.02)
+    assert left < 1e-9
+
+
 def test_a_beam_tears_as_griffith_says():
     """A sample of `fracture_energy.py`; the whole is in docs/fracture.md."""
     import fracture_energy
