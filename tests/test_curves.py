@@ -159,8 +159,8 @@ def test_bonds_have_a_history(torn):
         pbdkit.load("modelling/double-cantilever", settings=["solver.increments=1"]), progress=False
     )
     row = int(np.flatnonzero(damaged.broken_step > 0)[0])
-    (line,) = drawn(damaged.pbd.history("damage", bond=damaged.bond_ends.values[row]))
-    np.testing.assert_array_equal(line[1], damaged.damage.isel(bond=row))
+    (line,) = drawn(damaged.pbd.history("damage_left", bond=damaged.bond_ends.values[row]))
+    np.testing.assert_array_equal(line[1], damaged.damage_left.isel(bond=row))
 
 
 def test_the_crack_of_a_part_of_a_body_is_that_between_its_particles(torn):

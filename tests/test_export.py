@@ -145,8 +145,8 @@ def test_damage_is_of_bonds_and_changes(tmp_path):
     export(ds, tmp_path / "out.vtkhdf", build_scene(made), replace=False)
     for k, grid in enumerate(grids(tmp_path / "out.vtkhdf")):
         data = grid.GetCellData()
-        part, damage = field(data, "part"), field(data, "damage")
-        np.testing.assert_array_equal(damage[part == BOND], ds.damage.isel(time=k))
+        part, damage = field(data, "part"), field(data, "damage_left")
+        np.testing.assert_array_equal(damage[part == BOND], ds.damage_left.isel(time=k))
         assert np.isnan(damage[part != BOND]).all()
 
 
