@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from contextlib import suppress
+
+COLLECT_AFTER = 100_000
+"""Number of new objects after which the garbage collector looks for cycles. Python's own 700 make
+it look hundreds of times while a command is loaded, when nothing can be freed."""
 
 
 def main() -> None:
     """As `pbdkit.cli.main`; who interrupts it while it is being loaded sees no traceback either."""
     # An exception can be lost in what libraries do as they are imported; nothing is to be undone.
     before = signal.signal(signal.SIGINT, _end)
+    gc.set_threshold(COLLECT_AFTER)
     try:
         from pbdkit.cli import main as program
 

@@ -112,8 +112,9 @@ class Fracturing:
     def _breaks(self, part: _Renewed, when: str) -> NDArray[np.bool_]:
         """Which of some bonds break."""
         with np.errstate(all="ignore"), blaming(self._model, when):
-            found = self._evaluator.breaks(part.d, part.r, part.limits, part.own)
-        return np.asarray(part.intact & found)
+            return np.asarray(
+                part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.own)
+            )
 
     def _hold_back(self, before: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
         """Leaves cells as they were `before` that would begin to soften, all but the most loaded,
