@@ -49,9 +49,9 @@ def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes |
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Axes | Figure:
-        from pbdkit.drawing.figures import figure_of
-
         drawn = function(*args, **kwargs)
+        from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
+
         return figure_of(drawn[0]) if isinstance(drawn, list) else drawn
 
     return call

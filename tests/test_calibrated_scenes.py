@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+import numpy as np
 import pytest
 
 import pbdkit
@@ -162,3 +163,17 @@ def test_a_rule_on_the_moves_of_another_remembers_nothing():
     tiring = Tiring(poisson_ratio=0.3, length=2.0)
     with pytest.raises(pbdkit.ExperimentError, match="one that remembers nothing"):
         scene(rule=tiring)
+
+
+def test_bodies_of_given_sites_are_part_of_differences_without_a_warning():
+    """Such bodies have no outline and are infinitely far: their differences have whole cells."""
+    body = {
+        "type": "difference",
+        "of": [
+            {"type": "rectangle", "width": 9.0, "height": 6.0, "origin": [-4.0, -1.3]},
+            {"type": "grid", "columns": 4, "rows": 4},
+        ],
+    }
+    cells = scene(body=body, leaders=[]).cells
+    assert cells is not None
+    assert np.isfinite(cells.share).all()

@@ -197,7 +197,7 @@ runpy.run_module("pbdkit", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["pbdkit.cli", "click", "pbdkit.api", "h5netcdf"])
+@pytest.mark.parametrize("module", ["pbdkit.cli", "click", "pbdkit.scene.scene", "h5netcdf"])
 def test_an_interruption_while_the_program_is_loaded_shows_no_traceback(
     call: Call, module: str
 ) -> None:

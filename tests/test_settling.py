@@ -411,7 +411,7 @@ def test_the_command_says_how_far_from_equilibrium_the_run_ended(tmp_path, monke
     assert "of equilibrium (0.001 of the largest prescribed displacement), by the" in done.output
     assert "engine: numpy" in done.output
     figures = CliRunner().invoke(program, [*call, "--json", "--force"])
-    assert json.loads(figures.output)["status"] == "settled"
+    assert json.loads(figures.stdout)["status"] == "settled"
     short = CliRunner().invoke(program, [*call[:4], "--force", "--set", "steps=40"])
     assert short.exit_code == 0
     assert "all steps done, not settled: in step " in short.output

@@ -196,6 +196,8 @@ class _Followers:
         else:
             still = array_of(ask(SMALL * self._unit), self._shape)[:, 0]
             changes = derivative(ask, self._shape, self._unit)
+        if np.iscomplexobj(still):
+            raise ValueError(f"it returned values of {still.dtype}, not real numbers")
         if finite and not (np.isfinite(still).all() and np.isfinite(changes).all()):
             raise ValueError(f"its {name} at rest, or a derivative of it, is not finite")
         # (mover, place, axis of the answer, axis of u)

@@ -50,6 +50,9 @@ BENT = 1e-3
 middle bends within: at a corner of the outline, or between two sides of it."""
 HALVINGS = 8
 """So often triangles in which the distance bends are halved."""
+FAR = 1e100
+"""Distance from an outline that counts as infinite, as that of bodies of given sites: differences
+of such distances are numbers."""
 KINK = 1 / 32
 """Change of the slope of the signed distance between two parts of a cell's side from which on more
 than one line of the outline may pass through the cell."""
@@ -252,7 +255,7 @@ def shares_inside(
     distance at places: the mean over its triangles, cut into small ones in which the distance is
     linear; and in which cells more than one straight line, or a wide arc, can be the outline."""
     points, small = _points_within(x, y)
-    distance = signed(*points)
+    distance = np.clip(signed(*points), -FAR, FAR)
     share = (distance <= 0.0).all(axis=(0, 1)).astype(float)
     cut = (distance < 0.0).any(axis=(0, 1)) & (distance > 0.0).any(axis=(0, 1))
     a, b, c = (distance[corner][..., cut] for corner in small.T)

@@ -27,6 +27,13 @@ RULES = {
     "springs": {"type": "springs"},
 }
 LENGTHS = (7, 30, 140, 500)
+WEAK_ZONES = {
+    ("square", 0.0): (-0.55, 0.55),
+    ("square", 45.0): (-0.37, 1.08),
+    ("hexagonal", 0.0): (-0.3, 0.8),
+}
+"""Where along the bar the centres of weak cells lie, by lattice and angle: a crack across the bar
+meets one column of squares along their axis, and two rows where cells touch by corners."""
 
 
 def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
@@ -42,7 +49,6 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
         return {"type": "polygon", "vertices": points}
 
     ends = length / 2 - 0.6
-    middle = 0.37 if angle else 0.55
     ways = np.array([1.1 * length, 2.3 * ell + length]) * ONSET
     motion = {
         "type": "path",
@@ -57,7 +63,7 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
         "rule": rule,
         "frame": {"type": "natural"},
         "regions": {
-            "weak": zone(-middle, middle),
+            "weak": zone(*WEAK_ZONES.get((lattice, angle), (-0.37, 0.37))),
             "left": zone(-length, -ends),
             "right": zone(ends, length),
             "near-left": zone(-length, -ends + 1.1),
