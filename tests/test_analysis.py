@@ -221,10 +221,11 @@ def test_a_mode_that_never_decays_is_found():
     assert any("take a relaxation below 1" in w for w in pbdkit.analyse(given).warnings())
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", [n for n in shipped_names() if "to-failure" not in n])
 def test_predictions_for_shipped_experiments_are_borne_out(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
-    are made of steps, and those that go straight to equilibrium stay there too."""
+    are made of steps, and those that go straight to equilibrium stay there too. Bodies that are
+    torn in steps of equilibria have tests of their own."""
     experiment = pbdkit.load(name)
     straight = experiment.solver.type == "equilibrium"
     assert straight or pbdkit.analyse(experiment).stable is not False

@@ -41,6 +41,7 @@ SMALLER = {
         "cuts=[{from: [-1.0, 5.5], to: [3.25, 5.5]}]",
         "solver={type: stepping, memory: 0.97}",
     ],
+    "modelling/dogbone-to-failure": ["lattice.a=2.5", SWINGING_LONG],
     "modelling/inclusion": ["lattice.a=1.0", SWINGING],
     "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
     "modelling/composite-plate": ["lattice.a=4.0", SWINGING_LONG],
