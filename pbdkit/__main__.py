@@ -13,7 +13,7 @@ it look hundreds of times while a command is loaded, when nothing can be freed."
 
 
 def main() -> None:
-    """As `pbdkit.cli.main`; who interrupts it while it is being loaded sees no traceback either."""
+    """Run `pbdkit.cli.main`, without a traceback where it is interrupted while it is loaded."""
     # An exception can be lost in what libraries do as they are imported; nothing is to be undone.
     before = signal.signal(signal.SIGINT, _end)
     gc.set_threshold(COLLECT_AFTER)

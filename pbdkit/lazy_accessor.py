@@ -46,6 +46,7 @@ class AccessorFinder:
             _register(module)
             sys.meta_path.remove(self)
 
+        # The loader is that of one import alone; its method is replaced on purpose.
         spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
         return spec
 

@@ -229,7 +229,7 @@ class _Followers:
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
 
     def _total(self, parts: Sequence[Any], kept: int) -> Any:
-        """Of one number or vector by slot."""
+        """Return the totals of one number or vector, given by slot."""
         if isinstance(parts[0], Components):
             return vector(self._total(along, kept) for along in zip(*parts, strict=True))
         shape = (2 * kept - 1, self._shape[1])

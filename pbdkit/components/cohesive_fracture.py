@@ -102,7 +102,7 @@ class Cohesive(KnowsStiffness, SoftensCells, Parting):
         return _NUMBERS
 
     @staticmethod
-    def update(  # type: ignore[override]
+    def update(  # type: ignore[override]  # SoftensCells: it is given the cells
         d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
     ) -> tuple[Any, ...]:
         """Those of both cells; where there is one alone they are the same."""

@@ -130,7 +130,7 @@ class SoftensCells(RenewsBonds):
 
     @staticmethod
     @abstractmethod
-    def update(  # type: ignore[override]
+    def update(  # type: ignore[override]  # it is given the cells besides
         d: Any, r: Any, c: Any, p: Any, left: CellStress, right: CellStress
     ) -> tuple[Any, ...]:
         """The new values of the numbers that change, in their order, from the stress of the cell
