@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pbdkit.errors import ExperimentError
 from pbdkit.registry.registry import GIVEN
@@ -21,9 +20,6 @@ from pbdkit.sweeps.member import Asked, Member
 from pbdkit.sweeps.outlook import Outlook
 from pbdkit.sweeps.store import Store
 from pbdkit.sweeps.worker import INTERRUPTED, KEPT, Report
-
-if TYPE_CHECKING:
-    pass
 
 RESULT = "sweep.nc"
 Show = Callable[[str, float], None]
