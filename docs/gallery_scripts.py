@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib as mpl
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from pbdkit.experiment.shipped import shipped_names, shipped_text
+from pbdkit.model.shipped import shipped_names, shipped_text
 
 GROUPS = {
     "paper": "The paper's cases",

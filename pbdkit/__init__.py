@@ -33,8 +33,8 @@ if TYPE_CHECKING:
         PluginError as PluginError,
         StorageError as StorageError,
     )
-    from pbdkit.experiment.model import Experiment as Experiment
-    from pbdkit.interfaces import (
+    from pbdkit.model.experiment import Experiment as Experiment
+    from pbdkit.plugin import (
         AREA as AREA,
         ENERGY as ENERGY,
         FORCE as FORCE,
@@ -96,18 +96,18 @@ if TYPE_CHECKING:
         squared_length as squared_length,
         where as where,
     )
-    from pbdkit.pages.report import report as report
-    from pbdkit.registry.discovery import hookimpl as hookimpl
-    from pbdkit.results.result_file import open as open
-    from pbdkit.sessions.calling import live as live
-    from pbdkit.sweeps.concatenation import concat as concat
+    from pbdkit.web.report import report as report
+    from pbdkit.plugin.discovery import hookimpl as hookimpl
+    from pbdkit.io.open import open as open
+    from pbdkit.web.widget import live as live
+    from pbdkit.sweeps.combine import concat as concat
 
 _HOME = {
     "pbdkit.errors": (
         "DivergedError ExperimentError PbdkitError PbdkitWarning PluginError StorageError"
     ),
-    "pbdkit.experiment.model": "Experiment",
-    "pbdkit.interfaces": (
+    "pbdkit.model.experiment": "Experiment",
+    "pbdkit.plugin": (
         "AREA ENERGY FORCE FRACTURE_ENERGY LENGTH STRESS Anchors AppliesTwice BasisSite Bonds "
         "BreaksAtStrain Calibrated Cell CellStress Component Components Diagnostic Draws "
         "FollowerRule FractureModel FrameMap FramePolicy FrameSites Here KnowsStiffness Lattice "
@@ -117,11 +117,11 @@ _HOME = {
         "StoresEnergy TearsCells Torn TouchingRows TurnsParticles Variable Vector dot length "
         "squared_length where"
     ),
-    "pbdkit.pages.report": "report",
-    "pbdkit.registry.discovery": "hookimpl",
-    "pbdkit.results.result_file": "open",
-    "pbdkit.sessions.calling": "live",
-    "pbdkit.sweeps.concatenation": "concat",
+    "pbdkit.web.report": "report",
+    "pbdkit.plugin.discovery": "hookimpl",
+    "pbdkit.io.open": "open",
+    "pbdkit.web.widget": "live",
+    "pbdkit.sweeps.combine": "concat",
     "pbdkit.api": "analyse fit fit_strength identify load rerun resume run sweep",
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}

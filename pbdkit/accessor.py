@@ -8,25 +8,21 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import xarray
 
-from pbdkit.drawing.comparison import compare
-from pbdkit.drawing.crack import crack
-from pbdkit.drawing.curve import curve
-from pbdkit.drawing.history import history
-from pbdkit.drawing.movie import animate, animation
-from pbdkit.drawing.picture import plot
-from pbdkit.results.carried import experiment_of
-from pbdkit.results.members import member
-from pbdkit.results.older_layout import in_this_layout
-from pbdkit.results.physical import in_physical_units
-from pbdkit.results.saving import save
-from pbdkit.results.sites import indices_of, rows_at
+from pbdkit.io.layout import experiment_of, in_this_layout, indices_of, rows_at
+from pbdkit.io.open import member
+from pbdkit.io.physical import in_physical_units
+from pbdkit.io.save import save
+from pbdkit.plotting.configuration import compare, plot
+from pbdkit.plotting.crack import crack
+from pbdkit.plotting.curves import curve, history
+from pbdkit.plotting.movie import animate, animation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pbdkit.experiment.model import Experiment
-    from pbdkit.interfaces import Component
+    from pbdkit.model.experiment import Experiment
+    from pbdkit.plugin import Component
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -50,7 +46,7 @@ def _with_figure(function: Callable[P, Axes | list[Axes]]) -> Callable[P, Axes |
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Axes | Figure:
         drawn = function(*args, **kwargs)
-        from pbdkit.drawing.figures import figure_of  # needs matplotlib, which is there by now
+        from pbdkit.plotting.style import figure_of  # needs matplotlib, which is there by now
 
         return figure_of(drawn[0]) if isinstance(drawn, list) else drawn
 

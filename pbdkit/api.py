@@ -9,29 +9,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, PbdkitWarning, warn_caller
-from pbdkit.experiment.beside import OF_PROGRAM
-from pbdkit.experiment.loading import load_experiment
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import Settings, with_settings
-from pbdkit.experiment.source import Source
-from pbdkit.interfaces import Component
-from pbdkit.prediction.forecast import refuse_too_much_output
-from pbdkit.registry.registry import GIVEN, Registry
-from pbdkit.results.carried import carried
-from pbdkit.results.carried import experiment_of as experiment_of
-from pbdkit.results.progress import Watch, progress_bar
-from pbdkit.results.sink import MemorySink, Sink
-from pbdkit.runs.course import FAILED, Report, Run, record
-from pbdkit.runs.tuning import tuned
+from pbdkit.io.layout import carried
+from pbdkit.io.layout import experiment_of as experiment_of
+from pbdkit.io.sinks import MemorySink, Sink
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.loading import load_experiment
+from pbdkit.model.reading import OF_PROGRAM, Settings, Source, with_settings
+from pbdkit.plugin import Component
+from pbdkit.plugin.registry import GIVEN, Registry
+from pbdkit.progress import Watch, progress_bar
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.simulation import FAILED, Report, Run, record
+from pbdkit.stability.forecast import refuse_too_much_output
+from pbdkit.stability.relaxation import tuned
 
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.fitting.fitted import Fitted
-    from pbdkit.fitting.strength_fitted import FittedStrength
-    from pbdkit.identity.identity import Identity
-    from pbdkit.prediction.analysis import Analysis
+    from pbdkit.fitting.result import Fitted
+    from pbdkit.fitting.strength import FittedStrength
+    from pbdkit.identification.report import Identity
+    from pbdkit.stability.analysis import Analysis
 
 Components = Iterable[type[Component]]
 Given = Experiment | Mapping[str, Any] | str | Path
@@ -130,9 +128,9 @@ def _run(
 
 
 def _run_into(output: Path, experiment: Experiment, progress: bool, force: bool) -> xarray.Dataset:
-    from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.results.result_file import open
-    from pbdkit.results.saving import refuse_taken
+    from pbdkit.io.netcdf import NetcdfSink
+    from pbdkit.io.open import open
+    from pbdkit.io.save import refuse_taken
 
     refuse_taken(output, force=force)
     scene = build_scene(experiment)
@@ -163,7 +161,7 @@ def _warn(texts: Iterable[str]) -> None:
 def analyse(experiment: Given, *, components: Components = (), settings: Settings = ()) -> Analysis:
     """What is known of a run before its first step: stability, eigenvalues, steps to a tolerance,
     and the step operator as a sparse matrix (``.operator``)."""
-    from pbdkit.prediction.analysis import Analysis
+    from pbdkit.stability.analysis import Analysis
 
     return Analysis(tuned(build_scene(as_experiment(experiment, components, settings))))
 
@@ -177,7 +175,7 @@ def identify(
     Where its numbers differ from place to place it is that of the first of
     ``experiment.materials()``, which are experiments of one material each, by name.
     """
-    from pbdkit.identity.identification import identified
+    from pbdkit.identification.probe import identified
 
     first = next(iter(as_experiment(experiment, components, settings).materials().values()))
     return identified(tuned(build_scene(first)))
@@ -206,8 +204,8 @@ def resume(
     and, unless `anyway`, where the experiment, pbdkit or a plugin changed since; StorageError for a
     damaged store or disk; DivergedError, as `run` does, with no dataset: the file holds it.
     """
-    from pbdkit.results.result_file import open
-    from pbdkit.runs.resumption import resumption
+    from pbdkit.io.open import open
+    from pbdkit.restart import resumption
 
     path = Path(output)
     with progress_bar(progress) as show:
@@ -254,7 +252,7 @@ def sweep(
     cluster instead. A member that fails is NaN in the dataset, which says why in `message`; warns
     of it with pbdkit.PbdkitWarning. Raises ExperimentError and PluginError before anything runs.
     """
-    from pbdkit.sweeps.calling import called
+    from pbdkit.sweeps.execute import called
 
     given = as_experiment(experiment, ())
     parts = {"vary": vary or {}, "together": together or {}, "keep": keep or {}}
@@ -275,7 +273,7 @@ def fit(
     fit is found.
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
-    from pbdkit.fitting.calling import fit_experiment
+    from pbdkit.fitting.fit import fit_experiment
     from pbdkit.fitting.specification import described_fit
 
     asked, source = described_fit(description, given=experiment is not None)
@@ -300,8 +298,7 @@ def fit_strength(
     DivergedError where a specimen finds no equilibrium.
     """
     from pbdkit.equilibrium.certificate import UnconvergedError
-    from pbdkit.fitting.strength import fit_strength_of
-    from pbdkit.fitting.strength_specification import described_strength_fit
+    from pbdkit.fitting.strength import described_strength_fit, fit_strength_of
 
     asked, source = described_strength_fit(description, given=experiment is not None)
     found = as_experiment(experiment, components) if experiment is not None else None

@@ -130,8 +130,8 @@ def scenes():
 
 def compare():
     """Each kernel for one block and for several."""
-    from pbdkit.stepping.gpu import program
-    from pbdkit.stepping.gpu.gpu_stepper import GpuStepper
+    from pbdkit.stepping import cuda_engine as program
+    from pbdkit.stepping.cuda_engine import GpuStepper
 
     for name, scene in scenes().items():
         for alone in (0, 4096) if name in ("torn", "moves of another") else (4096,):

@@ -7,7 +7,7 @@ import numpy as np
 
 import pbdkit
 from pbdkit import Experiment
-from pbdkit.scene.raster import FOLLOWER, FRAME
+from pbdkit.lattice.raster import FOLLOWER, FRAME
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state

@@ -17,12 +17,11 @@ from changed_axes import AXES, KEEP, Change, applies_to, changed, differences
 from interpreted_kernels import interpreting
 
 import pbdkit
-from pbdkit.interfaces import StoresEnergy
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.tables import Tables
-from pbdkit.runs.course import Run
+from pbdkit.io.snapshot import StateMoment, Tables
+from pbdkit.plugin import StoresEnergy
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.testing import laws
+from pbdkit.simulation import Run
+from pbdkit.testing import mechanics as laws
 
 Tree = dict[str, Any]
 Faults = list[str]

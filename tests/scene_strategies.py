@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from pbdkit import Lattice, NeighbourMetric
-from pbdkit.registry.registry import Registry
-from pbdkit.scene.neighbourhood import build_neighbourhood
+from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.plugin.registry import Registry
 
 
 def samples(count, **more):

@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 import pbdkit
-from pbdkit.equilibrium.moves import Moves
-from pbdkit.equilibrium.system import one_thread
+from pbdkit.equilibrium.system import Moves, one_thread
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
-from pbdkit.scene.guides import guided_at, kinds_of_places
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.scene.leaders import guided_at, kinds_of_places
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import initial_state
 
 WEIGHTS = (3 / 4, -3 / 20, 1 / 60)

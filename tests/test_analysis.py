@@ -12,12 +12,12 @@ from property_cases import LATTICES, RULES
 from scene_strategies import calibrated_experiments, experiments, samples
 
 import pbdkit
-from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.stencil import wave_bound
 from pbdkit.cli import program
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.prediction.analysis import Analysis
+from pbdkit.linear.operator import step_operator
+from pbdkit.linear.stencil import wave_bound
+from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
+from pbdkit.stability.analysis import Analysis
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

@@ -8,10 +8,10 @@ import plain_space
 import pytest
 
 import pbdkit
-from pbdkit.experiment.body import Body, Box
-from pbdkit.experiment.motions import Velocity
+from pbdkit.model.bodies import Body, Box
+from pbdkit.model.motions import Velocity
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.engine_choice import choose, make_engine
 from pbdkit.stepping.state import initial_state
 
 SIZES, STEPS = (5, 4, 3), 12

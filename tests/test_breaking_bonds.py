@@ -9,11 +9,11 @@ import pytest
 from interpreted_kernels import interpreting
 
 import pbdkit
-from pbdkit.equilibrium import increments
-from pbdkit.equilibrium.breaking import choice
-from pbdkit.equilibrium.breaking.settler import Settler
-from pbdkit.equilibrium.increments import equilibrium_state
-from pbdkit.results.progress import Watch
+from pbdkit.equilibrium import breaking_kernel as choice
+from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium.breaking_kernel import Settler
+from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -103,8 +103,8 @@ def test_what_is_over_soon_is_not_compiled():
 
 def test_a_kernel_is_found_again_whatever_the_order_of_sets():
     program = (
-        "from pbdkit.components.strain_fracture import Damage\n"
-        "from pbdkit.stepping.compiled.functions import source_key\n"
+        "from pbdkit.components.fracture import Damage\n"
+        "from pbdkit.stepping.numba_engine.cache import source_key\n"
         "print(source_key(Damage.update))"
     )
     keys = {

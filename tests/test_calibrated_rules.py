@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.scene.raster import FRAME, LEADER
+from pbdkit.lattice.raster import FRAME, LEADER
 from pbdkit.scene.scene import build_scene
 
 SQUARE = {

@@ -7,7 +7,7 @@ import pytest
 
 import pbdkit
 from pbdkit.components.elasticity import StrainGradient
-from pbdkit.scene import cut_cells
+from pbdkit.lattice import fill as cut_cells
 from pbdkit.scene.scene import build_scene
 
 SQUARE, HEXAGONAL = {"type": "square", "a": 1.0}, {"type": "hexagonal", "a": 1.0}

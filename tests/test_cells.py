@@ -8,11 +8,10 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, LATTICES, displace, experiment, scene_of, state_with
 
 import pbdkit
-from pbdkit.interfaces import BasisSite, Cell, Vector
-from pbdkit.interfaces.polygons import area_share
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.tables import Tables
-from pbdkit.scene.cells import tiling_of
+from pbdkit.io.snapshot import StateMoment, Tables
+from pbdkit.lattice.cells import tiling_of
+from pbdkit.plugin import BasisSite, Cell, Vector
+from pbdkit.plugin.lattice import area_share
 from pbdkit.stepping.state import initial_state
 
 every_lattice = pytest.mark.parametrize("lattice", LATTICES)

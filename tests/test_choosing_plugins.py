@@ -18,9 +18,9 @@ from plugin_sources import hook, listed, rule
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.registry.discovery import DISABLE, installed_plugins
-from pbdkit.registry.registry import Registry
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plugin.discovery import DISABLE, installed_plugins
+from pbdkit.plugin.registry import Registry
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -177,7 +177,7 @@ def test_without_plugins_all_are_disabled_for_that_call(call: Call, words: Any) 
 SEEN = """
 import sys
 from pbdkit.cli import main
-from pbdkit.registry import discovery
+from pbdkit.plugin import discovery
 def refuse(): raise AssertionError("the installed distributions were looked through")
 discovery.distributions = refuse
 try:

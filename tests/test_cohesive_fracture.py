@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.interfaces.polygons import signed_area
+from pbdkit.plugin.lattice import signed_area
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.bond_breaker import Fracturing
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.numpy_engine import Fracturing
 from pbdkit.stepping.state import initial_state
 
 sys.path.append(str(Path(__file__).parent / "reliability"))

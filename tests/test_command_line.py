@@ -18,7 +18,7 @@ import xarray
 
 import pbdkit
 from pbdkit.cli import COMMANDS, FIRST, GROUPS
-from pbdkit.experiment.shipped import shipped_text
+from pbdkit.model.shipped import shipped_text
 
 Call = Callable[..., Any]
 Probing = Callable[..., None]
@@ -333,16 +333,16 @@ def test_starting_loads_nothing_heavy(start: str) -> None:
 
 LIBRARIES = {"dask", "h5py", "matplotlib", "numba", "pandas", "rich", "scipy", "shapely", "xarray"}
 NEEDED = {
-    "import pbdkit.api": ({"numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.prediction.lag"}),
-    "run paper/aa": (set(), {"pbdkit.interfaces", "pbdkit.components", "pbdkit.experiment.model"}),
+    "import pbdkit.api": ({"numpy", "pydantic"}, {"pbdkit.equilibrium", "pbdkit.stability.lag"}),
+    "run paper/aa": (set(), {"pbdkit.plugin", "pbdkit.components", "pbdkit.model.experiment"}),
     "run e.json --set rul=1": ({"numpy", "pydantic"}, {"pbdkit.scene.scene", "pbdkit.stepping"}),
-    "check e.json": ({"numpy", "pydantic"}, {"pbdkit.results.netcdf", "pbdkit.runs.resumption"}),
-    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.increments"}),
+    "check e.json": ({"numpy", "pydantic"}, {"pbdkit.io.netcdf", "pbdkit.restart"}),
+    "run e.json": ({"h5py", "numpy", "pydantic"}, {"pbdkit.equilibrium.solve"}),
     "run e.json --quiet": (
         {"h5py", "numpy", "pydantic"},
-        {"pbdkit.equilibrium", "pbdkit.prediction.lag"},
+        {"pbdkit.equilibrium", "pbdkit.stability.lag"},
     ),
-    "status e.nc": ({"numpy"}, {"pbdkit.interfaces", "pbdkit.components"}),
+    "status e.nc": ({"numpy"}, {"pbdkit.plugin", "pbdkit.components"}),
     "verify e.nc": ({"numpy", "pydantic"}, {"pbdkit.stepping", "pbdkit.equilibrium"}),
 }
 """Of commands, and of an import, the libraries that are loaded, all others left out, and parts of
@@ -480,7 +480,7 @@ def test_an_exit_out_of_nowhere_is_not_silent(call: Call, monkeypatch: pytest.Mo
     def leave() -> None:
         raise SystemExit(0)
 
-    monkeypatch.setattr("pbdkit.experiment.shipped.shipped_names", leave)
+    monkeypatch.setattr("pbdkit.model.shipped.shipped_names", leave)
     result = call("experiments")
     assert (result.code, "a bug in pbdkit, please report it: SystemExit: 0" in result.err) == (
         1,

@@ -15,12 +15,11 @@ import pytest
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.cli.completion import _Bash
-from pbdkit.cli.setting_paths import SettingPaths
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.experiment.settings import with_setting
-from pbdkit.experiment.shipped import read_experiment, shipped_names
-from pbdkit.registry.registry import Registry
+from pbdkit.cli.completion import SettingPaths, _Bash
+from pbdkit.model.reading import with_setting
+from pbdkit.model.schema import experiment_schema
+from pbdkit.model.shipped import read_experiment, shipped_names
+from pbdkit.plugin.registry import Registry
 
 Offered = Callable[..., list[str]]
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from pbdkit import Experiment, Here, Vector, load
 from pbdkit.components import pbdkit_components
 from pbdkit.components.elasticity import Elastic
-from pbdkit.components.fracture import NoFracture, Threshold
+from pbdkit.components.fracture import NoFracture, StrainFracture, Threshold
 from pbdkit.components.lattices import Hexagonal
 from pbdkit.components.neighbours import Coordination
 from pbdkit.components.rules import (
@@ -21,12 +21,11 @@ from pbdkit.components.rules import (
     MixedCoordinate,
     Springs,
 )
-from pbdkit.components.strain_fracture import StrainFracture
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.interfaces import Setting
-from pbdkit.interfaces.units import is_needed
-from pbdkit.scene.cells import tiling_of
-from pbdkit.scene.neighbourhood import build_neighbourhood
+from pbdkit.lattice.cells import tiling_of
+from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.model.shipped import shipped_names
+from pbdkit.plugin import Setting
+from pbdkit.plugin.units import is_needed
 
 REQUIRED = {
     "a": 1.5,

@@ -13,12 +13,12 @@ from shapely import Polygon
 from test_engines import assert_bitwise_equal
 
 import pbdkit
-from pbdkit.interfaces import Cell, Vector
-from pbdkit.scene.cut_cells import cut_by_border
-from pbdkit.scene.field_values import signed_distance
-from pbdkit.scene.laminate import laminate, layered
+from pbdkit.lattice.fill import cut_by_border
+from pbdkit.plugin import Cell, Vector
+from pbdkit.scene.constants import signed_distance
+from pbdkit.scene.materials import laminate, layered
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
 PULL = 0.01
 

@@ -16,7 +16,7 @@ from pydantic import Field
 import pbdkit
 from pbdkit.components import pbdkit_components
 from pbdkit.components.rules import MixedCoordinate
-from pbdkit.interfaces import INTERFACES, FollowerRule, FractureModel
+from pbdkit.plugin import INTERFACES, FollowerRule, FractureModel
 from pbdkit.testing import PROPERTIES, conformance, examine, examine_all, examples_of, properties_of
 from pbdkit.testing.subject import LATTICES, NEIGHBOURS, full_name
 

@@ -12,12 +12,12 @@ from test_engines import assert_bitwise_equal
 from test_obstacles import CASES, HEXAGONAL, SHAPES, block, moving, plane, run
 
 import pbdkit
-from pbdkit.equilibrium import increments
-from pbdkit.equilibrium.contact_system import NO_FACE, hold
+from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium.contact import NO_FACE, hold
 from pbdkit.scene.obstacles import outlines_at
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
 from pbdkit.stepping.contact import Contact
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

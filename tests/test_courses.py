@@ -15,29 +15,27 @@ from thread_ranks import on_ranks
 
 import pbdkit
 from pbdkit.components.elasticity import Elastic, StrainGradient
-from pbdkit.equilibrium.load_path import moments
+from pbdkit.equilibrium.solve import moments
 from pbdkit.errors import NotSharedError
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.source import Source
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.scene_alike import scene_like
-from pbdkit.fitting.sensitivity import Resting
-from pbdkit.interfaces import FollowerRule, FractureModel
-from pbdkit.interfaces.course import Course
-from pbdkit.prediction.analysis import Analysis
-from pbdkit.prediction.forecast import forecast
-from pbdkit.registry.registry import Registry
-from pbdkit.results.explanation import Explained
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.progress import Watch
-from pbdkit.results.tables import Tables
-from pbdkit.runs.course import Run
+from pbdkit.fitting.sensitivity import Resting, scene_like
+from pbdkit.io.explain import Explained
+from pbdkit.io.snapshot import StateMoment, Tables
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import Source
+from pbdkit.plugin import FollowerRule, FractureModel
+from pbdkit.plugin.registry import Registry
+from pbdkit.plugin.schedule import Course
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.sessions.session import Session
-from pbdkit.stepping.choice import choose, what_kernels_lack
+from pbdkit.simulation import Run
+from pbdkit.stability.analysis import Analysis
+from pbdkit.stability.forecast import forecast
+from pbdkit.stepping.engine_choice import choose, what_kernels_lack
+from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.prescription import last_event
 from pbdkit.stepping.state import initial_state
+from pbdkit.web.session import Session
 
 pytestmark = pytest.mark.filterwarnings("ignore:frame. under 'mean'")
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from property_cases import scene_of
 
 import pbdkit
-from pbdkit.interfaces import BasisSite, Cell, Vector
-from pbdkit.scene.neighbourhood import flatness
+from pbdkit.lattice.neighbourhood import flatness
+from pbdkit.plugin import BasisSite, Cell, Vector
 
 ORIGIN = BasisSite()
 

@@ -10,7 +10,7 @@ from remembering_parts import Tiring, Vanes, Weakest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

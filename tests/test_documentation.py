@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import pbdkit
 from pbdkit.cli import COMMANDS, program
-from pbdkit.experiment.source import read_text
+from pbdkit.model.reading import read_text
 
 ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import pbdkit
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.prediction.forecast import outlook, refuse_unheld_loads
-from pbdkit.scene.doubts import round_in_radians
+from pbdkit.model.shipped import shipped_names
+from pbdkit.scene.checks import round_in_radians
 from pbdkit.scene.scene import build_scene
+from pbdkit.stability.forecast import outlook, refuse_unheld_loads
 
 HOLD = {"type": "hold"}
 
@@ -301,5 +301,5 @@ def test_large_bodies_are_run_without_a_look_at_their_spectrum(
 ) -> None:
     scene = build_scene(pbdkit.load("paper/a"))
     assert outlook(scene)
-    monkeypatch.setattr("pbdkit.prediction.forecast.LOOKED_AT", 100)
+    monkeypatch.setattr("pbdkit.stability.forecast.LOOKED_AT", 100)
     assert outlook(scene) == []

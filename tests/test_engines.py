@@ -15,11 +15,12 @@ from turning_frame import Turning
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping import choice
-from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.compiled import compiled_stepper, stretches
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
-from pbdkit.stepping.compiled.functions import source_key
+from pbdkit.stepping import engine_choice as choice
+from pbdkit.stepping.engine_choice import choose, make_engine
+from pbdkit.stepping.numba_engine import arrays as stretches
+from pbdkit.stepping.numba_engine import engine as compiled_stepper
+from pbdkit.stepping.numba_engine.cache import source_key
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.bench import measurement
-from pbdkit.bench.measurement import Row, measure
-from pbdkit.bench.work_precision import lines, picture, table
-from pbdkit.bench.worker import Decay, decay_of, followers_of, result_of
-from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit import bench as measurement
+from pbdkit.bench import (
+    Decay,
+    Row,
+    decay_of,
+    followers_of,
+    lines,
+    measure,
+    picture,
+    result_of,
+    table,
+)
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

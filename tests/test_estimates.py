@@ -7,9 +7,8 @@ import pytest
 from property_cases import HOLD_LEFT, experiment, pull_right, scene_of
 
 import pbdkit
-from pbdkit.prediction.analysis import Analysis
-from pbdkit.prediction.estimate import Estimate
-from pbdkit.prediction.lag import lag_of
+from pbdkit.stability.analysis import Analysis, Estimate
+from pbdkit.stability.lag import lag_of
 
 pytest.importorskip("numba")
 
@@ -54,7 +53,7 @@ def test_estimates_are_near_what_is_exact(parts):
 
 def test_of_large_bodies_coarser_grids_are_enough(monkeypatch):
     """1 - λ = ½ (1 - cos(π/N)) within 1 %, without a turn on the finest grid."""
-    monkeypatch.setattr("pbdkit.prediction.estimate.MANY", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.MANY", 0)
     scene = body(240, 60)
     exact = (1 - math.cos(math.pi / 239)) / 2
     assert 1 - Estimate(scene).spectrum.largest == pytest.approx(exact, rel=0.01)
@@ -69,7 +68,7 @@ def test_waves_that_change_their_sign_do_not_outlast_the_slowest_mode():
 
 def estimated(monkeypatch, **parts):
     """The analysis of a body that counts as large."""
-    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_ANEW", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_ANEW", 0)
     return Analysis(body(**{"columns": 16, "rows": 12} | parts))
 
 
@@ -102,7 +101,7 @@ def test_a_lag_without_a_hold_is_left_out_with_a_word(monkeypatch):
     """At first one particle moves, around which an elastic body turns freely."""
     pull = {"type": "velocity", "velocity": [0.01, 0.0], "steps": 9}
     first = {"select": {"numbers": [30]}, "motion": pull, "until": 9}
-    monkeypatch.setattr("pbdkit.prediction.spectra.LARGEST_ANEW", 0)
+    monkeypatch.setattr("pbdkit.stability.analysis.LARGEST_ANEW", 0)
     parts = BODIES["elastic"] | {"leaders": [first, HOLD_LEFT | {"from": 10}], "steps": 40}
     analysis = Analysis(scene_of(16, 12, **parts))
     assert analysis.spectrum

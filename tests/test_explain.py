@@ -8,7 +8,7 @@ from property_cases import pull_right
 from remembering_parts import Weakest
 
 import pbdkit
-from pbdkit.results.explanation import Explained
+from pbdkit.io.explain import Explained
 from pbdkit.scene.scene import build_scene
 
 RATE = 0.03125

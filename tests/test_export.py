@@ -6,8 +6,7 @@ import pytest
 from property_cases import LATTICES, experiment, pull_right
 
 import pbdkit
-from pbdkit.results.grid import BOND, CELL, PARTICLE
-from pbdkit.results.vtkhdf import export
+from pbdkit.io.vtkhdf import BOND, CELL, PARTICLE, export
 from pbdkit.scene.scene import build_scene
 
 vtk = pytest.importorskip("vtk")

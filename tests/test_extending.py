@@ -18,8 +18,8 @@ from interpreted_kernels import interpreting
 
 import pbdkit
 import pbdkit.testing
-from pbdkit.interfaces import INTERFACES, Component
-from pbdkit.registry.discovery import Hooks
+from pbdkit.plugin import INTERFACES, Component
+from pbdkit.plugin.discovery import Hooks
 from pbdkit.testing import PROPERTIES, examine, examples_of
 
 PAGES = Path(__file__).parent.parent / "docs" / "extending"
@@ -191,8 +191,8 @@ def test_the_public_names_are_one_list():
     imports = (n for n in block.body if isinstance(n, ast.ImportFrom) and n.module != "typing")
     checked = {name.asname: node.module for node in imports for name in node.names}
     assert checked == pbdkit._MODULE_OF
-    public = {name for name, module in checked.items() if module == "pbdkit.interfaces"}
-    assert public == {*pbdkit.interfaces.__all__} - {"INTERFACES"}
+    public = {name for name, module in checked.items() if module == "pbdkit.plugin"}
+    assert public == {*pbdkit.plugin.__all__} - {"INTERFACES"}
     for name, module in checked.items():
         assert getattr(pbdkit, name) is getattr(importlib.import_module(module), name)
 

@@ -20,10 +20,8 @@ from test_calibrated_rules import (
 )
 
 import pbdkit
-from pbdkit.results.cell_values import StateCells
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.tables import Tables
-from pbdkit.scene.raster import FRAME
+from pbdkit.io.snapshot import StateCells, StateMoment, Tables
+from pbdkit.lattice.raster import FRAME
 from pbdkit.scene.scene import build_scene
 
 # Fields are given by the start of a run: nobody needs to lead.

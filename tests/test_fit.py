@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.fitting.interpolation import Interpolation
+from pbdkit.fitting.observations import Interpolation
 from pbdkit.fitting.sensitivity import Resting
 from pbdkit.scene.scene import build_scene
 
@@ -146,11 +146,9 @@ def test_errors_are_those_of_repeats():
     """Noise on the field and on what is prescribed, as both are measured; the long trial has more
     repeats. Poisson's ratio is off by as much as its standard error says."""
     generator = np.random.default_rng(3)
-    from pbdkit.fitting.evidence import FieldEvidence
-    from pbdkit.fitting.least_squares import solved
+    from pbdkit.fitting.observations import FieldEvidence, FieldObservation
     from pbdkit.fitting.parameter import Parameter
-    from pbdkit.fitting.problem import Problem, Unknown
-    from pbdkit.fitting.resting_field import FieldObservation
+    from pbdkit.fitting.problem import Problem, Unknown, solved
 
     coarse = {"lattice": {"type": "square", "a": 2.0}}
     resting = Resting.of(pbdkit.Experiment(**plate(**coarse)))
@@ -427,7 +425,7 @@ def test_one_point_at_rest_tells_nothing_and_breaks_nothing(noise, tmp_path):
 
 def test_the_picture_has_a_row_an_axis_and_no_text_over_another(tmp_path):
     pytest.importorskip("matplotlib")
-    from pbdkit.drawing.fit import draw_fit
+    from pbdkit.plotting.fit import draw_fit
 
     made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)

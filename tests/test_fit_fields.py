@@ -10,12 +10,9 @@ from scipy.spatial import KDTree
 from test_fit import plate
 
 import pbdkit
-from pbdkit.experiment.body import Sites
-from pbdkit.experiment.body_algebra import AnyBody
-from pbdkit.fitting.boundary import boundaries
-from pbdkit.fitting.depth import deeper, depths
-from pbdkit.fitting.interpolation import Interpolation
-from pbdkit.interfaces import Vector
+from pbdkit.fitting.observations import Interpolation, boundaries, deeper, depths
+from pbdkit.model.bodies import AnyBody, Sites
+from pbdkit.plugin import Vector
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.drawing.fit import draw_fit
-from pbdkit.fitting.calling import problem_of
+from pbdkit.fitting.fit import problem_of
+from pbdkit.fitting.observations import TracksObservation
 from pbdkit.fitting.specification import described_fit
-from pbdkit.fitting.tracks import TracksObservation
-from pbdkit.runs.course import Run
+from pbdkit.plotting.fit import draw_fit
+from pbdkit.simulation import Run
 
 WIDTH, HEIGHT, STEPS = 8.0, 4.0, 16
 MODULUS, THICKNESS, NOISE = 1000.0, 2.0, 1e-4

@@ -9,10 +9,10 @@ import pytest
 from test_fit import NOISE, fitted, in_series, measured, plate
 
 import pbdkit
-from pbdkit.fitting.calling import problem_of
-from pbdkit.fitting.least_squares import rise_of_loss
-from pbdkit.fitting.sampling import _marginal
+from pbdkit.fitting.fit import problem_of
+from pbdkit.fitting.problem import rise_of_loss
 from pbdkit.fitting.specification import described_fit
+from pbdkit.fitting.uncertainty import _marginal
 
 COARSE = {"lattice": {"type": "square", "a": 2.0}}
 POISSON = {"rule.poisson_ratio": [0.0, 0.49]}
@@ -155,8 +155,8 @@ def test_the_sampler_draws_from_it(fit):
 
 
 def test_a_sampler_that_is_missing_is_named_before_the_fit(fit, monkeypatch):
-    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda library: None)
-    monkeypatch.setattr("pbdkit.fitting.calling.solved", None)
+    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda library: None)
+    monkeypatch.setattr("pbdkit.fitting.fit.solved", None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[sample\]'"):
         pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
 

@@ -24,8 +24,8 @@ from test_calibrated_rules import (
 )
 
 import pbdkit
-from pbdkit.components.cell_stiffness import rectangle_matrix
-from pbdkit.interfaces import Stiffness
+from pbdkit.components.elasticity import rectangle_matrix
+from pbdkit.plugin import Stiffness
 from pbdkit.scene.scene import build_scene
 
 # Forces are those of given starts, and of any frame.

@@ -9,7 +9,7 @@ from property_cases import pull_right
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -183,8 +183,8 @@ def test_an_onset_beyond_failure_is_refused():
 
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
 def test_the_crack_path_is_the_broken_bonds_in_order(lattice, tmp_path):
-    from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.runs.course import Run, record
+    from pbdkit.io.netcdf import NetcdfSink
+    from pbdkit.simulation import Run, record
 
     given = bar(9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, **SHEET)
     record(Run(build_scene(pbdkit.Experiment(**given))), NetcdfSink(tmp_path / "o.nc"))

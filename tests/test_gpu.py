@@ -17,12 +17,12 @@ from test_engines import ANEW, sheet
 
 import pbdkit
 from pbdkit.components import pbdkit_components
-from pbdkit.interfaces import FollowerRule, FractureModel, FramePolicy
-from pbdkit.stepping import choice
-from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.compiled.levels import functions_of
-from pbdkit.stepping.gpu import limits, program
-from pbdkit.stepping.gpu.limits import what_gpus_lack, what_is_missing
+from pbdkit.plugin import FollowerRule, FractureModel, FramePolicy
+from pbdkit.stepping import cuda_engine as program
+from pbdkit.stepping import engine_choice as choice
+from pbdkit.stepping import engine_choice as limits
+from pbdkit.stepping.engine_choice import choose, make_engine, what_gpus_lack, what_is_missing
+from pbdkit.stepping.numba_engine.plan import functions_of
 
 ASKED = {"solver": {"type": "stepping", "engine": "gpu"}}
 
@@ -58,7 +58,7 @@ def types_of(arrays):
 
 def text_of(scene, device):
     """The kernel of a scene as PTX."""
-    from pbdkit.stepping.gpu import kernel
+    from pbdkit.stepping import cuda_engine as kernel
 
     made = program.program_of(scene)
     run = kernel.make_kernel(made.source, functions_of(made.plan.levels), 1024)
@@ -125,7 +125,7 @@ def test_functions_of_numpy_compile(device):
 def test_without_the_option_products_and_sums_are_contracted_and_that_is_refused(
     device, monkeypatch
 ):
-    from pbdkit.stepping.gpu import kernel
+    from pbdkit.stepping import cuda_engine as kernel
 
     monkeypatch.setattr(kernel, "_uncontracted", nullcontext)
     with pytest.raises(pbdkit.PbdkitError, match="contracts products and sums, whatever it is"):

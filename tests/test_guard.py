@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.results.progress import Watch
-from pbdkit.results.sink import MemorySink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.sinks import MemorySink
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping import guard
-from pbdkit.stepping.guard import EVERY, Guard
+from pbdkit.simulation import Run, record
+from pbdkit.stepping import divergence as guard
+from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.state import initial_state
 
 # That these runs can diverge is said before the first step; here it is what happens then.

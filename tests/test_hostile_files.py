@@ -17,11 +17,11 @@ import xarray
 from reliability import hostile_files
 
 import pbdkit
-from pbdkit.experiment import field_file
-from pbdkit.experiment.beside import ALLOW_OUTSIDE, OF_PROGRAM
-from pbdkit.experiment.field_file import read_field
-from pbdkit.resources.declared import check_declared
-from pbdkit.storage.seal import put_seal, seal_of
+from pbdkit.io.seal import put_seal, seal_of
+from pbdkit.model import validation as field_file
+from pbdkit.model.reading import ALLOW_OUTSIDE, OF_PROGRAM
+from pbdkit.model.validation import read_field
+from pbdkit.untrusted_files import check_declared
 
 STEPS = "step,ux,uy\n1,0.1,0.0\n"
 FIELD = {"file": "f.nc", "variable": "E"}

@@ -17,10 +17,10 @@ from ruamel.yaml.scanner import Scanner
 import pbdkit
 from pbdkit import Experiment
 from pbdkit.errors import LONGEST, PbdkitError, printable
-from pbdkit.experiment.source import MAX_DEPTH, Source, read_text
-from pbdkit.prediction.forecast import forecast
-from pbdkit.runs.course import rehearse
+from pbdkit.model.reading import MAX_DEPTH, Source, read_text
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import rehearse
+from pbdkit.stability.forecast import forecast
 
 Call = Callable[..., Any]
 SOON_S = 5.0

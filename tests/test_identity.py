@@ -23,10 +23,10 @@ from identity_cases import (
 from property_cases import LATTICES, NEIGHBOURS, advanced, body_sites
 
 import pbdkit
-from pbdkit.analysis.spectrum import modes
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.experiment.source import Source
-from pbdkit.identity.waves import operator, slow_waves
+from pbdkit.identification.waves import operator, slow_waves
+from pbdkit.linear.spectrum import modes
+from pbdkit.model.reading import Source
+from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
 
 AVERAGING = {

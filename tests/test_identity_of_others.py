@@ -19,7 +19,7 @@ from identity_cases import (
 from remembering_parts import Tiring
 
 import pbdkit
-from pbdkit.identity.elastic_constants import Elasticity
+from pbdkit.identification.elastic_constants import Elasticity
 
 HONEYCOMB = {"type": "honeycomb"}
 

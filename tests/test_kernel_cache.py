@@ -13,9 +13,9 @@ import pytest
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import choose, make_engine
-from pbdkit.stepping.compiled import kernel_cache
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.engine_choice import choose, make_engine
+from pbdkit.stepping.numba_engine import cache as kernel_cache
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -142,7 +142,7 @@ class Raises(pbdkit.FollowerRule):
 
 
 def test_a_fracture_model_that_does_not_compile_is_named(cache, monkeypatch):
-    monkeypatch.setattr("pbdkit.stepping.choice.PATIENCE_S", 0.0)
+    monkeypatch.setattr("pbdkit.stepping.engine_choice.PATIENCE_S", 0.0)
     scene = build_scene(pbdkit.Experiment(**SHEET | {"fracture": Odd()}))
     with pytest.raises(pbdkit.PluginError, match="FractureModel 'odd' failed to compile"):
         CompiledStepper(scene)

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 import pbdkit
-from pbdkit.experiment.kinds import EXPERIMENT, FIT, PARTS, SWEEP, kind_of
-from pbdkit.experiment.shipped import read_experiment, shipped_names
+from pbdkit.model.reading import EXPERIMENT, FIT, PARTS, SWEEP, kind_of
+from pbdkit.model.shipped import read_experiment, shipped_names
 
 TAKES_EXPERIMENTS = ["run", "check", "identify", "bench"]
 TAKES_RESULTS = ["animate", "explain", "status", "verify", "resume"]

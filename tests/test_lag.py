@@ -17,7 +17,7 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -141,14 +141,14 @@ def test_a_long_motion_that_is_not_followed_to_its_end_is_estimated():
 def test_what_is_reached_is_estimated_within_10_percent(steps, monkeypatch):
     parts = pulled(40, 12, 0.01, steps=steps)
     followed = pbdkit.analyse(experiment(**parts)).trailing
-    monkeypatch.setattr("pbdkit.prediction.lag.DEAREST", 0.0)
+    monkeypatch.setattr("pbdkit.stability.lag.DEAREST", 0.0)
     estimated = pbdkit.analyse(experiment(**parts)).trailing
     assert estimated.steady == followed.steady
     assert estimated.reached == pytest.approx(followed.reached, rel=0.1)
 
 
 def test_what_is_reached_is_not_estimated_where_the_step_has_a_memory(monkeypatch):
-    monkeypatch.setattr("pbdkit.prediction.lag.DEAREST", 0.0)
+    monkeypatch.setattr("pbdkit.stability.lag.DEAREST", 0.0)
     solver = {"type": "stepping", "memory": 0.5}
     lag = pbdkit.analyse(experiment(**pulled(8, 6, 0.01, solver=solver))).trailing
     assert lag.reached is None

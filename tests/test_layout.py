@@ -10,12 +10,12 @@ import xarray
 from property_cases import LATTICES, experiment, pull_right
 
 import pbdkit
-from pbdkit.results.layout import OF_BODY, OF_FRAME
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import Run, record
-from pbdkit.scene.raster import FRAME
+from pbdkit.io.layout import OF_BODY, OF_FRAME
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.lattice.raster import FRAME
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 OLD = Path(__file__).parent / "data" / "version-1.nc.gz"
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

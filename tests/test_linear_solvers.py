@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import linear_solver as linear
-from pbdkit.equilibrium.linear_solver import Ground, linear_solver
-from pbdkit.results.progress import StoppedError, Watch
+from pbdkit.equilibrium import sparse as linear
+from pbdkit.equilibrium.sparse import Ground, linear_solver
+from pbdkit.progress import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
 NAMES = ["lu", "multigrid", "conjugate-gradients"]
@@ -169,7 +169,7 @@ def test_an_iteration_hears_of_it():
 
 
 def test_progress_is_told_in_phases_and_shares(monkeypatch):
-    from pbdkit.equilibrium.increments import settle
+    from pbdkit.equilibrium.solve import settle
     from pbdkit.scene.scene import build_scene
     from pbdkit.stepping.state import initial_state
 
@@ -184,8 +184,8 @@ def test_progress_is_told_in_phases_and_shares(monkeypatch):
 
 
 def test_progress_is_drawn_on_a_terminal(monkeypatch, capsys):
-    monkeypatch.setattr("pbdkit.results.progress.PATIENCE_S", 0.0)
-    monkeypatch.setattr("pbdkit.results.progress.REFRESH_S", 0.0)
+    monkeypatch.setattr("pbdkit.progress.PATIENCE_S", 0.0)
+    monkeypatch.setattr("pbdkit.progress.REFRESH_S", 0.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
     pbdkit.run(sheet(), progress=True)
     assert "solving" in capsys.readouterr().err

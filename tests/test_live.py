@@ -22,20 +22,17 @@ from websockets.sync.client import connect
 
 import pbdkit
 from pbdkit.cli.live import live
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.runs.course import Run
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
-from pbdkit.sessions import history, saving, stage
-from pbdkit.sessions.access import Access
-from pbdkit.sessions.commands import FARTHEST, LONGEST, command_of
-from pbdkit.sessions.conductor import Conductor
-from pbdkit.sessions.judgement import judged
-from pbdkit.sessions.obeying import obey
-from pbdkit.sessions.scenery import scenery, standing
-from pbdkit.sessions.server import Page, SessionServer
-from pbdkit.sessions.session import Session
-from pbdkit.sessions.widget import LiveWidget
+from pbdkit.simulation import Run
+from pbdkit.web import script as saving
+from pbdkit.web import session as history
+from pbdkit.web import session as stage
+from pbdkit.web.commands import FARTHEST, LONGEST, command_of, obey
+from pbdkit.web.server import Access, Conductor, Page, SessionServer
+from pbdkit.web.session import Session, judged, scenery, standing
+from pbdkit.web.widget import LiveWidget
 
 CHANGED = {
     "paper/b": ["solver.memory=0.3"],
@@ -750,7 +747,7 @@ def test_the_module_of_a_notebook_shows_a_body_and_goes_again(page, tmp_path):
 
 
 def test_what_is_missing_is_said_with_the_remedy(monkeypatch):
-    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda name: None)
     for call in (lambda: pbdkit.live("paper/a"), lambda: live.main(["paper/a", "--no-browser"])):
         with pytest.raises(pbdkit.ExperimentError, match=re.escape("pip install 'pbdkit[live]'")):
             call()

@@ -11,13 +11,12 @@ from scene_strategies import samples
 
 import pbdkit
 from pbdkit.equilibrium.certificate import Foresight
-from pbdkit.equilibrium.increments import settle
-from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.load_path import events, moments
-from pbdkit.equilibrium.moves import Moves
-from pbdkit.results.progress import Watch
+from pbdkit.equilibrium.linearise import linearised
+from pbdkit.equilibrium.solve import events, moments, settle
+from pbdkit.equilibrium.system import Moves
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.bond_breaker import Fracturing
+from pbdkit.stepping.numpy_engine import Fracturing
 from pbdkit.stepping.state import initial_state
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

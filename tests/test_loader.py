@@ -14,11 +14,11 @@ from plugin_sources import BROKEN, NEWER, listed, rule
 
 import pbdkit
 from pbdkit.cli import COMMANDS
-from pbdkit.registry.registry import Registry
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.plugin.registry import Registry
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -74,7 +74,7 @@ def test_all_broken_plugins_together_stop_no_command(
 ) -> None:
     one = ("numpy", "float64", 1)
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
-    monkeypatch.setattr("pbdkit.bench.measurement.engines", lambda: [one])  # is enough
+    monkeypatch.setattr("pbdkit.bench.engines", lambda: [one])  # is enough
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
         install(f"pbdkit-broken-{n}", source, f"0.{n}")

@@ -10,10 +10,10 @@ from test_calibrated_rules import NATURAL
 from turning_frame import Turning
 
 import pbdkit
-from pbdkit.analysis.operator import step_operator
-from pbdkit.equilibrium import moves as moves_of
-from pbdkit.equilibrium.load_path import moments
-from pbdkit.experiment.loads import Load
+from pbdkit.equilibrium import system as moves_of
+from pbdkit.equilibrium.solve import moments
+from pbdkit.linear.operator import step_operator
+from pbdkit.model.boundary_conditions import Load
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
@@ -306,7 +306,7 @@ def test_what_is_refused(parts, message):
 
 @pytest.mark.filterwarnings("ignore:loads.0. begins to act")
 def test_a_load_after_the_end_is_warned_of():
-    from pbdkit.prediction.forecast import forecast
+    from pbdkit.stability.forecast import forecast
 
     found = forecast(scene_of(loaded(TIP | {"from": 9})))
     assert "loads.0: begins to act after the run's last step" in found.warnings

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.prediction.forecast import forecast
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import Choice, make_engine
+from pbdkit.stability.forecast import forecast
+from pbdkit.stepping.engine_choice import Choice, make_engine
 from pbdkit.stepping.state import initial_state
 
 LENGTH, HEIGHT = 6, 1

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 
 import pbdkit
 from pbdkit.errors import DivergedError
-from pbdkit.experiment.source import read_text
-from pbdkit.scene.raster import FRAME, LEADER
+from pbdkit.lattice.raster import FRAME, LEADER
+from pbdkit.model.reading import read_text
 
 PAGE = Path(__file__).parent.parent / "docs" / "materials.md"
 

@@ -56,7 +56,7 @@ def test_parameters_have_names_units_and_their_paths(swept):
     ],
 )
 def test_automatic_names_are_the_shortest_that_mean_something(paths, names):
-    from pbdkit.sweeps.grid import names_of
+    from pbdkit.sweeps.specification import names_of
 
     assert [*names_of(paths, {"time"}).values()] == names
 

@@ -7,8 +7,8 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, LATTICES, experiment
 
 import pbdkit
-from pbdkit.results.layout import reserved_names
-from pbdkit.scene.raster import FRAME
+from pbdkit.io.layout import reserved_names
+from pbdkit.lattice.raster import FRAME
 
 CRACKED = {"type": "threshold", "thresholds": [9.0], "cracks": [[[1.75, -9.0], [1.75, 9.0]]]}
 CALIBRATED = {

@@ -7,8 +7,7 @@ import pytest
 
 import pbdkit
 from pbdkit.cli import main
-from pbdkit.sweeps.member import job_of
-from pbdkit.sweeps.specification import Keep
+from pbdkit.sweeps.specification import Keep, job_of
 
 TEXT = """
 version: 1

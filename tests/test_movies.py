@@ -15,9 +15,9 @@ pytest.importorskip("matplotlib")
 import imageio_ffmpeg
 from PIL import Image
 
-from pbdkit.drawing.look import Look
-from pbdkit.drawing.movie import Moving
-from pbdkit.drawing.recording import Recording
+from pbdkit.plotting.data import Recording
+from pbdkit.plotting.movie import Moving
+from pbdkit.plotting.style import Look
 
 SMALL = {"figsize": (3.01, 2.47), "dpi": 61}
 """Of an odd number of pixels either way, as it is given."""
@@ -95,7 +95,7 @@ def test_what_makes_no_movie_is_refused(torn, name, look, message, tmp_path, mon
 
 
 def test_what_is_missing_is_named_with_its_extra(torn, tmp_path, monkeypatch):
-    monkeypatch.setattr("pbdkit.registry.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda name: None)
     for name, missing in {"torn.mp4": "imageio-ffmpeg", "torn.gif": "pillow"}.items():
         with pytest.raises(ExperimentError) as refused:
             torn.pbd.animate(file=tmp_path / name)

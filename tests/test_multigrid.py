@@ -8,10 +8,13 @@ import pytest
 from turning_frame import Turning
 
 import pbdkit
-from pbdkit.equilibrium import increments, linear_solver, linearisation, moves
-from pbdkit.equilibrium.increments import settle
-from pbdkit.interfaces import FollowerRule, Vector
-from pbdkit.scene import solver_sizes
+from pbdkit.equilibrium import linearise as linearisation
+from pbdkit.equilibrium import solve as increments
+from pbdkit.equilibrium import sparse as linear_solver
+from pbdkit.equilibrium import system as moves
+from pbdkit.equilibrium.solve import settle
+from pbdkit.plugin import FollowerRule, Vector
+from pbdkit.scene import memory_estimate as solver_sizes
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 

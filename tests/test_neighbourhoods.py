@@ -11,7 +11,7 @@ from property_cases import LATTICES, LATTICES_AND_NEIGHBOURS, NEIGHBOURS, scene_
 import pbdkit
 from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
 from pbdkit.components.neighbours import Chebyshev, Coordination
-from pbdkit.scene.neighbourhood import build_neighbourhood
+from pbdkit.lattice.neighbourhood import build_neighbourhood
 
 combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_NEIGHBOURS)
 spacing = st.floats(0.3, 3.0)

@@ -20,11 +20,11 @@ from interpreted_kernels import interpreting
 from plugin_sources import listed
 
 import pbdkit
-from pbdkit.cli.plugins import INTERFACES as OFFERED
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.experiment.source import read_file
-from pbdkit.interfaces import INTERFACES
-from pbdkit.registry.registry import Registry
+from pbdkit.cli.plugins import INTERFACE_NAMES as OFFERED
+from pbdkit.model.reading import read_file
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plugin import INTERFACES
+from pbdkit.plugin.registry import Registry
 from pbdkit.testing import examine
 
 Install = Callable[..., None]

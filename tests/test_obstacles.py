@@ -12,11 +12,11 @@ from test_engines import assert_bitwise_equal
 from test_passes import small_passes
 
 import pbdkit
-from pbdkit.experiment.obstacles import Obstacle
-from pbdkit.scene.outlines import Outline, outline_of
+from pbdkit.model.boundary_conditions import Obstacle
+from pbdkit.scene.obstacles import Outline, outline_of
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled import emitter
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numba_engine import emitter
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

@@ -19,14 +19,14 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.analysis.spectrum import (
+from pbdkit.linear.spectrum import (
     NEUTRAL,
     largest_stable_relaxation,
     modes,
     slowest_swing,
     swings_below,
 )
-from pbdkit.analysis.stencil import wave_bound
+from pbdkit.linear.stencil import wave_bound
 
 EIGENVALUES = {
     "real": st.builds(complex, st.floats(-3.0, 0.999)),

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import pbdkit
-from pbdkit.cli.output import refuse_output
+from pbdkit.cli.options import refuse_output
 
 Call = Callable[..., Any]
 OUT = Path("tensile.nc")
@@ -286,7 +286,7 @@ def test_memory_that_runs_out_on_the_way_is_told_as_such(
 
 
 def test_a_container_bounds_memory(tmp_path: Path, monkeypatch: Any) -> None:
-    from pbdkit.resources import memory
+    from pbdkit import memory
 
     monkeypatch.setattr(memory, "CONTAINER", tmp_path / "memory.max")
     whole = memory.machine_memory()

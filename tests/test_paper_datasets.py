@@ -10,9 +10,9 @@ import xarray
 from paper_cases import FOLLOWER, FRAME, LEADER, TORN, every_case, moved, run
 
 import pbdkit
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 BASE = {
     "time": (("time",), "int64"),

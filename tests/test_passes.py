@@ -14,11 +14,12 @@ from test_engines import ANEW, COMPONENTS, DAMAGE, ELASTIC, MANY, TWICE, assert_
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping import choice, passes
-from pbdkit.stepping.choice import choose
-from pbdkit.stepping.compiled import bands
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
-from pbdkit.stepping.passes import AxisSkew, Skew, single_steps
+from pbdkit.stepping import engine_choice as choice
+from pbdkit.stepping.engine_choice import choose
+from pbdkit.stepping.numba_engine import plan as bands
+from pbdkit.stepping.numba_engine import time_skewing as passes
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
+from pbdkit.stepping.numba_engine.time_skewing import AxisSkew, Skew, single_steps
 
 
 @contextmanager

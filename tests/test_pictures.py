@@ -15,10 +15,9 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from pbdkit.drawing import compare, plot
-from pbdkit.drawing.mesh import cells_of, outline, whole
-from pbdkit.drawing.outline import distance_from
-from pbdkit.drawing.pixels import Grid
+from pbdkit.plotting import compare, plot
+from pbdkit.plotting.data import cells_of, distance_from, outline, whole
+from pbdkit.plotting.layers import Grid
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}

@@ -21,9 +21,9 @@ from property_cases import (
 from scene_strategies import lattices, neighbours
 
 import pbdkit
-from pbdkit.analysis.stencil import wave_bound
-from pbdkit.prediction.analysis import Analysis
-from pbdkit.prediction.forecast import prediction
+from pbdkit.linear.stencil import wave_bound
+from pbdkit.stability.analysis import Analysis
+from pbdkit.stability.forecast import prediction
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 

@@ -25,7 +25,8 @@ from property_cases import (
 )
 
 import pbdkit
-from pbdkit.stepping import bond_breaker, surroundings
+from pbdkit.stepping import numpy_engine as bond_breaker
+from pbdkit.stepping import rule_evaluation as surroundings
 
 few = settings(max_examples=4, deadline=None, derandomize=True)
 small = st.floats(-2.0, 2.0, allow_subnormal=False)

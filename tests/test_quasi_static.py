@@ -10,11 +10,11 @@ from reliability.dogbones import faults_of, run, specimen, strains
 
 import pbdkit
 from pbdkit.equilibrium import newton
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import Run, record
-from pbdkit.runs.resumption import resumption
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.progress import Watch
+from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 VELOCITY, STEPS = 0.02, 30
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}

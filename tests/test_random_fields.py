@@ -15,12 +15,12 @@ from scipy.stats import norm
 from test_engines import assert_bitwise_equal
 
 import pbdkit
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.interfaces.random_field import RandomField
-from pbdkit.registry.registry import Registry
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plugin.fields import RandomField
+from pbdkit.plugin.registry import Registry
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
-from pbdkit.sweeps.grid import replicate_seeds
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
+from pbdkit.sweeps.specification import replicate_seeds
 
 MEAN, SCATTER, LENGTH = 0.05, 0.3, 2.0
 ASKED = {"mean": MEAN, "scatter": SCATTER, "correlation_length": LENGTH}

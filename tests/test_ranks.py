@@ -26,15 +26,13 @@ from test_resume import contents
 from thread_ranks import on_ranks
 
 import pbdkit
-from pbdkit.ranks.subdomain import subdomains
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import record
-from pbdkit.runs.processes import Processes
-from pbdkit.runs.resumption import resumption
+from pbdkit.io.checkpoint import has_committed, status_of
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.mpi.partition import subdomains
+from pbdkit.progress import Watch
+from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.storage.run_files import has_committed
-from pbdkit.storage.run_status import status_of
+from pbdkit.simulation import Processes, record
 
 BESIDE = Path(sys.executable).parent
 """Where the launcher of mpi4py's own MPI is, whether or not the environment is activated."""
@@ -272,7 +270,7 @@ def test_authors_look_at_where_others_were(memory, tmp_path):
 
 
 def test_sums_over_cells_have_one_order(tmp_path, monkeypatch):
-    monkeypatch.setattr("pbdkit.scene.cells.CELLS_AT_ONCE", 30)  # so that bodies are cut
+    monkeypatch.setattr("pbdkit.lattice.cells.CELLS_AT_ONCE", 30)  # so that bodies are cut
     compare(sheet(**OTHERS["every diagnostic of cells"]), tmp_path, 3)
 
 
@@ -409,7 +407,7 @@ def test_processes_that_do_not_find_each_other_are_refused(names, monkeypatch, c
     """As where the launcher is of one MPI and mpi4py of another."""
     for name in names:
         monkeypatch.setenv(name, "2")
-    monkeypatch.setattr("pbdkit.ranks.launched.refuse_without", lambda *missing: None)
+    monkeypatch.setattr("pbdkit.mpi.run.refuse_without", lambda *missing: None)
     monkeypatch.setitem(sys.modules, "mpi4py", SimpleNamespace(MPI=Alone))
     done = call("run", "e.json")
     assert done.code == 2

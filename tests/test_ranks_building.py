@@ -14,9 +14,9 @@ from test_ranks import CASES, OTHERS, assert_same, sheet, written
 from thread_ranks import on_ranks
 
 import pbdkit
-from pbdkit.interfaces.frame import FrameMap, FramePolicy
-from pbdkit.ranks.building import CUTS
-from pbdkit.ranks.part import part_of
+from pbdkit.mpi.partition import part_of
+from pbdkit.mpi.run import CUTS
+from pbdkit.plugin.frame import FrameMap, FramePolicy
 from pbdkit.scene.scene import build_scene
 
 LEFT_OUT = {"experiment", "neighbourhood", "others", "extent", "lattice", "rule", "group", "tiling"}
@@ -183,7 +183,9 @@ def test_where_frame_points_follow_particles_far_away_all_build_the_whole(frame)
 
 
 def bounded(monkeypatch, mib):
-    monkeypatch.setattr("pbdkit.scene.sizes.machine_memory", lambda processes=1: mib * 2**20)
+    monkeypatch.setattr(
+        "pbdkit.scene.memory_estimate.machine_memory", lambda processes=1: mib * 2**20
+    )
 
 
 LARGE = {"body": {"type": "grid", "columns": 300, "rows": 300}, "steps": 8, "record": {"every": 8}}

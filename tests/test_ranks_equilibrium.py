@@ -23,14 +23,14 @@ from thread_ranks import on_ranks
 from turning_frame import Turning
 
 import pbdkit
-from pbdkit.equilibrium.grids import parted_grids
-from pbdkit.equilibrium.grids.lattice_system import LatticeSystem
+from pbdkit.equilibrium import multigrid as parted_grids
+from pbdkit.equilibrium.lattice_system import LatticeSystem
 from pbdkit.equilibrium.system import StuckError
-from pbdkit.ranks.divided_rows import deep_subdomains, strip_of
-from pbdkit.results.progress import Watch
-from pbdkit.runs.processes import Processes
-from pbdkit.runs.resumption import resumption
+from pbdkit.mpi.driver import deep_subdomains, strip_of
+from pbdkit.progress import Watch
+from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Processes
 
 pytest.importorskip("numba")
 MULTIGRID = {"type": "equilibrium", "method": "multigrid"}

@@ -11,7 +11,7 @@ import pytest
 from plugin_sources import BROKEN, hook, rule
 
 import pbdkit
-from pbdkit.registry.registry import Registry
+from pbdkit.plugin.registry import Registry
 
 Install = Callable[..., None]
 

@@ -23,15 +23,12 @@ from hypothesis import strategies as st
 from scene_strategies import experiments, pulled_apart, samples
 
 import pbdkit
-from pbdkit.results import netcdf_sink
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.storage import run_store
-from pbdkit.storage.file_system import is_local
-from pbdkit.storage.run_files import store_of
-from pbdkit.storage.run_status import status_of
-from pbdkit.storage.run_store import RunStore
-from pbdkit.storage.unfinished import UnfinishedRun
+from pbdkit.io import checkpoint as run_store
+from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io.atomic_file import is_local
+from pbdkit.io.checkpoint import RunStore, UnfinishedRun, status_of, store_of
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.sinks import OverlappingSink
 
 FOLDER = Path(__file__).parent / "reliability"
 sys.path.append(str(FOLDER))

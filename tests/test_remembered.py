@@ -193,7 +193,7 @@ def test_single_precision_keeps_single_numbers():
 
 def test_the_operator_of_a_softened_state_is_the_step():
     """Linear in u at given damage: the operator makes the steps, to rounding."""
-    from pbdkit.analysis.operator import step_operator
+    from pbdkit.linear.operator import step_operator
 
     scene = build_scene(pbdkit.Experiment(**sheet(rule=Tiring(spread=0.05))))
     state = Stepper(scene).advance(initial_state(scene), 25)

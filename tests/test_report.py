@@ -15,16 +15,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import pbdkit
-from pbdkit.experiment.source import read_text
-from pbdkit.pages import bonds, report
-from pbdkit.pages.origin import experiment_text
-from pbdkit.pages.packing import packed
-from pbdkit.pages.page import script
-from pbdkit.pages.run_content import RunContent
-from pbdkit.pages.settling import moves_of
-from pbdkit.results.carried import carried
-from pbdkit.results.explanation import Explained
+from pbdkit.io.explain import Explained
+from pbdkit.io.layout import carried
+from pbdkit.model.reading import read_text
 from pbdkit.scene.scene import build_scene
+from pbdkit.web import report
+from pbdkit.web import report as bonds
+from pbdkit.web.page import packed, script
+from pbdkit.web.report import RunContent, experiment_text, moves_of
 
 HOSTILE = "</title></script><img src=x onerror=alert(1)><!-- <b>bold</b> &amp;"
 LIMIT = 5_000_000

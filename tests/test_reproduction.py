@@ -8,7 +8,7 @@ from paper_cases import FRAME, LAST, QUIET, body_u, low_after_top, parted, run
 from paper_page import DOCS, PAGE, rows
 
 import pbdkit
-from pbdkit.experiment.shipped import shipped_names
+from pbdkit.model.shipped import shipped_names
 
 OTHER = (DOCS / "anisotropy-and-plasticity.md").read_text("utf-8")
 CASES = {"a": 15, "b": 5, "c": 5, "d": 11, "e": 3, "f": 14, "g": 4}

@@ -16,14 +16,13 @@ from hypothesis import assume, given
 from scene_strategies import experiments, samples
 
 import pbdkit
-from pbdkit.results import netcdf_sink
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.results.progress import Watch
-from pbdkit.results.sink import MemorySink
-from pbdkit.runs.course import Run, record
-from pbdkit.runs.resumption import resumption
+from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.sinks import MemorySink, OverlappingSink
+from pbdkit.progress import Watch
+from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 Call = Callable[..., Any]
 OUT = Path("tensile.nc")
@@ -228,7 +227,7 @@ def test_what_changed_since_is_refused(
     assert (refused.code, "e.json has changed since the run began" in refused.err) == (2, True)
     Path("e.json").write_text(json.dumps(stopped))
     with monkeypatch.context() as other:
-        other.setattr("pbdkit.runs.earlier_run.version", lambda name: "99.0")
+        other.setattr("pbdkit.restart.version", lambda name: "99.0")
         refused = call("resume", str(OUT))
         assert (refused.code, "and 99.0 is installed" in refused.err) == (2, True)
         assert call("resume", str(OUT), "--anyway").code == 0
@@ -241,7 +240,7 @@ CONTINUED = ["plain", "everything", "memory", "fracture", "small records", "zlib
 def test_a_finished_run_is_continued_to_the_longer_one(
     change: str, tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pbdkit.runs.earlier_run.BLOCK_BYTES", 3000)  # several rows, not all
+    monkeypatch.setattr("pbdkit.restart.BLOCK_BYTES", 3000)  # several rows, not all
     given = tensile | RUNS[change]
     given |= {"steps": given.get("steps", 10) + 17}
     whole, shorter = tmp_path / "whole.nc", tmp_path / "shorter.nc"

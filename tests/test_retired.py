@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.experiment.source import Source
-from pbdkit.pages.run_content import RunContent
-from pbdkit.registry.registry import Registry
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import Source
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plugin.registry import Registry
+from pbdkit.web.report import RunContent
 
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 PULLED = {

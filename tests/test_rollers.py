@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.analysis.operator import step_operator
-from pbdkit.equilibrium.increments import equilibrium_state
-from pbdkit.prediction.forecast import forecast
+from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.linear.operator import step_operator
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.choice import Choice, make_engine
+from pbdkit.stability.forecast import forecast
+from pbdkit.stepping.engine_choice import Choice, make_engine
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
@@ -182,7 +182,7 @@ def test_the_step_operator_is_the_step(parts):
 @pytest.mark.parametrize("method", ["matrix", "stencils"])
 def test_rollers_cost_no_more_iterations_than_clamps(method, monkeypatch):
     if method == "matrix":
-        monkeypatch.setattr("pbdkit.equilibrium.linearisation.find_spec", lambda _: None)
+        monkeypatch.setattr("pbdkit.equilibrium.linearise.find_spec", lambda _: None)
 
     def iterations(**clamped):
         data = sheet(60, 40, solver={"type": "equilibrium", "method": "multigrid"})

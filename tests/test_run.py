@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium.settlement import Pace
-from pbdkit.experiment.solvers import Equilibrium, Solver
-from pbdkit.results.progress import Watch
-from pbdkit.results.sink import MemorySink
-from pbdkit.runs.course import DRIVERS, Run, record
-from pbdkit.runs.drivers import Stepwise
+from pbdkit.equilibrium.certificate import Pace
+from pbdkit.io.sinks import MemorySink
+from pbdkit.model.solver import Equilibrium, Solver
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.guard import Guard
+from pbdkit.simulation import DRIVERS, Run, Stepwise, record
+from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.state import State
 
 SOLVERS = {

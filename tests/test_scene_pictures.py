@@ -11,14 +11,12 @@ from matplotlib.figure import Figure
 from property_cases import LATTICES, experiment, pull_right
 
 import pbdkit
-from pbdkit.drawing import notebook, plot_experiment
-from pbdkit.drawing.figures import figure_of
-from pbdkit.drawing.scene_picture import edge_of, picture_of
-from pbdkit.drawing.svg import Svg
-from pbdkit.drawing.ways import extreme
-from pbdkit.experiment.shipped import shipped_names
-from pbdkit.results import progress
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit import progress
+from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.model.shipped import shipped_names
+from pbdkit.plotting import notebook, plot_experiment
+from pbdkit.plotting.scene import Svg, edge_of, extreme, picture_of
+from pbdkit.plotting.style import figure_of
 from pbdkit.scene.scene import build_scene
 
 PULLED = {"leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}},

@@ -7,13 +7,13 @@ import jsonschema
 import pytest
 
 import pbdkit
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.experiment.shipped import read_experiment, shipped_names
-from pbdkit.experiment.source import read_file
 from pbdkit.fitting.schema import fit_schema
 from pbdkit.fitting.specification import shipped_fits
-from pbdkit.registry.registry import Registry
-from pbdkit.results.layout import dataset_schema
+from pbdkit.io.layout import dataset_schema
+from pbdkit.model.reading import read_file
+from pbdkit.model.schema import experiment_schema
+from pbdkit.model.shipped import read_experiment, shipped_names
+from pbdkit.plugin.registry import Registry
 from pbdkit.sweeps.specification import sweep_schema
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.storage.seal import BLOCK, FOOT, BrokenSealError, SealedFile, put_seal
+from pbdkit.io.seal import BLOCK, FOOT, BrokenSealError, SealedFile, put_seal
 
 LARGE = ["--set=body.columns=120", "--set=body.rows=120", "--set=steps=20"]
 

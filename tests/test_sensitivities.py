@@ -14,12 +14,11 @@ import pbdkit
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import Resting
-from pbdkit.interfaces import FollowerRule, FramePolicy
-from pbdkit.registry import BUILTIN
-from pbdkit.registry.registry import Registry
-from pbdkit.scene import homes
-from pbdkit.scene.guides import kinds_of_places
-from pbdkit.scene.raster import FOLLOWER
+from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.plugin import BUILTIN, FollowerRule, FramePolicy
+from pbdkit.plugin.registry import Registry
+from pbdkit.scene import constants as homes
+from pbdkit.scene.leaders import kinds_of_places
 from pbdkit.scene.scene import build_scene, renumbered
 from pbdkit.stepping.followers import SlotFollowers
 
@@ -319,7 +318,7 @@ def test_a_rough_derivative_is_as_accurate_as_asked():
 
 def test_sensitivities_have_no_kernel_compiled_anew():
     pytest.importorskip("numba")
-    from pbdkit.equilibrium.grids.grid_functions import kernels
+    from pbdkit.equilibrium.kernels import kernels
 
     resting = Resting.of(pbdkit.Experiment(**WIDE))
     resting.gradient(np.ones_like(resting.state.u), [Parameter("rule.poisson_ratio")])

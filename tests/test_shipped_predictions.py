@@ -12,10 +12,10 @@ import pytest
 from property_cases import body_of
 
 import pbdkit
-from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.spectrum import modes, slowest_swing, spectrum
-from pbdkit.equilibrium.increments import equilibrium_state
-from pbdkit.experiment.shipped import shipped_names
+from pbdkit.equilibrium.solve import equilibrium_state
+from pbdkit.linear.operator import step_operator
+from pbdkit.linear.spectrum import modes, slowest_swing, spectrum
+from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state

@@ -10,11 +10,11 @@ from finite_elements.problems import HEXAGONAL_BAR
 from scipy import sparse
 
 import pbdkit
-from pbdkit.analysis.operator import step_operator
-from pbdkit.analysis.stencil import derivative
-from pbdkit.equilibrium import linear_solver as linear
-from pbdkit.equilibrium.dissection import FEWEST, dissected
-from pbdkit.scene import cut_cells
+from pbdkit.equilibrium import sparse as linear
+from pbdkit.equilibrium.amg import FEWEST, dissected
+from pbdkit.lattice import fill as cut_cells
+from pbdkit.linear.operator import step_operator
+from pbdkit.linear.stencil import derivative
 from pbdkit.scene.scene import build_scene
 
 
@@ -130,7 +130,7 @@ def test_cells_that_are_not_cut_are_whole_or_outside(body, lattice, monkeypatch)
 
 def test_a_process_reads_a_kernel_once(interpreted):
     pytest.importorskip("numba")
-    from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+    from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
     given = experiment(HEXAGONAL_BAR, 20, solver={"type": "stepping"})
     scene = build_scene(pbdkit.Experiment(**given))

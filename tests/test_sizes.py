@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import pbdkit
-from pbdkit.prediction.forecast import forecast
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
+from pbdkit.stability.forecast import forecast
 
 MIB = 2**20
 CHANGES = {
@@ -61,10 +61,10 @@ PEAK = """
 import json, sys
 from pathlib import Path
 from pbdkit.api import load
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.simulation import Run, record
 from pbdkit.scene.scene import build_scene
-from pbdkit.scene.sizes import sizes_of
+from pbdkit.scene.memory_estimate import sizes_of
 
 def run(side):
     size = [f"body.columns={side}", f"body.rows={side}"]
@@ -105,10 +105,10 @@ ALONE = """
 import json, sys
 from pathlib import Path
 from pbdkit.api import load
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, peak_memory, record
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.simulation import Run, peak_memory, record
 from pbdkit.scene.scene import build_scene
-from pbdkit.scene.sizes import sizes_of
+from pbdkit.scene.memory_estimate import sizes_of
 
 scene = build_scene(load("paper/a", settings=sys.argv[2:]))
 record(Run(scene), NetcdfSink(Path(sys.argv[1]), replace=True))
@@ -122,7 +122,7 @@ import contextlib, importlib, json, sys
 for name in json.load(sys.stdin):
     with contextlib.suppress(Exception):
         importlib.import_module(name)
-from pbdkit.runs.course import peak_memory
+from pbdkit.simulation import peak_memory
 print(peak_memory())
 """
 EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (800, [])}

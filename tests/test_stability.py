@@ -5,9 +5,9 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, advanced, body_sites, scene_of
 
 from pbdkit.components.neighbours import Chebyshev, Coordination
-from pbdkit.prediction.forecast import forecast
-from pbdkit.runs.course import Run
-from pbdkit.scene.neighbourhood import build_neighbourhood
+from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.simulation import Run
+from pbdkit.stability.forecast import forecast
 
 SQUARE = {"type": "square", "a": 1.0}
 HEXAGONAL = {"type": "hexagonal", "a": 1.0}

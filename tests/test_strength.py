@@ -14,13 +14,22 @@ import pytest
 from scipy.stats import weibull_min
 
 import pbdkit
-from pbdkit.experiment.source import Source
-from pbdkit.fitting import strength_simulation
-from pbdkit.fitting.first_break import BondStrains, Elastic, bond_strains, strengths
-from pbdkit.fitting.specimens import Specimens, seeded
-from pbdkit.fitting.strength_laws import LAWS, Breaks, weibull_sums
-from pbdkit.fitting.strength_specification import Peaks, is_strength_fit
-from pbdkit.scene.raster import FRAME
+from pbdkit.fitting import strength as strength_simulation
+from pbdkit.fitting.strength import (
+    LAWS,
+    BondStrains,
+    Breaks,
+    Elastic,
+    Peaks,
+    Specimens,
+    bond_strains,
+    is_strength_fit,
+    seeded,
+    strengths,
+    weibull_sums,
+)
+from pbdkit.lattice.raster import FRAME
+from pbdkit.model.reading import Source
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 

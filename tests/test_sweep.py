@@ -20,15 +20,11 @@ import xarray
 from reliability.sweep_under_fire import under_fire
 
 import pbdkit
-from pbdkit.experiment.source import Source
-from pbdkit.storage import sqlite_file
+from pbdkit.io import sqlite_file
+from pbdkit.model.reading import Source
 from pbdkit.sweeps import store as stores
-from pbdkit.sweeps.course import carry_out
-from pbdkit.sweeps.crew import Alone, Cluster
-from pbdkit.sweeps.grid import replicate_seeds
-from pbdkit.sweeps.member import Asked
-from pbdkit.sweeps.processes import Processes
-from pbdkit.sweeps.specification import checked
+from pbdkit.sweeps.execute import Alone, Cluster, Processes, carry_out
+from pbdkit.sweeps.specification import Asked, checked, replicate_seeds
 
 VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
 
@@ -579,7 +575,7 @@ class Lazy(pbdkit.FollowerRule):
 
 
 def test_a_class_from_python_is_swept_in_this_process(small, tmp_path):
-    from pbdkit.experiment.source import Source
+    from pbdkit.model.reading import Source
 
     given = pbdkit.Experiment.build(Source(data=small | {"rule": {"type": "lazy"}}), [Lazy])
     found = pbdkit.sweep(given, vary={"rule.share": [0.3, 0.6]}, progress=False)

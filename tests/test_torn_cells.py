@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scene_strategies import samples
 
 import pbdkit
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.tables import Tables
+from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.state import initial_state

@@ -10,7 +10,7 @@ import pytest
 import xarray
 
 import pbdkit
-from pbdkit.resources.trial import BEGINNINGS, MODULE, opened_unsealed, try_reading
+from pbdkit.untrusted_files import BEGINNINGS, MODULE, opened_unsealed, try_reading
 
 sys.path.append(str(Path(__file__).parent / "reliability"))
 import fuzz_experiments
@@ -121,7 +121,7 @@ def test_a_large_file_is_read_in_pieces(tmp_path):
     xarray.Dataset({"x": (("t", "n"), values)}).to_netcdf(path)
     code = (
         "import sys; from pathlib import Path; from pbdkit.resources import trial\n"
-        "trial._read(Path(sys.argv[1])); from pbdkit.runs.course import peak_memory\n"
+        "trial._read(Path(sys.argv[1])); from pbdkit.simulation import peak_memory\n"
         "print(peak_memory())"
     )
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)

@@ -12,11 +12,10 @@ import pytest
 from property_cases import BOTH_ENDS_HELD, FRAMES, LATTICES, RULES, experiment
 
 import pbdkit
-from pbdkit.analysis.spectrum import has_symmetric_rows
-from pbdkit.analysis.weights import HopelessError, Weights, best_weights
-from pbdkit.prediction.analysis import Analysis
-from pbdkit.runs.tuning import MARGIN, tuned
+from pbdkit.linear.spectrum import has_symmetric_rows
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.stability.analysis import Analysis
+from pbdkit.stability.relaxation import MARGIN, HopelessError, Weights, best_weights, tuned
 
 AUTO = {"type": "stepping", "engine": "numpy", "relaxation": "auto", "memory": "auto"}
 OTHERS = {"none": {"type": "none"}, "mean": FRAMES["mean"], "first": FRAMES["first"],

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.drawing.labels import in_its_units
-from pbdkit.experiment.schema import experiment_schema
-from pbdkit.experiment.source import Source
-from pbdkit.interfaces import units as units_module
-from pbdkit.interfaces.units import (
+from pbdkit.io.layout import dataset_schema
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.model.reading import Source
+from pbdkit.model.schema import experiment_schema
+from pbdkit.plotting.style import in_its_units
+from pbdkit.plugin import units as units_module
+from pbdkit.plugin.registry import Registry
+from pbdkit.plugin.units import (
     AREA,
     ENERGY,
     FORCE,
@@ -24,11 +27,8 @@ from pbdkit.interfaces.units import (
     STRESS,
     Units,
 )
-from pbdkit.registry.registry import Registry
-from pbdkit.results.layout import dataset_schema
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, record
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 
 UNITS = {"length": "0.25 mm", "youngs_modulus": "206 GPa", "thickness": "3.05 mm"}
 BAR: dict[str, Any] = {
@@ -310,7 +310,7 @@ def test_the_lag_behind_leaders_is_told_in_mm(call: Any) -> None:
 
 
 def test_units_that_are_those_wanted_are_read_without_pint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pbdkit.interfaces.units._registry", lambda: pytest.fail("pint is used"))
+    monkeypatch.setattr("pbdkit.plugin.units._registry", lambda: pytest.fail("pint is used"))
     assert Units(length="2.5 mm", youngs_modulus="3000 MPa").length_mm == 2.5
 
 

@@ -14,9 +14,9 @@ import xarray
 from jsonschema import Draft202012Validator
 
 import pbdkit
-from pbdkit.experiment.beside import Beside
-from pbdkit.experiment.field_file import read_field
-from pbdkit.interfaces.varying import Gridded, as_varying
+from pbdkit.model.reading import Beside
+from pbdkit.model.validation import read_field
+from pbdkit.plugin.fields import Gridded, as_varying
 from pbdkit.scene.scene import build_scene
 
 DISC = {"type": "disc", "radius": 2.0, "centre": [4.0, 2.0]}
@@ -54,8 +54,8 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 def schema() -> str:
-    from pbdkit.experiment.schema import experiment_schema
-    from pbdkit.registry.registry import Registry
+    from pbdkit.model.schema import experiment_schema
+    from pbdkit.plugin.registry import Registry
 
     return json.dumps(experiment_schema(Registry(), installed=False))
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pbdkit
-from pbdkit.interfaces.vector import KINDS, vector
-from pbdkit.stepping.compiled.functions import compiled
+from pbdkit.plugin.vector import KINDS, vector
+from pbdkit.stepping.numba_engine.cache import compiled
 
 NUMBERS = st.floats(-1e150, 1e150)
 SPACES = pytest.mark.parametrize("space", sorted(KINDS))

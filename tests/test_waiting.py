@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from pbdkit.cli import waiting as module
-from pbdkit.cli.waiting import waiting
+from pbdkit.cli import options as module
+from pbdkit.cli.options import waiting
 
 
 class Terminal(io.StringIO):

@@ -18,10 +18,9 @@ import pytest
 from conftest import Call
 
 import pbdkit
-from pbdkit.storage.destination import write, write_folder, write_together, written
-from pbdkit.storage.new_file import NewFile
-from pbdkit.storage.paged_file import PagedFile
-from pbdkit.storage.seal import SealedFile
+from pbdkit.io.atomic_file import NewFile, write, write_folder, write_together, written
+from pbdkit.io.paged_file import PagedFile
+from pbdkit.io.seal import SealedFile
 
 SCRIPT = Path(__file__).parent / "reliability" / "disk_faults.py"
 

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.overlapping_sink import LARGE_BYTES, MOST_WAITING, OverlappingSink
-from pbdkit.results.progress import Watch
-from pbdkit.results.sink import KeepingSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.atomic_file import Destination
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.sinks import LARGE_BYTES, MOST_WAITING, KeepingSink, OverlappingSink
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.storage.destination import Destination
+from pbdkit.simulation import Run, record
 
 LARGE = np.zeros(LARGE_BYTES // 8)
 
@@ -157,7 +156,7 @@ def test_an_output_that_appears_meanwhile_is_left_as_it_is(tmp_path):
 
 def test_what_another_run_writes_is_no_leftover_where_nothing_is_locked(tmp_path, monkeypatch):
     """The name of its result begins with this one's."""
-    monkeypatch.setattr("pbdkit.storage.destination.lock", lambda file: True)
+    monkeypatch.setattr("pbdkit.io.atomic_file.lock", lambda file: True)
     with Destination(tmp_path / "x.nc.2", replace=False).temporary() as live:
         left = Destination(tmp_path / "x.nc", replace=False).temporary()
         left.close()

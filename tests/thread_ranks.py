@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
 
-from pbdkit.ranks.divided_run import SharingRanks
+from pbdkit.mpi.run import SharingRanks
 
 PATIENCE_S = 120.0
 

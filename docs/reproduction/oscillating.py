@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import pbdkit
-from pbdkit.analysis.spectrum import modes
+from pbdkit.linear.spectrum import modes
 
 NAME, PARTICLE, LET_GO = "stability/oscillation", 116, 300
 

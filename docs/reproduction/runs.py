@@ -8,7 +8,7 @@ import xarray
 from numpy.typing import NDArray
 
 import pbdkit
-from pbdkit.experiment.source import read_text
+from pbdkit.model.reading import read_text
 
 Floats = NDArray[np.float64]
 LEADER, BODY = 0, 0

@@ -13,7 +13,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 import pbdkit
-from pbdkit.experiment.source import read_file
+from pbdkit.model.reading import read_file
 
 FILE = FOLDER.parent.parent / "stability-map.yaml"
 FINE = 221

@@ -17,7 +17,7 @@ import click
 from pbdkit import errors
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.cli.streams import standard_streams
-from pbdkit.resources.memory import refuse_little_memory
+from pbdkit.memory import refuse_little_memory
 
 COMPLETING = "_PBDKIT_COMPLETE"
 """The variable in which a shell asks how a line goes on."""
@@ -34,10 +34,8 @@ class Listed:
 
 GROUPS = {
     "Start": (
-        Listed(
-            "init", "experiments", "Writes an experiment to start from, or copies a shipped one."
-        ),
-        Listed("experiments", "experiments", "Lists the shipped experiments, or prints one."),
+        Listed("init", "sweep", "Writes an experiment to start from, or copies a shipped one."),
+        Listed("experiments", "sweep", "Lists the shipped experiments, or prints one."),
     ),
     "Run": (
         Listed("run", "run", "Runs an experiment, and writes its result to a file."),
@@ -46,26 +44,26 @@ GROUPS = {
         Listed("live", "live", "Steps an experiment in the browser, led by the mouse."),
     ),
     "Look": (
-        Listed("plot", "picture", "Draws a result, or the set-up of an experiment before it runs."),
-        Listed("animate", "picture", "Makes a movie of a result."),
-        Listed("curve", "curve", "Draws what changes: a curve, a history, the crack."),
+        Listed("plot", "plot", "Draws a result, or the set-up of an experiment before it runs."),
+        Listed("animate", "plot", "Makes a movie of a result."),
+        Listed("curve", "plot", "Draws what changes: a curve, a history, the crack."),
         Listed("report", "report", "Makes one page to share: its motion, curves, all else."),
-        Listed("export", "export", "Writes a result for ParaView."),
+        Listed("export", "result", "Writes a result for ParaView."),
         Listed("explain", "result", "Says which bonds broke, when and why."),
         Listed("verify", "result", "Says whether results are as they were written."),
     ),
     "Understand": (
         Listed("check", "check", "Says before a run whether it is stable, and how long it takes."),
-        Listed("identify", "identify", "Says what a rule is physically, with its constants."),
+        Listed("identify", "check", "Says what a rule is physically, with its constants."),
         Listed("bench", "bench", "Measures speed against error, to choose a solver."),
     ),
     "Vary and fit": (
         Listed("sweep", "sweep", "Runs an experiment over many values of its parameters."),
-        Listed("fit", "fit", "Finds the parameters that meet what was measured, with errors."),
+        Listed("fit", "sweep", "Finds the parameters that meet what was measured, with errors."),
     ),
     "Extend": (
         Listed("plugins", "plugins", "Lists, checks and begins components of your own."),
-        Listed("schema", "experiments", "Prints the JSON Schema, for completion in an editor."),
+        Listed("schema", "sweep", "Prints the JSON Schema, for completion in an editor."),
     ),
 }
 """Every command, by what somebody wants; a new one is a line here."""
@@ -95,7 +93,7 @@ MORE = """\
 
 MEANT = {
     ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
-    ("show", "view", "draw", "picture", "image"): "`pbdkit plot` draws a result or a set-up",
+    ("show", "view", "draw", "plot", "image"): "`pbdkit plot` draws a result or a set-up",
     ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
     ("continue", "restart"): "`pbdkit resume` goes on with a run",
     ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
@@ -130,7 +128,7 @@ class Commands(click.Group):
             if ctx.resilient_parsing:  # a shell asks how to go on
                 return None
             from pbdkit.errors import did_you_mean
-            from pbdkit.experiment.shipped import shipped_names
+            from pbdkit.model.shipped import shipped_names
 
             run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
             meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")

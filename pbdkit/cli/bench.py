@@ -38,12 +38,11 @@ def bench(
 ) -> None:
     """Measure speed against error, at one or several sizes: engines, precisions and threads; where
     the solver is `equilibrium`, its methods and the steps, over tolerances."""
+    from pbdkit import bench as work_precision
     from pbdkit.api import load
-    from pbdkit.bench import work_precision
-    from pbdkit.bench.measurement import measure, ways
-    from pbdkit.cli.output import refuse_output, refuse_unwritable, save, show_table
-    from pbdkit.cli.waiting import waiting
-    from pbdkit.storage.destination import write
+    from pbdkit.bench import measure, ways
+    from pbdkit.cli.options import refuse_output, refuse_unwritable, save, show_table, waiting
+    from pbdkit.io.atomic_file import write
 
     for path in filter(None, (picture, json_file)):
         refuse_output(path, force=True, experiment=Path(experiment))

@@ -1,4 +1,7 @@
-"""``pbdkit check``: what will happen, before it does."""
+"""``pbdkit check``: what will happen, before it does.
+
+``pbdkit identify``: what a rule is physically.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,16 @@ import click
 import numpy as np
 
 from pbdkit.cli.options import experiment_argument, json_option, set_option, verbose_option
-from pbdkit.interfaces.units import BODY_FORCE, FORCE, in_lengths
+from pbdkit.plugin.units import BODY_FORCE, FORCE, in_lengths
 
 if TYPE_CHECKING:
-    from pbdkit.experiment.leaders import Driven, LeaderGroup
-    from pbdkit.experiment.loads import Load
-    from pbdkit.experiment.model import Experiment
-    from pbdkit.interfaces.units import Units
-    from pbdkit.prediction.forecast import Forecast
+    from pbdkit.identification.report import Identity
+    from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
+    from pbdkit.model.experiment import Experiment
+    from pbdkit.plugin.units import Units
     from pbdkit.scene.scene import Scene
+    from pbdkit.stability.forecast import Forecast
+
 
 Row = tuple[str, str]
 SHOWN = 3
@@ -35,17 +39,17 @@ SHOWN = 3
 def check(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
     """Say what will happen, without running it: who is held and who leads, whether it is stable,
     in how many steps it settles, what it takes in time and memory."""
-    from pbdkit.cli.waiting import waiting
+    from pbdkit.cli.options import waiting
     from pbdkit.errors import PbdkitWarning
-    from pbdkit.experiment.loading import load_experiment
+    from pbdkit.model.loading import load_experiment
 
     with warnings.catch_warnings(record=True) as of_loading:
         warnings.simplefilter("always", PbdkitWarning)
         loaded = load_experiment(experiment, settings)
-    from pbdkit.prediction.forecast import forecast, refuse_unheld_loads
-    from pbdkit.runs.course import rehearse
-    from pbdkit.runs.tuning import tuned
     from pbdkit.scene.scene import build_scene
+    from pbdkit.simulation import rehearse
+    from pbdkit.stability.forecast import forecast, refuse_unheld_loads
+    from pbdkit.stability.relaxation import tuned
 
     with waiting(f"checking {loaded.name}", silent=as_json):
         scene = tuned(build_scene(loaded))
@@ -103,7 +107,7 @@ def _what(loaded: Experiment, scene: Scene, found: Forecast) -> Iterator[Row]:
         count = loaded.record_count - 1
         each = f" of each of {count} recorded steps" if count > 1 else ""
         yield "solver", f"goes straight to the equilibrium{each}, to where steps would lead"
-        from pbdkit.equilibrium.load_path import changes
+        from pbdkit.equilibrium.solve import changes
 
         if settled := changes(scene, loaded.steps):
             listed = ", ".join(map(str, settled[:SHOWN]))
@@ -158,7 +162,7 @@ def _force(load: Load, units: Units | None) -> str:
 
 def _in_regions(scene: Scene) -> Iterator[str]:
     """How many particles of the body lie in each region."""
-    from pbdkit.scene.field_values import signed_distance
+    from pbdkit.scene.constants import signed_distance
 
     raster = scene.raster
     x = raster.reference(raster.body_rows)
@@ -201,7 +205,7 @@ def _seconds(seconds: float) -> str:
 
 def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
     """The rest of what is known."""
-    from pbdkit.interfaces import RenewsParticles
+    from pbdkit.plugin import RenewsParticles
 
     experiment = scene.experiment
     records = experiment.record_count
@@ -225,3 +229,43 @@ def _more(scene: Scene, found: Forecast) -> Iterator[Row]:
         reached = "" if end is None else f", {size * end:.4g} when they end"
         told = f"{size * found.lag:.4g} {counted} behind equilibrium if the leaders' fastest steps"
         yield "lag", f"{told} went on{reached}"
+
+
+@click.command()
+@experiment_argument
+@set_option
+@verbose_option
+@json_option
+def identify(experiment: str, settings: tuple[str, ...], verbose: bool, as_json: bool) -> None:
+    """Say what the experiment's rule is physically, on its lattice and neighbours: diffusion or an
+    elastic body, and with which constants."""
+    from pbdkit.api import identify, load
+    from pbdkit.cli.options import waiting
+
+    materials = load(experiment, settings=settings).materials()
+    with waiting("identifying", silent=as_json):
+        every = {name: identify(one) for name, one in materials.items()}
+    if as_json:
+        alone = every.get("")
+        told = alone.as_dict() if alone else {name: f.as_dict() for name, f in every.items()}
+        click.echo(json.dumps(told))
+        return
+    alike: dict[str, list[str]] = {}
+    for name, found in every.items():
+        alike.setdefault(json.dumps(found.as_dict()), []).append(name)
+    for names in alike.values():
+        _show(every[names[0]], ", ".join(filter(None, names)), verbose)
+    for note in dict.fromkeys(note for found in every.values() for note in found.notes):
+        names = [name for name, found in every.items() if note in found.notes]
+        of = f" ({', '.join(names)})" if len(names) < len(every) else ""
+        click.echo(f"note{of}: {note}")
+
+
+def _show(found: Identity, materials: str, verbose: bool) -> None:
+    """The table of one material, or of several that are the same."""
+    from pbdkit.cli.options import show_table
+    from pbdkit.identification.report import table
+
+    where = f" ({materials})" if materials else ""
+    click.echo(f"{found.name}: {found.rule}{where}, {found.lattice} lattice, {found.neighbours}")
+    show_table(table(found, whole=verbose))

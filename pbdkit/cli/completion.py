@@ -1,14 +1,18 @@
 """What the tabulator key offers: experiments, settings, results, and what is in them.
 
 What cannot be found out is not offered: a shell has no place for messages.
+
+The paths that `--set` takes, and the values at them, by the JSON Schema of experiments.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from glob import escape
 from itertools import pairwise
 from pathlib import Path
@@ -49,7 +53,7 @@ def _completer(find: Finder) -> Completer:
 def _experiments(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
     """The shipped experiments and the experiment files here; where no shipped one begins so,
     whatever the shell itself offers as files."""
-    from pbdkit.experiment.shipped import shipped_names
+    from pbdkit.model.shipped import shipped_names
 
     names = [name for name in shipped_names() if name.startswith(begun)]
     if not names:
@@ -61,14 +65,14 @@ def _experiments(context: click.Context, begun: str) -> Iterator[str | Completio
 
 def _shipped(context: click.Context, begun: str) -> Iterable[str]:
     """The shipped experiments."""
-    from pbdkit.experiment.shipped import shipped_names
+    from pbdkit.model.shipped import shipped_names
 
     return shipped_names()
 
 
 def _results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
     """The results in a folder, those of runs that are not finished, and the folders in it."""
-    from pbdkit.storage.run_files import STORE
+    from pbdkit.io.checkpoint import STORE
 
     folder = begun[: begun.rfind("/") + 1]
     start, found = begun[len(folder) :], False
@@ -86,9 +90,8 @@ def _results(context: click.Context, begun: str) -> Iterator[str | CompletionIte
 def _settings(context: click.Context, begun: str) -> Iterator[str]:
     """The paths of the experiment on the line, with the settings before; behind `=` the words that
     can stand there, and the present value."""
-    from pbdkit.cli.setting_paths import SettingPaths
-    from pbdkit.experiment.schema import experiment_schema
-    from pbdkit.registry.registry import Registry
+    from pbdkit.model.schema import experiment_schema
+    from pbdkit.plugin.registry import Registry
 
     path, asks_value, _ = begun.partition("=")
     # Plugins are loaded where their types are asked for.
@@ -101,10 +104,9 @@ def _settings(context: click.Context, begun: str) -> Iterator[str]:
 
 
 def _data(context: click.Context) -> dict[str, Any]:
-    from pbdkit.experiment.model import Experiment
-    from pbdkit.experiment.settings import with_settings
-    from pbdkit.experiment.shipped import read_experiment
-    from pbdkit.experiment.source import Source
+    from pbdkit.model.experiment import Experiment
+    from pbdkit.model.reading import Source, with_settings
+    from pbdkit.model.shipped import read_experiment
 
     # The option that waits for its value keeps click from giving arguments their names.
     name = context.params.get("experiment") or next(iter(context.args), None)
@@ -142,7 +144,7 @@ def _times(context: click.Context, begun: str) -> Iterator[str]:
 @contextmanager
 def _content(context: click.Context) -> Iterator[Any]:
     """The first result among what is on the line, opened without xarray."""
-    from pbdkit.storage.seal import opened
+    from pbdkit.io.seal import opened
 
     given = [v for v in context.params.values() if isinstance(v, Path)]
     given += [Path(word) for word in context.args]
@@ -194,3 +196,105 @@ class _Bash(BashComplete):
 def speak_bash() -> None:
     """From now on this is what click takes for bash."""
     add_completion_class(_Bash)
+
+
+Schema = Mapping[str, Any]
+MISSING = object()
+"""In place of what an experiment leaves out."""
+
+NEEDS_QUOTES = {*" \"'{}$"}
+"""A shell would not leave a word with these as it is."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place in an experiment: what stands there, and what the schema says of it."""
+
+    path: str
+    data: Any
+    schema: Schema
+
+
+class SettingPaths:
+    """Of one experiment's `data`; `schema` is that of experiments."""
+
+    def __init__(self, data: Mapping[str, Any], schema: Schema) -> None:
+        self._definitions, self._whole = schema.get("$defs", {}), Place("", data, schema)
+
+    def paths(self) -> list[str]:
+        """Down to single values, and lists of them."""
+        return [place.path for place in self._below(self._whole)]
+
+    def values(self, path: str) -> list[str]:
+        """What can stand there: the words that the schema lists, and what stands there now."""
+        place = self._whole
+        for word in path.split("."):
+            inner = (one for one in self._inside(place) if one.path.rpartition(".")[-1] == word)
+            if (found := next(inner, None)) is None:
+                return []
+            place = found
+        words = dict.fromkeys(self._words(place.schema))
+        now = place.data if place.data is not MISSING else place.schema.get("default", MISSING)
+        if now is not MISSING and now is not None:
+            words[now if isinstance(now, str) else json.dumps(now, separators=(",", ":"))] = None
+        return [word for word in words if not {*word} & NEEDS_QUOTES]
+
+    def _below(self, place: Place) -> Iterator[Place]:
+        inside = [*self._inside(place)]
+        if not inside:
+            yield place
+        for one in inside:
+            yield from self._below(one)
+
+    def _inside(self, place: Place) -> Iterator[Place]:
+        """What it holds; nothing where it is a single value, or a list of them."""
+        begun = f"{place.path}." if place.path else ""
+        data, forms = place.data, [*self._forms(place.schema)]
+        if data is MISSING:
+            data = place.schema.get("default", MISSING)
+        if isinstance(data, list):
+            items: Schema = next((form["items"] for form in forms if "items" in form), {})
+            if any(isinstance(one, dict) for one in data) and items:
+                yield from (Place(f"{begun}{n}", one, items) for n, one in enumerate(data))
+            return
+        maps = [form for form in forms if "properties" in form]
+        if isinstance(data, dict):
+            fitting = [form for form in maps if _fits(form, data)] or maps[:1]
+            known: dict[str, Any] = dict(fitting[0]["properties"]) if fitting else {}
+            types = [form["properties"]["type"] for form in maps if "type" in form["properties"]]
+            known |= {"type": {"anyOf": types}} if types else {}
+            other: Schema = next((f["additionalProperties"] for f in forms if _is_open(f)), {})
+            for key in dict.fromkeys([*data, *known]):
+                yield Place(f"{begun}{key}", data.get(key, MISSING), known.get(key, other))
+        elif data is MISSING and len(maps) == len(forms) == 1:
+            for key, schema in maps[0]["properties"].items():
+                yield Place(f"{begun}{key}", MISSING, schema)
+
+    def _forms(self, schema: Schema) -> Iterator[Schema]:
+        """The ways to write it that are not deprecated, references followed."""
+        if "$ref" in schema:
+            yield from self._forms(self._definitions.get(schema["$ref"].split("/")[-1], {}))
+            return
+        ways = [way for name in ("anyOf", "oneOf", "allOf") for way in schema.get(name, ())]
+        for way in ways:
+            if not way.get("deprecated"):
+                yield from self._forms(way)
+        if not ways or "properties" in schema:
+            yield schema
+
+    def _words(self, schema: Schema) -> Iterator[str]:
+        for form in self._forms(schema):
+            if form.get("type") == "boolean":
+                yield from ("true", "false")
+            words = [*form.get("enum", ()), *([form["const"]] if "const" in form else [])]
+            yield from (word for word in words if isinstance(word, str))
+
+
+def _fits(form: Schema, data: Mapping[str, Any]) -> bool:
+    """Whether a part of that type may be so written; anything where it has no type."""
+    kind = form["properties"].get("type")
+    return kind is None or data.get("type") in (kind.get("const"), *kind.get("enum", ()))
+
+
+def _is_open(form: Schema) -> bool:
+    return isinstance(form.get("additionalProperties"), Mapping)

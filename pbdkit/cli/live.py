@@ -32,12 +32,12 @@ def live(
     The page is served to this machine alone, under an address that nobody guesses. Ctrl-C ends it.
     """
     from pbdkit.api import load
-    from pbdkit.registry.extras import refuse_without
-    from pbdkit.sessions.conductor import Conductor
-    from pbdkit.sessions.session import Session
+    from pbdkit.plugin.discovery import refuse_without
+    from pbdkit.web.server import Conductor
+    from pbdkit.web.session import Session
 
     refuse_without("websockets", "live", "live needs websockets")
-    from pbdkit.sessions.server import SessionServer
+    from pbdkit.web.server import SessionServer
 
     loaded = load(experiment, settings=settings)
     conductor = Conductor(Session(loaded, output))

@@ -1,19 +1,37 @@
-"""Arguments and options that several commands take."""
+"""Arguments and options that several commands take.
+
+The file that a command is to write, looked at before the work and not after; and tables.
+
+What somebody at a terminal is told while a command works.
+"""
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Callable
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.plugin.discovery import refuse_no_matplotlib
+from pbdkit.progress import PATIENCE_S
+
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
+    from matplotlib.figure import Figure
+    from rich.table import Table
 
     from pbdkit.cli.completion import Completer
+    from pbdkit.scene.scene import Scene
+
 
 PATH = click.Path(path_type=Path)
 C = TypeVar("C", bound=click.Command)
@@ -108,7 +126,7 @@ outside_option = click.option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_setting("pbdkit.experiment.beside", "ALLOW_OUTSIDE"),
+    callback=_setting("pbdkit.model.reading", "ALLOW_OUTSIDE"),
     help="Read files that lie outside the folder of the file that names them.",
 )
 
@@ -126,7 +144,7 @@ NO_PLUGINS = click.Option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_setting("pbdkit.registry.discovery", "DISABLE"),
+    callback=_setting("pbdkit.plugin.discovery", "DISABLE"),
     help="Load no plugin, as if only pbdkit itself were installed.",
 )
 
@@ -138,3 +156,144 @@ def with_no_plugins(command: C) -> C:
     for inner in getattr(command, "commands", {}).values():
         with_no_plugins(inner)
     return command
+
+
+FORMATS = (".png", ".svg", ".pdf")
+UNLIMITED = 10_000
+
+
+@contextmanager
+def refusals_as(what: str) -> Iterator[None]:
+    """What the system refuses in the block becomes a StorageError that begins with `what`."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{what}: {error.strerror}") from None
+
+
+@contextmanager
+def folder_kept() -> Iterator[None]:
+    """Goes back to the current folder: a plugin may change it when it is imported. Raises
+    StorageError where there is none."""
+    with refusals_as("the current folder"):
+        here = Path.cwd()
+    with chdir(here):
+        yield
+
+
+def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:
+    """Raises ExperimentError where nothing is to be written there: a name that is no UTF-8, a
+    folder, a file without `force`, and, forced or not, what is no plain file, and the experiment
+    under this or another name. Raises StorageError where the system does not tell."""
+    from pbdkit.io.atomic_file import kind_of
+
+    try:  # in the bytes that the system has, whatever the locale makes of them
+        os.fsencode(path.absolute()).decode()
+    except UnicodeDecodeError:
+        shown = os.fsencode(path.absolute()).decode(errors="backslashreplace")
+        raise ExperimentError(f"{shown}: is no UTF-8; name another file with -o") from None
+    with refusals_as(f"{str(path)[:80]}..."):
+        kind, there = kind_of(path), os.path.lexists(path)
+    if not there:
+        return
+    if kind == "a folder":
+        raise ExperimentError(f"{path}: is a folder; name a file with -o")
+    if kind:
+        raise ExperimentError(
+            f"{path}: is {kind}, which is not replaced; remove it, or name another file with -o"
+        )
+    if experiment and experiment.exists() and path.samefile(experiment):
+        raise ExperimentError(f"{path}: is the experiment itself; name another file with -o")
+    if not force:
+        raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
+
+
+def refuse_unfinished(path: Path, *, force: bool) -> None:
+    """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
+    process is writing it."""
+    from pbdkit.io.checkpoint import make_room
+
+    if not make_room(path, discard=force):
+        raise ExperimentError(
+            f"{path}: an unfinished run of it is here; `pbdkit resume {path}` goes on with it, "
+            "--force discards it, -o names another file"
+        )
+
+
+def disk_warnings(path: Path, scene: Scene) -> Iterator[str]:
+    """What is to be said where the output may not fit on its disk."""
+    from pbdkit.scene.memory_estimate import MIB, sizes_of
+
+    output = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total).output
+    with suppress(OSError):  # no such folder: said when the file is opened
+        if output > (free := shutil.disk_usage(path.parent).free):
+            yield (
+                f"record: the output of about {output / MIB:.3g} MiB may not fit into the "
+                f"{free / MIB:.3g} MiB that are free in {path.parent}; record fewer steps, or "
+                "name a file on another disk with -o"
+            )
+
+
+def show_table(table: Table) -> None:
+    """Prints it; a line a row where it goes to a file or another program."""
+    from rich.console import Console
+
+    width = None if sys.stdout.isatty() else UNLIMITED
+    Console(width=width, highlight=False).print(table)
+
+
+def refuse_unwritable(picture: Path | None, *others: Path | None) -> None:
+    """ExperimentError or StorageError where a picture or another file cannot be written there."""
+    if picture and picture.suffix not in FORMATS:
+        raise ExperimentError(f"{picture}: a picture ends in {', '.join(FORMATS)}")
+    if picture:
+        refuse_no_matplotlib()
+    for path in (picture, *others):
+        if path and path.is_dir():
+            raise ExperimentError(f"{path}: is a folder; name a file")
+        if path and not path.parent.is_dir():
+            raise StorageError(f"{path}: there is no folder {path.parent}")
+
+
+def save(picture: Path, drawn: Figure, *, replace: bool, quiet: bool = False) -> None:
+    """Writes a figure and says so, unless quiet; WriteError where the system refuses."""
+    from pbdkit.io.atomic_file import write
+
+    content = io.BytesIO()
+    drawn.savefig(content, format=picture.suffix.removeprefix("."))
+    write(picture, content.getvalue(), replace=replace)
+    if not quiet:
+        click.echo(f"{picture} written")
+
+
+@contextmanager
+def waiting(what: str, *, silent: bool = False) -> Iterator[Callable[[str], None]]:
+    """Says on stderr what is being done, and for how long already, once a second has passed; at its
+    end the line goes. Nothing where nobody looks: `silent`, or stderr is no terminal.
+
+    Yields a function to be told what is done from then on.
+    """
+    if silent or not sys.stderr.isatty():
+        yield lambda what: None
+        return
+    line = _line(what)
+    timer = threading.Timer(PATIENCE_S, line.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda what: line.update(line.task_ids[0], description=what)
+    finally:
+        timer.cancel()
+        timer.join()
+        if line.live.is_started:
+            line.stop()
+
+
+def _line(what: str) -> Any:
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    line = Progress(*columns, console=Console(file=sys.stderr), transient=True)
+    line.add_task(what, total=None)
+    return line

@@ -20,11 +20,10 @@ def report(
 ) -> None:
     """Write one page to share: the moving lattice, histories, curves, what was predicted, what
     broke, how to run it again; of a sweep its map and its members. It needs no network."""
-    from pbdkit.cli.output import refuse_output, refuse_unwritable
-    from pbdkit.pages.report import BUDGET
-    from pbdkit.pages.report import report as write
-    from pbdkit.results.other_files import refuse_other_file
-    from pbdkit.results.result_file import reading
+    from pbdkit.cli.options import refuse_output, refuse_unwritable
+    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.web.report import BUDGET
+    from pbdkit.web.report import report as write
 
     refuse_other_file(file)
     path = output or file.with_suffix(".html")

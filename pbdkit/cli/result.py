@@ -1,4 +1,7 @@
-"""``pbdkit explain``, ``status`` and ``verify``: a result, or a run, looked at."""
+"""``pbdkit explain``, ``status`` and ``verify``: a result, or a run, looked at.
+
+``pbdkit export``: a result in the format of other programs.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import at_option, json_option, result_argument
+from pbdkit.cli.options import PATH, at_option, json_option, result_argument
 
 if TYPE_CHECKING:
-    from pbdkit.results.explanation import Explained, Standing
+    import xarray
+
+    from pbdkit.io.explain import Explained, Standing
+    from pbdkit.scene.scene import Scene
+
 
 SHOWN = 20
 """So many broken bonds are listed in words; --json has all."""
@@ -24,7 +31,7 @@ SHOWN = 20
 @result_argument("files", "FILE...", nargs=-1, required=True)
 def verify(files: tuple[Path, ...]) -> int:
     """Recompute the digests of results and say, a line a file, which are as they were written."""
-    from pbdkit.cli.waiting import waiting
+    from pbdkit.cli.options import waiting
 
     faults = []
     for file in files:
@@ -37,12 +44,11 @@ def verify(files: tuple[Path, ...]) -> int:
 
 def _verified(file: Path) -> str:
     """What a file's line says against it, if anything."""
-    from pbdkit.cli.output import refusals_as
+    from pbdkit.cli.options import refusals_as
     from pbdkit.errors import StorageError
-    from pbdkit.resources.trial import refuse_no_result
-    from pbdkit.results.other_files import other_file
-    from pbdkit.results.result_file import UNSEALED, refuse_no_file
-    from pbdkit.storage.seal import SealedFile
+    from pbdkit.io.open import UNSEALED, other_file, refuse_no_file
+    from pbdkit.io.seal import SealedFile
+    from pbdkit.untrusted_files import refuse_no_result
 
     fault = ""
     try:
@@ -64,8 +70,8 @@ def _verified(file: Path) -> str:
 def _refuse_elsewhere(file: Path) -> None:
     """Raises StorageError where the bytes are what was sealed, and refer to others elsewhere."""
     from pbdkit.errors import StorageError
-    from pbdkit.registry.blame import one_line
-    from pbdkit.storage.seal import opened
+    from pbdkit.io.seal import opened
+    from pbdkit.plugin.discovery import one_line
 
     try:
         opened(file).close()
@@ -81,8 +87,8 @@ def _refuse_elsewhere(file: Path) -> None:
 def status(output: Path, as_json: bool) -> None:
     """Say of an unfinished run how far it is, at which rate, and when it will end."""
     from pbdkit.errors import ExperimentError
-    from pbdkit.results.other_files import refuse_other_file, refuse_store
-    from pbdkit.storage.run_status import status_of
+    from pbdkit.io.checkpoint import status_of
+    from pbdkit.io.open import refuse_other_file, refuse_store
 
     refuse_store(output)
     found = status_of(output)
@@ -115,10 +121,10 @@ def _duration(seconds: float) -> str:
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
     """Say which bonds broke, when, how far strained and in which order; or, of one bond, how far it
     is, or was, from breaking, and what happened around it."""
-    from pbdkit.cli.waiting import waiting
-    from pbdkit.results.carried import scene_of
-    from pbdkit.results.explanation import Explained
-    from pbdkit.results.result_file import reading
+    from pbdkit.cli.options import waiting
+    from pbdkit.io.explain import Explained
+    from pbdkit.io.layout import scene_of
+    from pbdkit.io.open import reading
 
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
         explained = Explained(dataset, scene_of(dataset, "explain"))
@@ -229,3 +235,46 @@ def _standing(s: Standing) -> str:
 
 def _number(value: float | None, unknown: str = "not known") -> str:
     return unknown if value is None else f"{value:.6g}"
+
+
+SUFFIX = ".vtkhdf"
+
+
+@click.command()
+@result_argument("file")
+@click.option("-o", "--output", type=PATH, help="A .vtkhdf file; beside OUT.nc if not said.")
+@at_option
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+def export(file: Path, output: Path | None, at: dict[str, str], force: bool) -> None:
+    """Write a result as VTKHDF, which ParaView opens: every recorded step with all variables.
+
+    Particles are vertices, bonds lines, and the cells of the lattice triangles and quads; the cell
+    array `part` tells them apart (0, 1, 2), and `broken` those that are torn.
+    """
+    from pbdkit.cli.options import refuse_output
+    from pbdkit.errors import ExperimentError, StorageError
+    from pbdkit.io.open import reading, refuse_other_file
+    from pbdkit.io.vtkhdf import export as write
+
+    refuse_other_file(file)
+    path = output or file.with_suffix(SUFFIX)
+    if path.suffix != SUFFIX:
+        raise ExperimentError(f"{path}: ends in {SUFFIX}, so that ParaView knows what it is")
+    refuse_output(path, force=force)
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no folder {path.parent}")
+    with reading(file, at=at) as dataset:
+        write(dataset, path, _scene_of(dataset), replace=force)
+    click.echo(f"{path} written")
+
+
+def _scene_of(dataset: xarray.Dataset) -> Scene | None:
+    """The scene that the cells are those of; without it, which is told, there are no cells."""
+    from pbdkit.errors import PbdkitError
+    from pbdkit.io.layout import scene_of
+
+    try:
+        return scene_of(dataset, "a grid of cells")
+    except PbdkitError as error:
+        click.echo(f"warning: without cells, as its experiment is not there: {error}", err=True)
+        return None

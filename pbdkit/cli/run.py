@@ -1,9 +1,14 @@
-"""``pbdkit run`` and ``resume``, which signals end between two steps: what is kept is whole."""
+"""The signals that end a run between two steps.
+
+``pbdkit run`` and ``resume``, which signals end between two steps: what is kept is whole.
+"""
 
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -12,22 +17,62 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import (
-    PATH,
-    experiment_argument,
-    json_option,
-    result_argument,
-    set_option,
-)
-from pbdkit.cli.stopping import Stop, asked_to_stop
+from pbdkit.cli.options import PATH, experiment_argument, json_option, result_argument, set_option
 from pbdkit.errors import ExperimentError, NotSharedError, PbdkitWarning
 
 if TYPE_CHECKING:
-    from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.results.progress import Watch
-    from pbdkit.results.recorder import Outcome
-    from pbdkit.runs.course import Report, Run
-    from pbdkit.runs.processes import Processes
+    from pbdkit.io.netcdf import NetcdfSink
+    from pbdkit.io.recorder import Outcome
+    from pbdkit.progress import Watch
+    from pbdkit.simulation import Processes, Report, Run
+
+
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+"""Ctrl-C, what ends a process, a terminal that closes, and the warning that batch systems send; a
+system may lack some."""
+
+
+class Stop:
+    """Whether, and by which signal, the process was asked to stop."""
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+
+    def __call__(self) -> bool:
+        """Whether it was."""
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """130 for Ctrl-C, else 128 and the number of the signal."""
+        return 128 + (self.signal or signal.SIGINT)
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Stop]:
+    """Yields what tells whether the process has been asked to stop.
+
+    A second Ctrl-C stops at once. Outside the main thread signals are not ours to handle.
+    """
+    stop = Stop()
+
+    def note(number: int, frame: Any) -> None:
+        if stop():
+            raise KeyboardInterrupt
+        stop.signal = signal.Signals(number)
+
+    ours = threading.current_thread() is threading.main_thread()
+    found = [getattr(signal, name) for name in NAMES if hasattr(signal, name)] if ours else []
+    # Who starts it with `nohup` wants it to survive the terminal.
+    hears = {n: n.name != "SIGHUP" or signal.getsignal(n) is not signal.SIG_IGN for n in found}
+    numbers = [number for number in found if hears[number]]
+    before = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
 
 ENDED = ("complete", "settled")
 """How runs end that came to what was asked for."""
@@ -51,9 +96,9 @@ def run(
     as_json: bool,
 ) -> int:
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
-    from pbdkit.cli.output import disk_warnings, folder_kept, refuse_output, refuse_unfinished
-    from pbdkit.experiment.loading import load_experiment
-    from pbdkit.ranks.launched import launched
+    from pbdkit.cli.options import disk_warnings, folder_kept, refuse_output, refuse_unfinished
+    from pbdkit.model.loading import load_experiment
+    from pbdkit.mpi.run import launched
 
     with launched() as processes:
         with processes.agreeing():
@@ -69,8 +114,8 @@ def run(
         quiet = quiet or not processes.first
 
         def run_by(those: Processes, again: bool) -> int:
-            from pbdkit.results.netcdf_sink import NetcdfSink
-            from pbdkit.runs.course import record
+            from pbdkit.io.netcdf import NetcdfSink
+            from pbdkit.simulation import record
 
             scene = those.scene(loaded)
             with those.agreeing():
@@ -102,8 +147,8 @@ def run(
 @json_option
 def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:
     """Go on with an interrupted run that was to write OUT.nc, to the same result bit for bit."""
-    from pbdkit.ranks.launched import launched
-    from pbdkit.runs.resumption import resumption
+    from pbdkit.mpi.run import launched
+    from pbdkit.restart import resumption
 
     with launched() as processes:
         quiet = quiet or not processes.first
@@ -132,7 +177,7 @@ def _shared(processes: Processes, quiet: bool, work: Callable[[Processes, bool],
     except NotSharedError as error:
         told = str(error).replace("; run it in one process", "; the first of them runs it alone")
         _warn([told], quiet)
-    from pbdkit.runs.processes import Processes
+    from pbdkit.simulation import Processes
 
     # A signal that all of them get must not end those who wait.
     with nullcontext() if processes.first else asked_to_stop():
@@ -144,7 +189,7 @@ def _watched(
     path: Path, silent: bool, file: NetcdfSink | None = None
 ) -> Iterator[tuple[Stop, Watch]]:
     """Progress on a terminal, and signals heard."""
-    from pbdkit.results.progress import Watch, progress_bar
+    from pbdkit.progress import Watch, progress_bar
 
     drawn = not silent and sys.stderr.isatty()
     with asked_to_stop() as stop, progress_bar(drawn) as show:
@@ -229,7 +274,7 @@ def _say(report: Report, path: Path, *, settling: bool) -> None:
 
 
 def _figures(report: Report, path: Path) -> dict[str, Any]:
-    from pbdkit.runs.course import peak_memory
+    from pbdkit.simulation import peak_memory
 
     peak = peak_memory()
     return {

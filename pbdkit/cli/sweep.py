@@ -1,8 +1,15 @@
-"""``pbdkit sweep``: many runs, of which those that are finished need not run again."""
+"""``pbdkit sweep``: many runs, of which those that are finished need not run again.
+
+``pbdkit fit``: parameters from measurements.
+
+What there is to start from: ``pbdkit experiments``, ``init`` and ``schema``.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,11 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pbdkit.cli.options import outside_option
+from pbdkit.cli.options import completed_by, outside_option
 
 if TYPE_CHECKING:
-    from pbdkit.cli.stopping import Stop
-    from pbdkit.sweeps.course import Summary
+    from pbdkit.cli.run import Stop
+    from pbdkit.sweeps.execute import Summary
+
 
 PATH = click.Path(path_type=Path)
 CONNECT_S = 10.0
@@ -34,12 +42,10 @@ def sweep(
     file: Path, folder: Path | None, workers: int | None, address: str | None, quiet: bool
 ) -> int:
     """Run an experiment over many parameters; a second call runs what is left."""
-    from pbdkit.cli.stopping import asked_to_stop
-    from pbdkit.results.progress import progress_bar
-    from pbdkit.sweeps.calling import crew_of
-    from pbdkit.sweeps.course import carry_out
-    from pbdkit.sweeps.member import Asked
-    from pbdkit.sweeps.specification import read_sweep
+    from pbdkit.cli.run import asked_to_stop
+    from pbdkit.progress import progress_bar
+    from pbdkit.sweeps.execute import carry_out, crew_of
+    from pbdkit.sweeps.specification import Asked, read_sweep
 
     specified, base, source = read_sweep(file)
     asked, kept = Asked(specified, base, source), folder or Path(file.stem)
@@ -57,7 +63,7 @@ def sweep(
 
 def _refuse_folder(folder: Path) -> None:
     """Raises ExperimentError where something else than a folder has the name."""
-    from pbdkit.cli.output import refusals_as
+    from pbdkit.cli.options import refusals_as
     from pbdkit.errors import ExperimentError
 
     with refusals_as(str(folder)[:80]):
@@ -113,7 +119,7 @@ def _show(summary: Summary) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from pbdkit.cli.output import UNLIMITED
+    from pbdkit.cli.options import UNLIMITED
 
     failures = summary.failures
     table = Table("member", "status", "message", title=f"{len(failures)} members have no values")
@@ -124,3 +130,114 @@ def _show(summary: Summary) -> None:
     if len(failures) > SHOWN:
         more = f"and {len(failures) - SHOWN} more: `status` and `message` in {summary.path}"
         click.echo(more, err=True)
+
+
+@click.command()
+@click.argument("file", metavar="FIT")
+@click.option("-o", "--output", type=PATH, help="JSON; else the name of FIT with .json.")
+@click.option("--plot", "picture", type=PATH, help="PNG, SVG or PDF: measured, fitted, left.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+@outside_option
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
+    """Find the parameters that fit a measured field best, or the strengths of repeated tests, with
+    their errors."""
+    import pbdkit
+    from pbdkit.cli.options import refuse_output, refuse_unwritable, save, waiting
+    from pbdkit.fitting.strength import is_strength_fit
+    from pbdkit.io.atomic_file import write
+
+    path = output or Path(Path(file).name or "fit").with_suffix(".json")
+    refuse_output(path, force=force, experiment=Path(file))
+    if picture:
+        refuse_output(picture, force=force)
+    refuse_unwritable(picture, path)
+    repeats = is_strength_fit(file)
+    if picture and repeats:
+        raise pbdkit.ExperimentError("a strength fit has no picture; leave --plot out")
+    with waiting(f"fitting {file}", silent=quiet):
+        found = pbdkit.fit_strength(file) if repeats else pbdkit.fit(file)
+    write(path, json.dumps(found.as_dict(), indent=2) + "\n", replace=force)
+    if not quiet:
+        for line in found.lines():
+            click.echo(line)
+        click.echo(f"{path} written")
+    if picture:
+        from pbdkit.fitting.result import Fitted
+        from pbdkit.plotting.fit import draw_fit
+
+        assert isinstance(found, Fitted)
+        save(picture, draw_fit(found), replace=force, quiet=quiet)
+
+
+START = "start"
+"""The shipped experiment that `init` writes by default."""
+
+
+@click.command()
+@click.argument("name", required=False, shell_complete=completed_by("shipped"))
+def experiments(name: str | None) -> None:
+    """List the shipped experiments, or print the file of one, e.g. paper/f1."""
+    from pbdkit.model.shipped import shipped_names, shipped_text, shipped_title
+
+    if name is not None:
+        click.echo(shipped_text(name), nl=False)
+        return
+    width = max(map(len, names := shipped_names()))
+    for each in names:
+        click.echo(f"{each:<{width}}  {shipped_title(each)}")
+
+
+@click.command()
+@click.argument("file", required=False, type=PATH)
+@click.option(
+    "--from",
+    "origin",
+    metavar="NAME",
+    shell_complete=completed_by("shipped"),
+    help="Copy this shipped experiment with its data files, e.g. paper/f1.",
+)
+def init(file: Path | None, origin: str | None) -> None:
+    """Write an experiment to start from: a commented one, or a copy of a shipped one.
+
+    FILE is experiment.yaml by default, or with --from the last part of NAME with .yaml."""
+    from pbdkit.errors import ExperimentError
+    from pbdkit.io.atomic_file import write_together
+    from pbdkit.model.shipped import SUFFIX, shipped_data, shipped_names, shipped_text
+
+    path, text = (
+        file or Path(Path(origin or "experiment").name + SUFFIX),
+        shipped_text(origin or START),
+    )
+    if origin is None and str(path) in shipped_names():
+        copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
+        raise ExperimentError(f"{path}: is a shipped experiment, no file to be written; {copy}")
+    data = shipped_data(origin) if origin else []
+    files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
+    for each in files:
+        if os.path.lexists(each):
+            raise ExperimentError(f"{each}: exists and is left as it is; name another file")
+    write_together(files)
+    beside = f" with {', '.join(d.name for d in data)}" if data else ""
+    click.echo(f"{path} written{beside}; next: pbdkit check {path}, then pbdkit run {path}")
+
+
+@click.command()
+@click.argument(
+    "what", type=click.Choice(["experiment", "dataset", "sweep", "fit"]), default="experiment"
+)
+@click.option("--builtin", is_flag=True, help="Leave third-party components out.")
+def schema(what: str, builtin: bool) -> None:
+    """Print the JSON Schema of experiments, datasets, sweeps or fits, with what is installed."""
+    from pbdkit.fitting.schema import fit_schema
+    from pbdkit.io.layout import dataset_schema
+    from pbdkit.model.schema import experiment_schema
+    from pbdkit.plugin.registry import Registry
+    from pbdkit.sweeps.specification import sweep_schema
+
+    if what in (of_files := {"sweep": sweep_schema, "fit": fit_schema}):
+        made = of_files[what]()
+    else:
+        make = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
+        made = make(Registry(), installed=not builtin)
+    click.echo(json.dumps(made, indent=2))

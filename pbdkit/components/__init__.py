@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from pbdkit.interfaces import Component
-from pbdkit.registry.discovery import hookimpl
+from pbdkit.plugin import Component
+from pbdkit.plugin.discovery import hookimpl
 
 COMPONENTS = {
     "lattices": "Square Rectangular CentredRectangular Hexagonal Oblique",
@@ -13,13 +13,9 @@ COMPONENTS = {
     "rules": "Barycentre MeanDisplacement DistanceWeighted MixedCoordinate Springs",
     "elasticity": "Elastic Orthotropic StrainGradient",
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame Natural",
-    "fracture": "NoFracture Threshold",
-    "strain_fracture": "StrainFracture Damage",
-    "cohesive_fracture": "Cohesive",
-    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath",
-    "fields": "Strain Rotation Stress",
-    "forces": "StrainEnergy Reaction LoadDisplacement StressStrain",
-    "contact_forces": "Contact",
+    "fracture": "NoFracture Threshold StrainFracture Damage Cohesive",
+    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath "
+    "Strain Rotation Stress StrainEnergy Reaction LoadDisplacement StressStrain Contact",
 }
 """By module of this folder the classes that it offers."""
 

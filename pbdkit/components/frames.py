@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Anchors, Cell, FrameMap, FramePolicy, FrameSites
+from pbdkit.plugin import Anchors, Cell, FrameMap, FramePolicy, FrameSites
 
 
 class Frameless(FramePolicy):

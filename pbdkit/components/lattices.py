@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pbdkit.interfaces import BasisSite, Cell, Lattice, Vector
-from pbdkit.interfaces.units import LENGTH
+from pbdkit.plugin import BasisSite, Cell, Lattice, Vector
+from pbdkit.plugin.units import LENGTH
 
 Spacing = Annotated[float, Field(ge=1e-100, le=1e100), LENGTH]
 """A lattice constant; the range keeps squared lengths finite."""

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import Cell, Nearness, NeighbourMetric, Offset, Vector
-from pbdkit.interfaces.units import LENGTH
+from pbdkit.plugin import Cell, Nearness, NeighbourMetric, Offset, Vector
+from pbdkit.plugin.units import LENGTH
 
 MOST_NEIGHBOURS = 4224
 """As many as 32 shells of chebyshev neighbours."""

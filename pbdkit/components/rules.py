@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pbdkit.components.elasticity import Factor
 from pbdkit.errors import ExperimentError
-from pbdkit.interfaces import (
+from pbdkit.plugin import (
     FollowerRule,
     Here,
     Loadable,
@@ -24,7 +24,7 @@ from pbdkit.interfaces import (
     length,
     where,
 )
-from pbdkit.interfaces.units import PER_LENGTH
+from pbdkit.plugin.units import PER_LENGTH
 
 
 class Barycentre(FollowerRule):

@@ -1,26 +1,298 @@
-"""The linear system of an equilibrium, A c = move with A = 1 - (step operator), and who solves it.
+"""The moves of a scene's followers at a state, as the rule makes them.
+
+The rows of a grid that a process has, and those of the next grid that follow from them.
+
+The rows of a lattice that a process has in the search for an equilibrium, and what several
+processes tell each other of theirs.
+
+Fields are (…, row, place). A process has some rows of its own, and around them a halo of others'.
+What is asked of the whole lattice is put together from own rows, in their order, so that the
+answer is the same in all processes, and that of one alone.
+
+The linear system of an equilibrium, A c = move with A = 1 - (step operator), and who solves it.
 
 Moves and displacements are planes, (axis, sublattice, cell, cell), as in a state.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from pbdkit.equilibrium.rows import ALL, Rows
 from pbdkit.errors import ExperimentError
+from pbdkit.lattice.raster import FOLLOWER
+from pbdkit.model.motions import Hold
+from pbdkit.model.solver import Stepping
+from pbdkit.plugin import RenewsParticles
+from pbdkit.scene.leaders import Leading, kinds_at
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.contact import Contact
+from pbdkit.stepping.engine_choice import Choice, make_engine, obstacle
+from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.leaders import Guidance
+from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State
 
+LARGEST_BY_NUMPY = 20_000
+"""Particles beyond which moves are evaluated by the compiled engine."""
+ROUNDING = 4 * float(np.finfo(float).eps)
+
+
+class Moves:
+    """Evaluates the moves of a scene's followers, relaxed as in its steps but without memory, the
+    frame standing where the body tells it to, and obstacles where they are at a moment.
+
+    Of large bodies they are compiled, which is worth its seconds where they are asked for often
+    with the same numbers; `compiles` says whether that is so.
+    """
+
+    def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
+        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
+        self._scene = scene
+        self._engine: Engine | None = None
+        self._guidance = Guidance(scene)
+        self.contact = Contact(scene) if scene.barriers else None
+        renews = isinstance(scene.experiment.rule, RenewsParticles)
+        self._loads = replace(scene.loads) if scene.loads else None
+        stepped = replace(scene, loads=self._loads)
+        large = compiles and scene.raster.count > LARGEST_BY_NUMPY
+        if large and not (scene.has_fracture or renews):
+            experiment = scene.experiment.model_copy(update={"solver": stepping})
+            free = replace(stepped, barriers=())
+            stepped = replace(free, experiment=experiment, leading=_resting(scene))
+            choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
+            self._engine, _ = make_engine(stepped, choice)
+        self._followers = None if self._engine else SlotFollowers(stepped, stepping)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether evaluating them is cheap."""
+        return self._engine is not None and self._engine.name == "compiled"
+
+    def at(self, state: State, moment: float) -> Floats:
+        """Planes, zero where nobody follows in the moment's step, or along that axis, under the
+        loads of that moment; who would enter an obstacle moves onto its outline. Brings the state's
+        frame into line."""
+        moves = self.free(state, moment)
+        if self.contact:
+            there = state.u + moves
+            with np.errstate(all="ignore"):
+                self.contact.push_out(there, moment)
+                np.subtract(there, state.u, out=moves)
+            self._stop(moves, math.ceil(moment))
+        return moves
+
+    def rounding(self, u: Floats) -> float:
+        """How far rounding alone may put a move off at displacements u: before obstacles, where
+        places count, by what it leaves of those."""
+        reach = self.contact.reach if self.contact else 0.0
+        return ROUNDING * max(float(np.abs(u).max()), reach)
+
+    def free(self, state: State, moment: float) -> Floats:
+        """The same without obstacles."""
+        u, frame, step = state.u, self._scene.frame, math.ceil(moment)
+        if self._loads:
+            self._loads.held_at = moment
+        flat = u.reshape(len(u), -1)
+        if frame:
+            frame.follow(flat, flat)
+        if self._engine:
+            none = (None,) * len(self._scene.leading)
+            here = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)
+            moves = self._engine.advance(here).u
+        else:
+            assert self._followers
+            moves = u.astype(float)
+            with np.errstate(all="ignore"):
+                self._followers.move(u, moves, state)
+                self._guidance.correct(moves, u, step)
+        with np.errstate(all="ignore"):
+            moves -= u
+        self._stop(moves, step)
+        return moves
+
+    def _stop(self, moves: Floats, step: int) -> None:
+        """Only followers move."""
+        still, frame = moves.reshape(len(moves), -1), self._scene.frame
+        for led in self._scene.leading:
+            for axis in led.axes if led.group.leads(step) else ():
+                still[axis, led.place] = 0.0
+        if frame:
+            still[:, frame.place] = 0.0
+
+
+def _resting(scene: Scene) -> tuple[Leading, ...]:
+    """The leader groups, holding."""
+    groups = [leading.group.model_copy(update={"motion": Hold()}) for leading in scene.leading]
+    pairs = zip(scene.leading, groups, strict=True)
+    return tuple(replace(leading, group=group) for leading, group in pairs)
+
+
+def random_displacements(scene: Scene, size: float) -> Floats:
+    """Planes with followers of the last step put elsewhere, up to that far along each axis."""
+    kinds = kinds_at(scene.raster, scene.leading, scene.experiment.steps)
+    place = scene.raster.place_of(np.flatnonzero(kinds == FOLLOWER))
+    put: Floats = np.zeros((scene.axes, *scene.raster.shape))
+    random = np.random.default_rng(0).uniform(-size, size, (len(put), len(place)))
+    put.reshape(len(put), -1)[:, place] = random
+    return put
+
+
+def coarser_size(size: int) -> int:
+    """How many places a grid has along an axis where one of that size is halved."""
+    return (size - 2) // 2 + 3
+
+
+def outside(rows: slice, count: int) -> tuple[slice, slice]:
+    """Those of so many rows that some are not."""
+    first, last, _ = rows.indices(count)
+    return slice(0, first), slice(last, count)
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Rows of a grid of so many, `count`, by their numbers there: an array has those from `low` on,
+    a process `begin` to `end` as its own, and knows the stencils of `first` to `last`. Where rows
+    are halved `low` is even, so that row n of the next grid lies at 2n - 1 in the arrays too:
+    `low` and what follows from it serve for so many coarser grids, `depth`."""
+
+    count: int
+    low: int
+    begin: int
+    end: int
+    first: int
+    last: int
+    depth: int
+
+    @property
+    def own(self) -> slice:
+        """Its own rows, in arrays."""
+        return slice(self.begin - self.low, self.end - self.low)
+
+    @property
+    def known(self) -> slice:
+        """Those with known stencils, in arrays."""
+        return slice(self.first - self.low, max(self.first, self.last) - self.low)
+
+    def coarser(self, half: int) -> Strip:
+        """That of the next grid: a stencil there depends on two rows on either side of its place;
+        where rows are not halved, on one."""
+        if not half:
+            first = self.first + 1 if self.first else 0
+            last = self.last - 1 if self.last < self.count else self.last
+            return replace(self, first=first, last=last, depth=self.depth - 1)
+        count = coarser_size(self.count)
+        return Strip(
+            count,
+            self.low // 2,
+            (self.begin + 1) // 2,
+            (self.end + 1) // 2 if self.end < self.count else count,
+            (self.first + 4) // 2 if self.first else 0,
+            self.last // 2 if self.last < self.count else count,
+            self.depth - 1,
+        )
+
+
+Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]
+
+
+class Rows(ABC):
+    """Those of one process among all. Each call is made by all processes, in the same order."""
+
+    strip: Strip | None = None
+    """Which rows those are; None of all."""
+    rank: int = 0
+    """How many processes have rows before them."""
+
+    @property
+    def own(self) -> slice:
+        """Its own, among the rows of its arrays."""
+        return self.strip.own if self.strip else slice(None)
+
+    @property
+    def known(self) -> slice:
+        """Those of its arrays with known stencils."""
+        return self.strip.known if self.strip else slice(None)
+
+    @abstractmethod
+    def every(self, value: Any) -> list[Any]:
+        """The values of all processes, in the order of their rows."""
+
+    @abstractmethod
+    def agreeing(self) -> AbstractContextManager[None]:
+        """What is raised in the block, in any process, is raised in all of them at its end."""
+
+    @abstractmethod
+    def meet(self, field: Array) -> None:
+        """Renews the halo of a field, in place."""
+
+    @abstractmethod
+    def random(self, shape: tuple[int, ...]) -> Floats:
+        """A field of numbers from [-1, 1), always the same for the same lattice."""
+
+    def whole(self, numbers: Array, axis: int = -1) -> Array:
+        """Of all rows, from numbers of the rows that are here, along an axis."""
+        own = np.moveaxis(numbers, axis, 0)[self.own]
+        return np.concatenate(self.every(np.moveaxis(own, 0, axis)), axis)
+
+    def total(self, numbers: Array) -> float:
+        """The sum of one number a row."""
+        return float(self.whole(numbers).sum())
+
+    def most(self, value: float) -> float:
+        """The largest of all processes; not a number where one is none."""
+        return float(np.max(self.every(value)))
+
+    def any(self, value: bool) -> bool:
+        """Whether it is so in any process."""
+        return any(self.every(bool(value)))
+
+    def size(self, field: Array) -> int:
+        """How many numbers a field has."""
+        return sum(self.every(field[..., self.own, :].size))
+
+    def largest(self, field: Floats) -> float:
+        """Its largest magnitude; 0 of none."""
+        return self.most(float(np.abs(field[..., self.own, :]).max(initial=0.0)))
+
+    def norm(self, field: Floats) -> float:
+        """The root of the sum of squares."""
+        with np.errstate(over="ignore"):
+            each = self.every(float(np.linalg.norm(field[..., self.own, :])))
+        return math.hypot(*each)
+
+
+class AllRows(Rows):
+    """One process has all."""
+
+    def every(self, value: Any) -> list[Any]:
+        """Its own alone."""
+        return [value]
+
+    def agreeing(self) -> AbstractContextManager[None]:
+        """With itself."""
+        return nullcontext()
+
+    def meet(self, field: Array) -> None:
+        """There is no halo."""
+
+    def random(self, shape: tuple[int, ...]) -> Floats:
+        """From one generator."""
+        return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+
+
+ALL: Final = AllRows()
 
 
 @cache

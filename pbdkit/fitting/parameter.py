@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pbdkit.errors import ExperimentError, did_you_mean
-from pbdkit.experiment.given import given_classes
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.settings import with_value
-from pbdkit.interfaces.fields import TakesFields
-from pbdkit.interfaces.varying import ByRegion
+from pbdkit.model.experiment import Experiment, given_classes
+from pbdkit.model.reading import with_value
+from pbdkit.plugin.fields import ByRegion, TakesFields
 
 Floats = NDArray[np.floating[Any]]
 ORDER_4 = (2 / 3, -1 / 12)

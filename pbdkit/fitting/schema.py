@@ -6,9 +6,9 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from pbdkit.experiment.schema import DIALECT
 from pbdkit.fitting.specification import Fit
-from pbdkit.fitting.strength_specification import StrengthFit
+from pbdkit.fitting.strength import StrengthFit
+from pbdkit.model.schema import DIALECT
 
 
 def fit_schema() -> dict[str, Any]:

@@ -1,4 +1,6 @@
-"""How the equilibrium of a scene changes with a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
+"""The scene of an experiment that differs from another by numbers.
+
+How the equilibrium of a scene changes with a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
 An equilibrium is where no follower moves, m(u, θ) = 0. A = -∂m/∂u is the system by which it was
 found, so that each parameter costs one more solution, and the moves of a few scenes in which it is
@@ -15,20 +17,44 @@ from functools import cached_property
 import numpy as np
 
 from pbdkit.equilibrium.certificate import Certificate, spacing_of
-from pbdkit.equilibrium.finder import finder_of
-from pbdkit.equilibrium.increments import settle
-from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.equilibrium.moves import Moves
+from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.newton import Finder
-from pbdkit.equilibrium.system import Floats, System, one_thread
+from pbdkit.equilibrium.solve import finder_of, settle
+from pbdkit.equilibrium.system import Floats, Moves, System, one_thread
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.model import Experiment
 from pbdkit.fitting.parameter import STEP, WEIGHTS, Parameter
-from pbdkit.fitting.scene_alike import scene_like
-from pbdkit.results.progress import Watch
-from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.prescription import place, prescribe
+from pbdkit.model.experiment import Experiment
+from pbdkit.progress import Watch
+from pbdkit.scene.scene import Scene, build_scene, renumbered
+from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.state import State, initial_state
+
+GEOMETRY = ("lattice", "body", "regions", "neighbours", "frame", "initial", "loads", "cuts")
+"""The parts of an experiment that its scene is built of besides numbers and motions."""
+
+
+def scene_like(scene: Scene, experiment: Experiment) -> Scene:
+    """The scene of an experiment that differs by numbers, as much as possible of it as it was.
+
+    Raises ExperimentError where they decide which particles there are.
+    """
+    own = scene.experiment
+    groups = zip(experiment.leaders, own.leaders, strict=True)
+    same_leaders = all(a.select == b.select and a.axes == b.axes for a, b in groups)
+    if same_leaders and all(getattr(experiment, name) is getattr(own, name) for name in GEOMETRY):
+        if experiment.leaders is not own.leaders:
+            pairs = zip(scene.leading, experiment.leaders, strict=True)
+            leading = tuple(replace(leading, group=group) for leading, group in pairs)
+            scene = replace(scene, leading=leading)
+        return renumbered(scene, experiment)
+    found = build_scene(experiment)
+    if found.raster.shape != scene.raster.shape or (found.raster.kind != scene.raster.kind).any():
+        raise ExperimentError(
+            "the number decides which particles there are, one by one, and that is no smooth way; "
+            "sensitivities are of rules, fields, loads and motions"
+        )
+    return found
+
 
 __all__ = ["Adjoint", "Resting", "along", "scene_like"]
 

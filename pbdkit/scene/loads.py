@@ -10,16 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
-from pbdkit.experiment.loads import Load
-from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces.course import Course
-from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.polygons import Tiling, signed_area
-from pbdkit.scene.cells import WeighedCells, patches
-from pbdkit.scene.force_shares import shares_of
-from pbdkit.scene.places import Floats
-from pbdkit.scene.raster import Raster
-from pbdkit.scene.selecting import Selecting
+from pbdkit.lattice.cells import WeighedCells, patches
+from pbdkit.lattice.raster import Floats, Raster
+from pbdkit.model.boundary_conditions import Load
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.lattice import Tiling, signed_area
+from pbdkit.plugin.schedule import Course
+from pbdkit.scene.selection import Selecting, shares_of
 
 STRAIGHT = 1e-9
 """Particles that lie off a line by less than this share of its length are on it."""

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.interfaces import CellStress, Slot, SoftensCells, Stiffness, Vector
-from pbdkit.interfaces.lattice import Index
-from pbdkit.interfaces.polygons import Polygon, Side, signed_area
-from pbdkit.interfaces.rule import material_of
-from pbdkit.scene.places import Block
+from pbdkit.lattice.raster import Block
+from pbdkit.plugin import CellStress, Slot, SoftensCells, Stiffness, Vector
+from pbdkit.plugin.lattice import Index, Polygon, Side, signed_area
+from pbdkit.plugin.rule import material_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import shown
 

@@ -11,17 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from pbdkit.experiment.solvers import Stepping
-from pbdkit.interfaces import Components, Here, StoresEnergy
-from pbdkit.interfaces.frame import Indices
-from pbdkit.interfaces.rule import shares_particles
-from pbdkit.interfaces.vector import vector
-from pbdkit.scene.neighbourhood import Neighbourhood
-from pbdkit.scene.raster import positions
+from pbdkit.lattice.neighbourhood import Neighbourhood
+from pbdkit.lattice.raster import positions
+from pbdkit.model.solver import Stepping
+from pbdkit.plugin import Components, Here, StoresEnergy
+from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.rule import shares_particles
+from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Contributions, Evaluator, Mask, Neighbour
+from pbdkit.stepping.rule_evaluation import (
+    Contributions,
+    Evaluator,
+    Mask,
+    Neighbour,
+    Surroundings,
+    blocks,
+)
 from pbdkit.stepping.state import Floats, State, shown
-from pbdkit.stepping.surroundings import Surroundings, blocks
 
 REAL = "fiub"
 """The kinds of numpy's types that are numbers a particle can move by."""

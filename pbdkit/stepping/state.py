@@ -1,4 +1,7 @@
-"""What a run remembers from one step to the next. This, and nothing else, is a checkpoint."""
+"""Breaking the bonds that cross a crack or a cut (docs/fracture.md).
+
+What a run remembers from one step to the next. This, and nothing else, is a checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError, did_you_mean
-from pbdkit.interfaces import (
+from pbdkit.lattice.neighbourhood import crossed_bonds
+from pbdkit.lattice.raster import LEADER
+from pbdkit.plugin import (
     Bonds,
     Draws,
     FollowerRule,
@@ -21,12 +26,33 @@ from pbdkit.interfaces import (
     Remembered,
     StartsCracked,
 )
-from pbdkit.registry.blame import blaming
-from pbdkit.scene.declarations import bond_numbers, particle_numbers
-from pbdkit.scene.leader_groups import kinds_at
-from pbdkit.scene.raster import LEADER
+from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.fracture import Segment
+from pbdkit.scene.constants import bond_numbers, particle_numbers
+from pbdkit.scene.leaders import kinds_at
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.cutting import break_crossed, cut_bonds
+
+BrokenSteps = NDArray[np.integer[Any]]
+"""The step at which each bond broke, (plane, cell, cell), -1 where it has not."""
+
+
+def break_crossed(
+    scene: Scene, segments: Iterable[Segment], broken: BrokenSteps, step: int
+) -> None:
+    """Marks, in place, the bonds that cross a segment and are whole as broken at a step."""
+    for n, block, crossed in crossed_bonds(scene.raster, scene.neighbourhood, segments):
+        there = block.within(broken[n])
+        there[crossed & (there < 0)] = step
+
+
+def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
+    """Makes, in place, the cuts of the beginning of a step; whether there are any."""
+    segments = [cut.segment for cut in scene.experiment.cuts if cut.at == step]
+    if segments:
+        assert broken is not None
+        break_crossed(scene, segments, broken, step)
+    return bool(segments)
+
 
 Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]

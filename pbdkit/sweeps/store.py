@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from pbdkit.errors import StorageError
-from pbdkit.storage.file_system import FULL, is_full, is_local, lock, sync_folder
-from pbdkit.storage.sqlite_file import (
+from pbdkit.io.atomic_file import FULL, is_full, is_local, lock, sync_folder
+from pbdkit.io.sqlite_file import (
     BEGINNING,
     PATIENCE_S,
     connect,

@@ -1,4 +1,7 @@
-"""Runs one member wherever it is asked to, and reports what came of it: never an exception."""
+"""What is kept of one run, as bytes: names and shapes as JSON, then the values as they are.
+
+Runs one member wherever it is asked to, and reports what came of it: never an exception.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +15,64 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xxhash
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.source import Source
-from pbdkit.interfaces import Component
-from pbdkit.registry.blame import worded
-from pbdkit.results.layout import Column, Values, When
-from pbdkit.results.progress import Watch
-from pbdkit.results.sink import Sink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.layout import Column, Values, When
+from pbdkit.io.sinks import Sink
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import Source
+from pbdkit.plugin import Component
+from pbdkit.plugin.discovery import worded
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
-from pbdkit.sweeps.content import Variable, packed, variable_of
-from pbdkit.sweeps.member import Job
+from pbdkit.simulation import Run, record
+from pbdkit.sweeps.specification import Job
+
+LENGTH = 8
+"""Bytes of the number that says how long the JSON is."""
+
+
+class Variable(NamedTuple):
+    """One variable of a run; `fixed` where it was known before the first step."""
+
+    dims: tuple[str, ...]
+    values: NDArray[Any]
+    attributes: dict[str, Any]
+    coordinate: bool
+    fixed: bool
+
+
+def variable_of(column: Column, values: NDArray[Any], fixed: bool) -> Variable:
+    """The variable of a column of the dataset."""
+    return Variable(column.dims, values, column.attributes, column.coordinate, fixed)
+
+
+def packed(variables: dict[str, Variable]) -> bytes:
+    """The bytes."""
+    head, parts = {}, []
+    for name, (dims, values, attributes, *marks) in variables.items():
+        said = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
+        head[name] = [dims, values.dtype.str, values.shape, said, *marks]
+        parts.append(np.ascontiguousarray(values).tobytes())
+    described = json.dumps(head).encode()
+    return b"".join([len(described).to_bytes(LENGTH, "little"), described, *parts])
+
+
+def unpacked(content: bytes) -> dict[str, Variable]:
+    """What was packed; the values are views of the bytes."""
+    begin = LENGTH + int.from_bytes(content[:LENGTH], "little")
+    found = {}
+    for name, entry in json.loads(content[LENGTH:begin]).items():
+        dims, dtype, shape, attributes, coordinate, fixed = entry
+        count, kind = int(np.prod(shape, dtype=np.int64)), np.dtype(dtype)
+        values = np.frombuffer(content, kind, count, begin) if count else np.zeros(0, kind)
+        begin += count * kind.itemsize
+        flags = {k: np.array(v, kind) if isinstance(v, list) else v for k, v in attributes.items()}
+        found[name] = Variable(tuple(dims), values.reshape(shape), flags, coordinate, fixed)
+    return found
+
 
 WHOLE = ("complete", "settled")
 KEPT = (*WHOLE, "separated")

@@ -10,8 +10,15 @@ In a plugin's tests one line is enough::
 components of a distribution. docs/extending/testing.md lists the properties.
 """
 
-from pbdkit.testing.examination import Outcome, Report, conformance, examine, examine_all
-from pbdkit.testing.properties import PROPERTIES, properties_of
+from pbdkit.testing.conformance import (
+    PROPERTIES,
+    Outcome,
+    Report,
+    conformance,
+    examine,
+    examine_all,
+    properties_of,
+)
 from pbdkit.testing.subject import NotAskedError, Property, PropertyError, examples_of
 
 __all__ = [

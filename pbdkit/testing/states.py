@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import PluginError
-from pbdkit.interfaces import (
+from pbdkit.io.snapshot import StateMoment, Tables
+from pbdkit.plugin import (
     Bonds,
     Component,
     Diagnostic,
@@ -26,13 +27,11 @@ from pbdkit.interfaces import (
     TouchingRows,
     Vector,
 )
-from pbdkit.interfaces.rule import shares_particles
-from pbdkit.results.moment import StateMoment
-from pbdkit.results.tables import Tables
-from pbdkit.scene.declarations import bond_numbers, particle_numbers
+from pbdkit.plugin.rule import shares_particles
+from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.evaluator import Evaluator, summed
 from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.rule_evaluation import Evaluator, summed
 from pbdkit.stepping.state import State, describe_bonds, describe_particles, initial_state
 
 Floats = NDArray[np.float64]

@@ -27,7 +27,7 @@ from gpu import gpu
 from peers import peers
 from ranks import ranks, weak_scaling
 
-from pbdkit.stepping.choice import processors
+from pbdkit.stepping.engine_choice import processors
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -16,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 
 import pbdkit
-from pbdkit.equilibrium import increments
+from pbdkit.equilibrium import solve as increments
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.state import State
 

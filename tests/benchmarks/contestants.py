@@ -23,9 +23,9 @@ from finite_elements.varying import VARYING, modulus, reference
 from peers import python_with
 
 import pbdkit
-from pbdkit.equilibrium.increments import equilibrium_state
-from pbdkit.runs.course import Run
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.simulation import Run
 from pbdkit.stepping.state import State
 
 HERE = Path(__file__).parent

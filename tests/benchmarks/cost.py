@@ -11,8 +11,8 @@ from pairing import best
 from scipy.optimize import nnls
 from sheets import Running, moving, scene_of
 
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.simulation import Run, record
 from pbdkit.stepping.numpy_engine import Stepper
 
 NEIGHBOURS = {

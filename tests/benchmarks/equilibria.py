@@ -24,9 +24,9 @@ from skfem.models.elasticity import plane_stress
 from threadpoolctl import threadpool_limits
 
 import pbdkit
-from pbdkit.equilibrium.increments import settle
-from pbdkit.equilibrium.linearisation import linearised
-from pbdkit.results.progress import Watch
+from pbdkit.equilibrium.linearise import linearised
+from pbdkit.equilibrium.solve import settle
+from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 

@@ -8,10 +8,10 @@ import tempfile
 from pathlib import Path
 
 IMPORTS = """
-import pbdkit.api, pbdkit.results.netcdf, pbdkit.stepping.compiled.compiled_stepper, pbdkit.cli.run
+import pbdkit.api, pbdkit.io.netcdf, pbdkit.stepping.numba_engine.engine, pbdkit.cli.run
 """
 PEAK = """
-from pbdkit.runs.course import peak_memory
+from pbdkit.simulation import peak_memory
 print(peak_memory())
 """
 RUN = """

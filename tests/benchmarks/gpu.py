@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from sheets import FRACTURE, Running, moving
 
-from pbdkit.stepping.gpu.limits import what_is_missing
+from pbdkit.stepping.engine_choice import what_is_missing
 
 SIZE, FEW, MANY, TURNS = 3000, 100, 1100, 5
 
@@ -21,7 +21,7 @@ def gpu() -> list[dict[str, Any]] | None:
         return None
     from numba import cuda
 
-    from pbdkit.stepping.gpu.gpu_stepper import GpuStepper
+    from pbdkit.stepping.cuda_engine import GpuStepper
 
     u, v = (cuda.to_device(np.zeros((2, SIZE, SIZE))) for _ in range(2))
     copying = _best(_copies(u, v, MANY)) - _best(_copies(u, v, FEW))

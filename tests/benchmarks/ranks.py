@@ -15,12 +15,11 @@ from typing import Any
 
 from sheets import Running, moving, scene_of
 
-from pbdkit.ranks.divided_driver import Division
-from pbdkit.ranks.divided_run import SharingRanks
-from pbdkit.ranks.divided_stepper import DividedStepper
-from pbdkit.ranks.subdomain import MOST_STEPS, subdomains
-from pbdkit.runs.course import peak_memory
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.mpi.driver import DividedStepper, Division
+from pbdkit.mpi.partition import MOST_STEPS, subdomains
+from pbdkit.mpi.run import SharingRanks
+from pbdkit.simulation import peak_memory
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
 SIZE, STEPS, TURNS = 3000, 32, 9
 HELD, PARTS, SMALL = 4000, 4, 200
@@ -147,11 +146,10 @@ def _wait(ranks: SharingRanks) -> None:
 
 def memory(ranks: SharingRanks | None) -> float:
     """Bytes that a run of a large body takes in this process beyond one of a small body."""
-    from pbdkit.experiment.model import Experiment
-    from pbdkit.results.netcdf_sink import NetcdfSink
-    from pbdkit.results.progress import Watch
-    from pbdkit.runs.course import record
-    from pbdkit.runs.processes import Processes
+    from pbdkit.io.netcdf import NetcdfSink
+    from pbdkit.model.experiment import Experiment
+    from pbdkit.progress import Watch
+    from pbdkit.simulation import Processes, record
 
     held = []
     for size in (SMALL, HELD):

@@ -11,9 +11,9 @@ import numpy as np
 from pairing import Ratio, ratio
 from sheets import Running, moving, scene_of
 
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.runs.course import Run, record
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.sinks import OverlappingSink
+from pbdkit.simulation import Run, record
 
 
 def recording(size: int, steps: int, every: int) -> tuple[Ratio, str]:

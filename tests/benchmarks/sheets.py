@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 import pbdkit
-from pbdkit.experiment.source import Source
+from pbdkit.model.reading import Source
 from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.state import initial_state
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 import pbdkit
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.compiled.compiled_stepper import CompiledStepper
-from pbdkit.stepping.compiled.tearing import torn_marks
+from pbdkit.stepping.numba_engine.engine import CompiledStepper
+from pbdkit.stepping.numba_engine.sweeps import torn_marks
 from pbdkit.stepping.state import State, initial_state
 
 STRAIN = {"type": "strain", "failure": 0.9}

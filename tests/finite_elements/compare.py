@@ -24,7 +24,7 @@ from finite_elements.lattices import Solved, experiment, on_grid
 from finite_elements.problems import BAR, CANTILEVER, HOLE, Problem
 from finite_elements.stepping import setting_up, stepped
 from finite_elements.timing import Seconds, best
-from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import build_scene
 
 PICTURE = Path(__file__).parents[2] / "docs/pictures/finite-elements.png"

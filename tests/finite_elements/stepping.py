@@ -11,9 +11,9 @@ import pbdkit
 from finite_elements.lattices import experiment, on_grid
 from finite_elements.problems import Problem
 from finite_elements.timing import Seconds, best
-from pbdkit.equilibrium.increments import equilibrium_state
+from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.stepping.choice import choose, make_engine
+from pbdkit.stepping.engine_choice import choose, make_engine
 from pbdkit.stepping.state import initial_state
 
 FINER = 50

@@ -65,8 +65,8 @@ if FAULTS:
 
     import pbdkit
     from pbdkit.cli import main
-    from pbdkit.results.overlapping_sink import OverlappingSink
-    from pbdkit.storage.seal import SealedFile
+    from pbdkit.io.seal import SealedFile
+    from pbdkit.io.sinks import OverlappingSink
 
 SMALL = {
     "body": {"type": "grid", "columns": 10, "rows": 8},
@@ -202,7 +202,7 @@ def _each_step() -> None:
 
 def _unfinished() -> None:
     """A run that is killed at its second commit."""
-    from pbdkit.storage.unfinished import UnfinishedRun
+    from pbdkit.io.checkpoint import UnfinishedRun
 
     _experiment()
     keep, left = UnfinishedRun.keep, [2]

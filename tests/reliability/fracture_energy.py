@@ -25,9 +25,9 @@ import scipy.linalg
 import scipy.sparse
 from scipy.sparse.linalg import splu
 
-from pbdkit.components.cohesive_fracture import Cohesive
-from pbdkit.experiment.model import Experiment
-from pbdkit.interfaces import CellStress, Vector
+from pbdkit.components.fracture import Cohesive
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin import CellStress, Vector
 from pbdkit.scene.scene import build_scene
 
 PARTS = {

@@ -28,13 +28,13 @@ from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
 import pbdkit
 from pbdkit.errors import LONGEST, PbdkitError
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.shipped import shipped_names, shipped_text
-from pbdkit.experiment.source import MAX_NODES, Source, read_text
-from pbdkit.prediction.forecast import forecast
-from pbdkit.runs.course import rehearse
-from pbdkit.scene import sizes
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import MAX_NODES, Source, read_text
+from pbdkit.model.shipped import shipped_names, shipped_text
+from pbdkit.scene import memory_estimate as sizes
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import rehearse
+from pbdkit.stability.forecast import forecast
 
 PATIENCE_S = 60.0
 MEMORY = 2**29

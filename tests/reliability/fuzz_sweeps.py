@@ -28,11 +28,10 @@ from hostile_text import hostile_text, to_yaml
 from isolation import Outcome, forget_peak, outcomes, report, resident, serve
 
 from pbdkit.errors import PbdkitError
-from pbdkit.scene import sizes
-from pbdkit.sweeps import outlook
-from pbdkit.sweeps.course import validated
-from pbdkit.sweeps.member import Asked
-from pbdkit.sweeps.specification import read_sweep
+from pbdkit.scene import memory_estimate as sizes
+from pbdkit.sweeps import execute as outlook
+from pbdkit.sweeps.execute import validated
+from pbdkit.sweeps.specification import Asked, read_sweep
 
 MEMBER_S = 0.2
 """What each of the members, of which there are a few dozen, may take besides."""

@@ -40,16 +40,14 @@ import xarray
 
 import pbdkit
 import pbdkit.cli.check
-import pbdkit.cli.curve
-import pbdkit.cli.export
-import pbdkit.cli.picture
+import pbdkit.cli.plot
 import pbdkit.cli.report
 import pbdkit.cli.result
-import pbdkit.pages.report  # noqa: F401  # as above
+import pbdkit.web.report  # noqa: F401  # as above
 from pbdkit.cli import main as program
-from pbdkit.experiment.beside import Beside
-from pbdkit.experiment.field_file import read_field
-from pbdkit.storage.seal import put_seal, seal_of
+from pbdkit.io.seal import put_seal, seal_of
+from pbdkit.model.reading import Beside
+from pbdkit.model.validation import read_field
 
 PATIENCE_S, LONGEST_S = 120.0, 60.0
 MOST_BYTES = 2 * 2**30

@@ -38,9 +38,10 @@ from trials import (
 )
 
 from pbdkit.errors import PbdkitError
-from pbdkit.storage import run_store, unfinished
-from pbdkit.storage.file_system import is_local
-from pbdkit.storage.run_status import status_of
+from pbdkit.io import checkpoint as run_store
+from pbdkit.io import checkpoint as unfinished
+from pbdkit.io.atomic_file import is_local
+from pbdkit.io.checkpoint import status_of
 
 KINDS = tuple(EXPERIMENTS)
 MOST_KILLS = 4

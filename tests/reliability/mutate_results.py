@@ -27,9 +27,9 @@ from isolation import Outcome, outcomes, report, serve
 
 import pbdkit
 from pbdkit.cli import main as program
-from pbdkit.drawing.recording import Recording
 from pbdkit.errors import PbdkitError
-from pbdkit.results.result_file import reading
+from pbdkit.io.open import reading
+from pbdkit.plotting.data import Recording
 
 PATIENCE_S, LONGEST_S = 120.0, 20.0
 """After so many seconds a case is ended, and so many it may take."""

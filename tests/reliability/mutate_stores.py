@@ -46,10 +46,8 @@ from trials import (
 
 import pbdkit
 from pbdkit.errors import PbdkitError
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.storage.run_files import store_of
-from pbdkit.storage.run_store import RunStore
-from pbdkit.storage.unfinished import UnfinishedRun
+from pbdkit.io.checkpoint import RunStore, UnfinishedRun, store_of
+from pbdkit.io.sinks import OverlappingSink
 
 KINDS = ("breaking", "settling", "increments", "large")
 DOCUMENTED = (0, 2, 3, 4, 6)

@@ -30,8 +30,7 @@ from trials import done, row
 
 import pbdkit
 import pbdkit.cli.sweep
-import pbdkit.sweeps.calling
-import pbdkit.sweeps.course
+import pbdkit.sweeps.execute
 from pbdkit.cli import main as main_of_pbdkit
 from pbdkit.sweeps import store
 

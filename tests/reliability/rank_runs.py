@@ -23,12 +23,11 @@ from trials import differences, row
 from scene_strategies import calibrated_experiments, experiments, pulled_apart  # beside trials
 
 from pbdkit.errors import PbdkitError
-from pbdkit.experiment.model import Experiment
-from pbdkit.ranks.divided_run import SharingRanks
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.progress import Watch
-from pbdkit.runs.course import record
-from pbdkit.runs.processes import Processes
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.model.experiment import Experiment
+from pbdkit.mpi.run import SharingRanks
+from pbdkit.progress import Watch
+from pbdkit.simulation import Processes, record
 
 Parts = dict[str, Any]
 ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])

@@ -23,8 +23,8 @@ from trials import BASE, BREAKING, EXPERIMENTS, row
 
 from pbdkit.components import pbdkit_components
 from pbdkit.errors import ExperimentError, PbdkitError
-from pbdkit.experiment.source import read_text
-from pbdkit.interfaces import Component
+from pbdkit.model.reading import read_text
+from pbdkit.plugin import Component
 from pbdkit.scene.scene import build_scene
 from pbdkit.testing.subject import examples_of, experiments_with, full_name
 

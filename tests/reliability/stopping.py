@@ -11,20 +11,18 @@ from typing import Any
 
 from trials import differences, often
 
-from pbdkit.experiment.model import Experiment
-from pbdkit.experiment.source import Source
-from pbdkit.interfaces import Component
-from pbdkit.results.netcdf_sink import NetcdfSink
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.results.progress import StoppedError, Watch
-from pbdkit.results.recorder import Recorder, columns_of
-from pbdkit.runs import drivers
-from pbdkit.runs.continuation import take_up
-from pbdkit.runs.course import Report, Run, record
-from pbdkit.runs.processes import Processes
+from pbdkit import simulation as drivers
+from pbdkit.io.checkpoint import UnfinishedRun, is_unfinished
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.recorder import Recorder, columns_of
+from pbdkit.io.sinks import OverlappingSink
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import Source
+from pbdkit.plugin import Component
+from pbdkit.progress import StoppedError, Watch
+from pbdkit.restart import take_up
 from pbdkit.scene.scene import build_scene
-from pbdkit.storage.run_files import is_unfinished
-from pbdkit.storage.unfinished import UnfinishedRun
+from pbdkit.simulation import Processes, Report, Run, record
 
 Components = Iterable[type[Component]]
 MOST_STOPS = 4

@@ -21,10 +21,10 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from pairing import wait_for_quiet
 from sheets import Running, moving, scene_of
 
-from pbdkit.results.netcdf_sink import FIRST_S, NetcdfSink
-from pbdkit.results.overlapping_sink import OverlappingSink
-from pbdkit.runs.course import Run, record
-from pbdkit.storage.run_files import store_of
+from pbdkit.io.checkpoint import store_of
+from pbdkit.io.netcdf import FIRST_S, NetcdfSink
+from pbdkit.io.sinks import OverlappingSink
+from pbdkit.simulation import Run, record
 
 NEVER = 1e9
 Work = Callable[[], object]

@@ -30,15 +30,24 @@ import numpy as np
 from scipy.stats import chi2
 
 import pbdkit
-from pbdkit.experiment.source import Source
-from pbdkit.fitting import strength_simulation
-from pbdkit.fitting.first_break import BondStrains, Elastic, Seen
+from pbdkit.fitting import strength as strength_simulation
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.specimens import Specimen, Specimens, seeded
-from pbdkit.fitting.strength import fit_strength_of
-from pbdkit.fitting.strength_fitted import fitted_strength
-from pbdkit.fitting.strength_laws import LAWS, Breaks, weibull_sums
-from pbdkit.fitting.strength_specification import Peaks, StrengthFit
+from pbdkit.fitting.strength import (
+    LAWS,
+    BondStrains,
+    Breaks,
+    Elastic,
+    Peaks,
+    Seen,
+    Specimen,
+    Specimens,
+    StrengthFit,
+    fit_strength_of,
+    fitted_strength,
+    seeded,
+    weibull_sums,
+)
+from pbdkit.model.reading import Source
 
 TRUE = {"weibull": (0.02, 8.0), "uniform": (0.02, 0.3)}
 BOUNDS = {"weibull": [[0.002, 0.5], [1.0, 60.0]], "uniform": [[0.002, 0.5], [0.02, 0.98]]}

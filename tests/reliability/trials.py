@@ -25,14 +25,14 @@ import xarray  # noqa: F401  # as above
 
 import pbdkit
 import pbdkit.cli.run
-import pbdkit.prediction.forecast
-import pbdkit.results.result_file
-import pbdkit.runs.resumption
-import pbdkit.storage.run_status
+import pbdkit.io.checkpoint
+import pbdkit.io.open
+import pbdkit.restart
+import pbdkit.stability.forecast
 from pbdkit.cli import main
-from pbdkit.results import netcdf_sink
-from pbdkit.results.netcdf_sink import FINAL_STATE, NetcdfSink
-from pbdkit.storage.seal import SealedFile, opened
+from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
+from pbdkit.io.seal import SealedFile, opened
 
 OUTPUT = "out.nc"
 OF_A_RUN = ("created", "ranks")

@@ -35,8 +35,9 @@ from trials import (
     write_experiment,
 )
 
-from pbdkit.storage import destination, unfinished
-from pbdkit.storage.run_files import has_committed
+from pbdkit.io import atomic_file as destination
+from pbdkit.io import checkpoint as unfinished
+from pbdkit.io.checkpoint import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
 KINDS = tuple(PARTS)

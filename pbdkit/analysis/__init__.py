@@ -1,1 +1,0 @@
-"""What a step is to small displacements: the step operator, its spectrum, plane waves."""

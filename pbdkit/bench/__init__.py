@@ -1,1 +1,0 @@
-"""Speed against error: methods measured at sizes, each in a process of its own."""

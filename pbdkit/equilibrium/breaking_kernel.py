@@ -1,0 +1,592 @@
+"""The matrix of small and middle bodies as a band, and its factors: loops for kernels.
+
+A c = r with A = 1 - (step operator), an unknown a follower and axis; or, where all axes move alike
+and each by itself, an unknown a follower, for all axes at a time: `wide` is how many unknowns a
+follower has. Row i of a band holds A[i, i - half] to A[i, i + half]. Factors are L with ones on
+the diagonal and U, without exchanges, in its place. A row depends on those before it alone:
+where rows change, those before the first of them stay as they are, to the bit.
+
+Whether a kernel of its own settles a scene whose bonds break.
+
+Who moves whom in a scene, as long as the roles stay: followers in an order in which those that
+move each other are near, and the frame put in terms of the body.
+
+Writes the kernel that settles a scene, renews and breaks its bonds, and settles again.
+
+Of the matrix only the rows of particles whose bonds have changed are found anew, from the moves
+that a nudge of each neighbour by 1 makes at rest: exact for linear rules.
+
+Settles a scene whose bonds break, by a kernel of its own, one increment a call or some.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.equilibrium.certificate import LINEAR
+from pbdkit.equilibrium.sparse import SOFT
+from pbdkit.equilibrium.system import ROUNDING
+from pbdkit.errors import PluginError
+from pbdkit.lattice.raster import FOLLOWER, slot_step
+from pbdkit.linear.response import by_sublattice
+from pbdkit.linear.spectrum import frame_matrices
+from pbdkit.model.solver import Stepping
+from pbdkit.plugin import RenewsBonds, SoftensCells
+from pbdkit.plugin.discovery import blaming
+from pbdkit.plugin.frame import Indices
+from pbdkit.progress import Watch
+from pbdkit.scene.constants import Home
+from pbdkit.scene.leaders import kinds_at
+from pbdkit.scene.memory_estimate import LARGEST_ANEW
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.engine_choice import PATIENCE_S, obstacle
+from pbdkit.stepping.leaders import place, prescribe
+from pbdkit.stepping.numba_engine.arrays import Arrays, constant_arrays, find_runs, state_arrays
+from pbdkit.stepping.numba_engine.boundary import write_frame
+from pbdkit.stepping.numba_engine.emitter import write_module
+from pbdkit.stepping.numba_engine.plan import Function, Plan, levels_of, load_blamed
+from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
+from pbdkit.stepping.state import State, unmoved_state
+
+SAME = 1e-12
+"""By so much entries may differ that are alike but for rounding; they are shares of a move."""
+SAFETY = 3.0
+"""What the estimated spread is multiplied with."""
+
+
+def rows_of(work: Any, count: int, reach: int, wide: int) -> Any:
+    """The band of `count` followers, each coupled to those up to `reach` before and after it."""
+    width = 2 * ((reach + 1) * wide - 1) + 1
+    return work[: count * wide * width].reshape(count * wide, width)
+
+
+def are_alike(blocks: Any) -> Any:
+    """Whether all blocks (follower, neighbour, axis, axis) are multiples of 1."""
+    count, slots, axes, _ = blocks.shape
+    for e in range(count):
+        for k in range(slots):
+            for a in range(axes):
+                for b in range(axes):
+                    like = blocks[e, k, 0, 0] if a == b else 0.0
+                    if not abs(blocks[e, k, a, b] - like) <= SAME:
+                        return False
+    return True
+
+
+def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> None:
+    """Writes the rows of A from follower `first` on. Who does not move at all has a row of zeros,
+    and stays: its diagonal becomes 1."""
+    first_entry, slot, column, weight = pattern
+    half, inner = band.shape[1] // 2, wide if wide > 1 else 1
+    for e in range(first, len(blocks)):
+        for i in range(e * wide, (e + 1) * wide):
+            for m in range(band.shape[1]):
+                band[i, m] = 0.0
+        for n in range(first_entry[e], first_entry[e + 1]):
+            away = half + (column[n] - e) * wide
+            for a in range(wide):
+                for b in range(wide):
+                    value = 0.0
+                    for c in range(inner):
+                        value += blocks[e, slot[n], a, c] * weight[n, c, b]
+                    band[e * wide + a, away + b - a] -= value
+        for i in range(e * wide, (e + 1) * wide):
+            most = 0.0
+            for m in range(band.shape[1]):
+                most = max(most, abs(band[i, m]))
+            if most == 0.0:
+                band[i, half] = 1.0
+
+
+def factor(band: Any, first: int, diagonal: Any, inverse: Any) -> None:
+    """Replaces the rows of A from `first` on by those of its factors; notes what stood on its
+    diagonal, and the inverse of each pivot."""
+    half = band.shape[1] // 2
+    for i in range(first, len(band)):
+        row = band[i]
+        diagonal[i] = row[half]
+        for k in range(max(0, i - half), i):
+            at = k - i + half
+            if row[at] != 0.0:
+                share = row[at] * inverse[k]
+                row[at] = share
+                here, above = row[at + 1 : at + 1 + half], band[k, half + 1 :]
+                for m in range(half):
+                    here[m] -= share * above[m]
+        inverse[i] = 1.0 / row[half]
+
+
+def solve(band: Any, inverse: Any, x: Any) -> None:
+    """Replaces the right sides (unknown, side) by the solutions."""
+    half, sides = band.shape[1] // 2, x.shape[1]
+    for i in range(len(band)):
+        for k in range(max(0, i - half), i):
+            for s in range(sides):
+                x[i, s] -= band[i, k - i + half] * x[k, s]
+    for i in range(len(band) - 1, -1, -1):
+        for k in range(i + 1, min(len(band), i + half + 1)):
+            for s in range(sides):
+                x[i, s] -= band[i, k - i + half] * x[k, s]
+        for s in range(sides):
+            x[i, s] *= inverse[i]
+
+
+def refactor(
+    work: Any, blocks: Any, pattern: Any, factors: Any, known: Any, first: int, alike: bool
+) -> None:
+    """Factors anew from follower `first` on. `known` are the unknowns a follower has, how far A⁻¹
+    takes random signs, with a margin, the largest diagonal entry, and the reach of the band;
+    `alike` whether frame points follow with all axes alike."""
+    diagonal, inverse, signs = factors
+    count, axes = blocks.shape[0], blocks.shape[2]
+    wide = 1 if alike and are_alike(blocks) else axes
+    if wide != known[0]:
+        first = 0
+    known[0], known[2] = wide, 1.0
+    band, size = rows_of(work, count, int(known[3]), wide), count * wide
+    assemble(band, blocks, pattern, first, wide)
+    factor(band, first * wide, diagonal, inverse)
+    x = np.empty((size, 1))
+    for i in range(size):
+        x[i, 0] = signs[i]
+        known[2] = max(known[2], abs(diagonal[i]))
+    solve(band, inverse, x)
+    known[1] = SAFETY * largest(x)
+
+
+def correct(work: Any, factors: Any, known: Any, r: Any, c: Any) -> None:
+    """c (follower, axis) with A c = r."""
+    count, axes = r.shape
+    wide = 1 if known[0] == 1.0 else axes
+    for e in range(count):
+        for a in range(axes):
+            c[e, a] = r[e, a]
+    band = rows_of(work, count, int(known[3]), wide)
+    solve(band, factors[1], c.reshape(count * wide, axes // wide))
+
+
+def largest(table: Any) -> Any:
+    """The largest size in a table; not a number where one is none."""
+    most = 0.0
+    for n in range(table.shape[0]):
+        for m in range(table.shape[1]):
+            if not abs(table[n, m]) <= most:
+                most = abs(table[n, m])
+    return most
+
+
+def norm(table: Any) -> Any:
+    """The root of the sum of squares."""
+    found = 0.0
+    for n in range(table.shape[0]):
+        for m in range(table.shape[1]):
+            found += table[n, m] * table[n, m]
+    return math.sqrt(found)
+
+
+SETTLING_S, PARTICLE_S = 6e-3, 1e-5
+"""What a settling takes by numpy, about, and what it takes more a particle."""
+LITTLE_BY_LITTLE, AT_ONCE = 20, 2
+"""Settlings an increment where bonds change little by little, and where they only break."""
+
+
+def settler_of(scene: Scene, tolerance: float, watch: Watch) -> Settler | None:
+    """For a scene whose rule is linear; None where compiling would take longer than numpy, where
+    nothing compiles, or where the solver's method is not direct. Decided by the experiment alone,
+    so that what is resumed goes on as it began."""
+    solver = scene.experiment.solver.sought
+    direct = solver.method == "lu" or (
+        solver.method == "auto" and scene.raster.count <= LARGEST_ANEW
+    )
+    if not (direct and _is_plain(scene)) or _seconds(scene) < PATIENCE_S or obstacle():
+        return None
+
+    try:
+        found = Settler(scene, tolerance, watch)
+    except PluginError:
+        return None
+    return found if found.is_small else None
+
+
+def _is_plain(scene: Scene) -> bool:
+    """Whether the kernel knows all that such a scene has: loads, cuts, fields, courses, leaders
+    along one axis and cells that begin to soften in turn it does not."""
+    asked, constants = scene.experiment, scene.constants
+    more = any((asked.cuts, asked.loads, asked.courses, constants.by_bond, constants.by_particle))
+    mixed = scene.cells is not None and bool(scene.cells.mixed)
+    guided = any(leading.group.axes for leading in scene.leading)
+    flat = scene.axes == 2 and scene.inner is None
+    in_turn = isinstance(asked.fracture, SoftensCells)
+    return scene.has_fracture and flat and not (more or mixed or guided or in_turn)
+
+
+def _seconds(scene: Scene) -> float:
+    """What numpy would take."""
+    renews = isinstance(scene.experiment.fracture, RenewsBonds)
+    settlings = scene.experiment.solver.sought.increments * (
+        LITTLE_BY_LITTLE if renews else AT_ONCE
+    )
+    return settlings * (SETTLING_S + PARTICLE_S * scene.raster.count)
+
+
+Floats = NDArray[np.floating[Any]]
+Entry = tuple[Indices, Indices, Indices, Floats]
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """`place` is the flat place of each follower. Follower e is moved by the entries from
+    `first[e]` to `first[e + 1]`: through a `slot` (that after the last: by itself), by the follower
+    `column`, times a `weight` (entry, axis, axis). `reach` is how far a column lies from e."""
+
+    place: Indices
+    first: Indices
+    slot: Indices
+    column: Indices
+    weight: Floats
+
+    @property
+    def reach(self) -> int:
+        """The half width of the band."""
+        row = np.repeat(np.arange(len(self.place)), np.diff(self.first))
+        return int(np.abs(row - self.column).max(initial=0))
+
+    @property
+    def alike(self) -> bool:
+        """Whether all axes follow alike."""
+        axes = self.weight.shape[-1]
+        return bool((self.weight == self.weight[:, :1, :1] * np.eye(axes)).all())
+
+
+def pattern_at(scene: Scene, step: int) -> Pattern:
+    """With the roles of a step; followers row by row or column by column, what lies nearer."""
+    rows = np.flatnonzero(kinds_at(scene.raster, scene.leading, step) == FOLLOWER)
+    places, (x, y) = scene.raster.place_of(rows), scene.raster.reference(rows).round(6).T
+    found = (_pattern(scene, places[np.lexsort(keys)]) for keys in ((x, y), (y, x)))
+    return min(found, key=lambda pattern: pattern.reach)
+
+
+def _pattern(scene: Scene, place: Indices) -> Pattern:
+    parts = [*_entries(scene, place.astype(np.int64))]
+    row, slot, column, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort((slot, row))
+    first = np.searchsorted(row[order], np.arange(len(place) + 1))
+    return Pattern(
+        place.astype(np.int64), first, slot[order], column[order], weight[order].astype(float)
+    )
+
+
+def _entries(scene: Scene, place: Indices) -> Iterator[Entry]:
+    """(follower, slot, column, weight) of some entries at a time."""
+    size, one = scene.raster.kind.size, np.eye(scene.axes)
+    column_at = np.full(size, -1)
+    every = column_at[place] = np.arange(len(place))
+
+    def entries(rows: Indices, slot: int, there: Indices, weight: Floats) -> Entry:
+        free = column_at[there] >= 0
+        slots = np.full(np.count_nonzero(free), slot)
+        return rows[free], slots, column_at[there[free]], weight[free]
+
+    for s, own in by_sublattice(scene, place):
+        ones = np.broadcast_to(one, (len(own), *one.shape))
+        count = len(scene.neighbourhood.slots[s])
+        yield entries(every[own], count, place[own], ones)
+        for k, slot in enumerate(scene.neighbourhood.slots[s]):
+            there = place[own] + slot_step(scene.raster.shape, slot)
+            yield entries(every[own], k, there, ones)
+            for some, body, weight in _followed(scene, there):
+                yield entries(every[own][some], k, body, weight)
+
+
+def _followed(scene: Scene, there: Indices) -> Iterator[tuple[Indices, Indices, Floats]]:
+    """Which of some places are frame points, with a body place each that they follow and its
+    weight: the first of each, then the second, and so on."""
+    if (frame := scene.frame) is None:
+        return
+    point_at = np.full(scene.raster.kind.size, -1)
+    point_at[frame.place] = np.arange(len(frame.place))
+    some = np.flatnonzero(point_at[there] >= 0)
+    first, last = (
+        np.searchsorted(frame.map.point, point_at[there[some]], side) for side in ("left", "right")
+    )
+    matrices = frame_matrices(frame.map.weight, scene.axes)
+    for e in range(int((last - first).max(initial=0))):
+        has = first + e < last
+        entry = (first + e)[has]
+        yield some[has], frame.body_place[entry], matrices[entry]
+
+
+GOES_ON, SETTLED, FAILED = 0, 1, 2
+"""What became of a call: bonds may still change, no bond changes any more, or the band does not
+serve; then followers stand where they were before the last settling."""
+ROWS = "int64(0)", "int64(kind.shape[1])"
+
+
+def write_settling(plan: Plan) -> tuple[str, list[str]]:
+    """The source of a module with ``run(given, step, tolerance, slack, most)``, which settles at
+    most so often, to within the length `tolerance`, and leaves out changes of bonds within the
+    share `slack`; it returns how often bonds have changed, and what became of it."""
+    (level,) = plan.levels
+    general = write_general(plan, level, None)
+    follow = Function(plan.shared, "follow_body")
+    if plan.scene.frame:
+        follow.depth = -1
+        write_frame(follow, plan, "flat_u", "flat_u")
+    moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
+    judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
+    known, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)
+    run = Function(plan.shared, "run", "given", "step", "tolerance", "slack", "most")
+    run.add(0, "for n in range(most):", f"    {mark.call()}")
+    run.add(1, f"if not {known.call()} or not {settle.call('tolerance')}:")
+    run.add(2, f"return n, {FAILED}")
+    run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
+    run.add(2, f"return n, {SETTLED}")
+    run.add(0, f"return most, {GOES_ON}")
+    functions = [general, moves, derive, judge, mark, changed, known, settle]
+    return write_module(plan, [follow, *functions] if follow.lines else functions, run)
+
+
+def _write_moves(plan: Plan, follow: Function, general: Function) -> Function:
+    """The function that writes r (follower, axis), the moves, with the frame in line."""
+    out = Function(plan.shared, "find_moves")
+    out.add(0, *[follow.call()] * bool(follow.lines), "for n in range(len(body)):")
+    out.add(1, general.call("body[n, 0]", "body[n, 1]", "body[n, 2]", *ROWS))
+    out.add(0, "for e in range(place.size):")
+    out.add(1, *plan.each("residual[e, #] = flat_v_@[place[e]] - flat_u_@[place[e]]"))
+    return out
+
+
+def _write_derivative(plan: Plan, general: Function) -> Function:
+    """The function that writes what each neighbour of a follower, and it itself, does to its move;
+    `u` are planes at rest."""
+    axes, planes = len(plan.axes), plan.each("u_@")
+    out = Function(plan.shared, "derive", "e", *planes)
+    out.add(0, "spot, s, i = place[e], sublattice[e], runs[e, 0]")
+    out.add(0, f"for m in range(-1, {axes} * (counts[s] + 1)):")
+    out.add(1, f"k, b = m // {axes}, m % {axes}")
+    out.add(1, "there = spot + away[s, k] if m >= 0 and k < counts[s] else spot")
+    out.add(1, f"f = ({', '.join(f'{u}.reshape(-1)' for u in planes)})[b]")
+    out.add(1, "f[there] = 0.0 if m < 0 else 1.0")
+    out.add(1, general.call("s", "e", "e + 1", "i", "i + 1"))
+    out.add(1, "if m < 0:", *plan.each("    none_@ = flat_v_@[spot]"), "else:")
+    out.add(2, *plan.each("blocks[e, k, #, b] = flat_v_@[spot] - u_@.reshape(-1)[spot] - none_@"))
+    out.add(1, "f[there] = 0.0")
+    return out
+
+
+def _bonds(plan: Plan, pattern: str) -> list[str]:
+    """The pattern for each number that is remembered of bonds."""
+    return [pattern.replace("#", str(n)) for n in range(plan.bonds)]
+
+
+def _write_mark(plan: Plan) -> Function:
+    """The function that marks followers whose bonds, or those of the cells around them, are not as
+    they were known; then they are."""
+    out = Function(plan.shared, "mark")
+    differs = _bonds(plan, " or flat_bond#[home] != flat_known#[home]")
+    out.add(0, "cells = broken.size // len(ends)", "for n in range(len(ends)):")
+    out.add(1, "way = ends[n, 2] * kind.shape[2] + ends[n, 3]", "for e in range(cells):")
+    out.add(2, "home = n * cells + e")
+    out.add(2, f"if flat_broken[home] != flat_known_broken[home]{''.join(differs)}:")
+    out.add(3, "flat_known_broken[home] = flat_broken[home]")
+    out.add(3, *_bonds(plan, "flat_known#[home] = flat_bond#[home]"))
+    if plan.tears:
+        out.add(3, "for m in range(mark_steps.shape[1]):")
+        out.add(4, "end = ends[n, 0] * cells + e + mark_steps[n, m]")
+    else:
+        out.add(3, "for end in (ends[n, 0] * cells + e, ends[n, 1] * cells + e + way):")
+    out.add(4, "if 0 <= end < equation.size and equation[end] >= 0:")
+    out.add(5, "stale[equation[end]] = 1")
+    return out
+
+
+def _write_changed(plan: Plan) -> Function:
+    """The function that tells whether bonds broke or changed; else they are as they were known."""
+    out = Function(plan.shared, "changed", "slack")
+    numbers = [n for n in plan.levels[-1].seen.bond if n.home is Home.BOND]
+    changing = [str(n) for n, number in enumerate(numbers) if number.changes]
+    out.add(0, "for home in range(broken.size):")
+    out.add(1, "if flat_broken[home] >= 0 and flat_known_broken[home] < 0:", "    return True")
+    for n in changing:
+        out.add(1, f"new, old = flat_bond{n}[home], flat_known{n}[home]")
+        out.add(1, "if abs(new - old) > slack * max(1.0, abs(old)):", "    return True")
+    if changing:
+        out.add(0, "for home in range(broken.size):")
+        out.add(1, *(f"flat_bond{n}[home] = flat_known{n}[home]" for n in changing))
+    out.add(0, "return False")
+    return out
+
+
+def _write_known(plan: Plan, derive: Function) -> Function:
+    """The function that brings the factors up to date; it tells whether they serve."""
+    out = Function(plan.shared, "know")
+    out.add(0, "since = place.size", "for e in range(place.size):", "    if stale[e]:")
+    out.add(2, derive.call("e", *plan.each("still_@")), "stale[e], since = 0, min(since, e)")
+    out.add(0, "pattern = first_entry, entry_slot, entry_column, entry_weight")
+    out.add(0, "factors = diagonal, inverse, randoms", "if since < place.size:")
+    out.add(1, "refactor(band, blocks, pattern, factors, facts, since, alike[0])")
+    out.add(0, "return facts[1] < facts[4]")
+    return out
+
+
+def _write_settle(plan: Plan, follow: Function, moves: Function) -> Function:
+    """The function that moves the followers to where they rest, and tells whether it did."""
+    out = Function(plan.shared, "settle", "tolerance")
+    at = plan.each("flat_u_@[place[e]]")
+    out.add(0, "factors, before = (diagonal, inverse, randoms), 0.0", "for e in range(place.size):")
+    out.add(1, *(f"kept[e, {a}] = {value}" for a, value in enumerate(at)))
+    out.add(0, "for n in range(corrections[0]):", f"    {moves.call()}")
+    out.add(1, "correct(band, factors, facts, residual, correction)")
+    out.add(1, "size, left, ways = 0.0, norm(residual), 0.0")
+    out.add(1, *plan.each("size = max(size, largest(u_@.reshape(-1, 1)))"))
+    out.add(1, "unsure = facts[2] * facts[5] * size", "floor = unsure * residual.size**0.5")
+    out.add(1, "for a in range(correction.shape[1]):")
+    out.add(2, "ways += (largest(correction[:, a : a + 1]) + facts[1] * unsure) ** 2")
+    out.add(1, "if n > 0 and ways <= tolerance**2:", "    return True")
+    out.add(1, "before = left if n == 0 else before")
+    out.add(1, "allowed = left if n == 0 else max(facts[6] * before + floor, 1e3 * floor)")
+    out.add(1, "if not left <= allowed:")
+    out.add(2, "break")
+    out.add(1, "for e in range(place.size):")
+    out.add(2, *(f"{value} += correction[e, {a}]" for a, value in enumerate(at)))
+    out.add(0, "for e in range(place.size):")
+    out.add(1, *(f"{value} = kept[e, {a}]" for a, value in enumerate(at)))
+    out.add(0, *[follow.call()] * bool(follow.lines), "return False")
+    return out
+
+
+FUNCTIONS = (refactor, correct, largest, norm)
+MOST_CORRECTIONS = 8
+LARGEST_BAND = 10_000_000
+"""Numbers in a band: 80 MB."""
+OPERATIONS_A_CALL = 100_000_000
+"""In calls of so many, some tenths of a second, interruptions are heard."""
+
+
+class Settler:
+    """For linear rules, with all that the band needs. What it holds is decided by the bonds as
+    they are, to the bit: it remembers nothing else from one increment to the next.
+
+    Raises PluginError for parts that do not compile.
+    """
+
+    def __init__(self, scene: Scene, tolerance: float, watch: Watch) -> None:
+        solver = scene.experiment.solver.sought
+        self._scene, self._watch, self._tolerance = scene, watch, tolerance
+        self._share = solver.tolerance
+        stepping = Stepping(relaxation=scene.experiment.stepping.relaxation, threads=1)
+        stepped = replace(
+            scene, experiment=scene.experiment.model_copy(update={"solver": stepping})
+        )
+        levels = levels_of(stepped)
+        self._plan = plan = Plan(stepped, levels, False, apart=True)
+        self._runs, starts, groups = find_runs(stepped, all_general=True)
+        self._body = [
+            [s, span[0, 0], span[-1, 1]] for (s, _), span in zip(groups, starts, strict=True)
+        ]
+        size = np.array(scene.raster.shape[1:])
+        box = np.stack([np.zeros_like(size), size], axis=1).ravel().astype(np.int64)
+        self._constant = constant_arrays(plan) | {"box": box}
+        if plan.tears:  # every follower is taken as torn, and marks are written but not read
+            self._constant["torn"] = np.zeros(scene.raster.shape, np.uint8)
+        self._roles: tuple[bool, ...] = ()
+        self._of_roles: Arrays = {}
+        self._work = 1
+        start = unmoved_state(scene, scene.raster.shape[1:])
+        self._take_roles(scene.experiment.steps, start)
+        shared = ("step", *self._named(start))
+        source, self._names = write_settling(replace(plan, shared=shared))
+        functions = {function.__name__: function for function in FUNCTIONS}
+        self._run = load_blamed(levels, source, self._given(start, 0.0, 0), functions)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether a band serves a body of this size and shape."""
+        return bool(self._of_roles["band"].size <= LARGEST_BAND)
+
+    def settle(self, state: State, moment: float, most: int) -> tuple[bool, int]:
+        """Goes on, in place, from an equilibrium to that of a moment, until no bond changes any
+        more, `most` times at most. Returns whether that is so, and how often bonds have changed;
+        where the band does not serve the state is as the last settling left it.
+
+        Raises ExperimentError for contradicting leaders, and StoppedError.
+        """
+        led, state.starts = prescribe(self._scene, state, moment)
+        place(state.u, led)
+        self._take_roles(math.ceil(moment), state)
+        changes, became = 0, GOES_ON
+        while became == GOES_ON and changes < most:
+            self._watch.begin("settling and breaking")
+            a_call = max(1, min(most - changes, OPERATIONS_A_CALL // self._work))
+            with blaming(self._scene.experiment.rule, f"at step {moment:.6g}"):
+                more, became = self._run(*self._given(state, moment, a_call))
+            changes += more
+        state.step = math.floor(moment)
+        state.previous[...] = state.u
+        return became == SETTLED, changes
+
+    def _take_roles(self, step: int, state: State) -> None:
+        """Makes ready for the roles of a step, where they are others."""
+        roles = tuple(leading.group.leads(step) for leading in self._scene.leading)
+        if self._of_roles and roles == self._roles:
+            return
+        pattern = pattern_at(self._scene, step)
+        reach, axes, count = pattern.reach, self._scene.axes, len(pattern.place)
+        most = count * axes * (2 * ((reach + 1) * axes - 1) + 1)
+        self._work = 1 + most * (reach + 1) * axes
+        self._roles, self._of_roles = roles, self._arrays_of(pattern, most)
+        # Unlike any bond's, so that all rows are found anew.
+        known = {"known_broken": np.full_like(state.broken_step, -2)}
+        known |= {f"known{n}": value.copy() for n, value in enumerate(state.bond_values)}
+        self._of_roles |= known
+
+    def _arrays_of(self, pattern: Pattern, most: int) -> Arrays:
+        """By name what the kernel holds as long as the roles stay."""
+        raster, axes, count = self._scene.raster, self._scene.axes, len(pattern.place)
+        s, *cells = np.unravel_index(pattern.place, raster.shape)
+        alone = np.stack([cells[0], cells[0] + 1, cells[1], cells[1] + 1], axis=1)
+        equation = np.full(raster.kind.size, -1)
+        equation[pattern.place] = np.arange(count)
+        slots = max(map(len, self._scene.neighbourhood.slots)) + 1
+        facts = [0.0, 0.0, 1.0, pattern.reach, SOFT, ROUNDING, LINEAR]
+        planes = [f"{name}_{c}" for name in ("v", "still") for c in self._plan.axes]
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], count * axes)
+        return {
+            # First a run of each follower by itself.
+            "runs": np.concatenate([alone, self._runs]).astype(np.int64),
+            "body": np.array(self._body, np.int64) + np.array([0, count, count]),
+            "place": pattern.place,
+            "sublattice": s.astype(np.int64),
+            "equation": equation.astype(np.int64),
+            "first_entry": pattern.first.astype(np.int64),
+            "entry_slot": pattern.slot.astype(np.int64),
+            "entry_column": pattern.column.astype(np.int64),
+            "entry_weight": pattern.weight,
+            "alike": np.array([pattern.alike]),
+            "stale": np.ones(count, np.uint8),
+            "blocks": np.zeros((count, slots, axes, axes)),
+            "band": np.empty(most),
+            "diagonal": np.zeros(count * axes),
+            "inverse": np.zeros(count * axes),
+            "randoms": signs,
+            "facts": np.array(facts, float),
+            "corrections": np.array([MOST_CORRECTIONS + 1]),
+            **{name: np.zeros((count, axes)) for name in ("residual", "correction", "kept")},
+            **{name: np.zeros(raster.shape) for name in planes},
+        }
+
+    def _named(self, state: State) -> Arrays:
+        """The arrays of the kernel by name."""
+        nobody = np.zeros_like(state.u)
+        return self._constant | state_arrays(self._plan, state.u, nobody, state) | self._of_roles
+
+    def _given(self, state: State, moment: float, most: int) -> tuple[Any, ...]:
+        arrays = self._named(state)
+        given = tuple(arrays[name] for name in self._names)
+        return given, math.ceil(moment), self._tolerance, self._share, most

@@ -1,0 +1,550 @@
+"""How the grids of a matrix are made, each from the finer one, compiled.
+
+A grid has a `code` by (row, place), the number of the stencil in `own` or -1 where nobody is free,
+and a `kind`, 0 outside, 1 free, 2 led. `halved` tells along which axes the next grid has half the
+places: its place n lies at 2n - 1, or at n.
+
+What iterations do with whole fields, (axis, row, place), compiled. Sums are given by row, for
+whoever has some of the rows to add up with those of others.
+
+What is done on one grid of a lattice: loops over its rows, compiled.
+
+Fields are planes (axis, row, place), zero where nobody is free; the outermost ring is never free. A
+row has runs of places that share the stencil `same`, from `begin` to `end`, and single places, the
+lone, with stencils of their own, `own[which]`. A stencil is 3 × 3 places of 4 numbers, xx, xy, yx,
+yy, row after row.
+
+Rows are relaxed in two colours, even and odd, the places of a row from the same state; sums are
+made row by row. So what comes out does not depend on how many rows are done at a time.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+import numpy as np
+from numba import njit
+
+KEPT = globals().get("KEPT", False)
+
+
+@njit(cache=KEPT)
+def runs(code, first, begin, end, lone, place, which):
+    """Fills the lists of a grid; returns how many runs and lone places there are. Lists without
+    room are not filled."""
+    r = s = 0
+    for i in range(code.shape[0]):
+        first[i], lone[i] = r, s
+        j = 0
+        while j < code.shape[1]:
+            start = j
+            while j < code.shape[1] and code[i, j] == 0:
+                j += 1
+            if j > start:
+                if r < begin.size:
+                    begin[r], end[r] = start, j
+                r += 1
+                continue
+            if code[i, j] > 0:
+                if s < place.size:
+                    place[s], which[s] = j, code[i, j]
+                s += 1
+            j += 1
+    first[code.shape[0]], lone[code.shape[0]] = r, s
+    return r, s
+
+
+@njit(cache=KEPT)
+def coarse_kinds(kind, halved, out):
+    """0 outside, 1 free, 2 led, of the next grid: a place outside on which free ones hang is free,
+    unless led ones are nearer."""
+    a1, b1 = halved
+    for n in range(1, out.shape[0] - 1):
+        for m in range(1, out.shape[1] - 1):
+            i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
+            here = kind[i, j] if i < kind.shape[0] and j < kind.shape[1] else 0
+            for ring in (1, 2):
+                if here:
+                    break
+                for a in range(max(-a1, -i), min(a1, kind.shape[0] - 1 - i) + 1):
+                    for b in range(max(-b1, -j), min(b1, kind.shape[1] - 1 - j) + 1):
+                        near = kind[i + a, j + b]
+                        if abs(a) + abs(b) == ring and near and here != 1:
+                            here = near
+            out[n, m] = here
+
+
+@njit(cache=KEPT)
+def coarse_codes(code, kind, halved, out):
+    """Of the next grid: -1 where nobody is free, 0 where all stencils around are the one of most,
+    so that this one's is too; others are numbered from 1. Returns the last number."""
+    count = 0
+    a1, b1 = halved
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            out[n, m] = -1
+            if kind[n, m] != 1:
+                continue
+            i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
+            plain = i > a1 and j > b1 and i + a1 + 1 < code.shape[0] and j + b1 + 1 < code.shape[1]
+            if plain:
+                for a in range(-a1 - 1, a1 + 2):
+                    for b in range(-b1 - 1, b1 + 2):
+                        c = code[i + a, j + b]
+                        if c < 0 or (c > 0 and abs(a) <= a1 and abs(b) <= b1):
+                            plain = False
+            count += 0 if plain else 1
+            out[n, m] = 0 if plain else count
+    return count
+
+
+@njit(cache=KEPT)
+def beside(q, half):
+    """The places of the next grid between which a place lies that is q away from one of them, and
+    the share of the first: numbers of a stencil, -1, 0 or 1."""
+    if not half:
+        return q, q, 1.0
+    return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
+
+
+@njit(cache=KEPT)
+def galerkin(code, own, coarse, halved, out):
+    """out[k] = the stencil of Pᵀ K P at the place of the next grid that is numbered k."""
+    a1, b1 = halved
+    for n in range(1, coarse.shape[0] - 1):
+        for m in range(1, coarse.shape[1] - 1):
+            k = coarse[n, m]
+            if k <= 0:
+                continue
+            for a in range(-a1, a1 + 1):
+                for b in range(-b1, b1 + 1):
+                    i, j = (2 * n - 1 if a1 else n) + a, (2 * m - 1 if b1 else m) + b
+                    if i >= code.shape[0] or j >= code.shape[1] or code[i, j] < 0:
+                        continue
+                    hangs = (1.0 - 0.5 * abs(a)) * (1.0 - 0.5 * abs(b))
+                    for s in range(9):
+                        da, db = s // 3 - 1, s % 3 - 1
+                        if code[i + da, j + db] < 0:
+                            continue
+                        row, next_row, of_row = beside(a + da, a1)
+                        place, next_place, of_place = beside(b + db, b1)
+                        for ta, wa in ((row, of_row), (next_row, 1.0 - of_row)):
+                            for tb, wb in ((place, of_place), (next_place, 1.0 - of_place)):
+                                w = hangs * wa * wb
+                                if w > 0.0:
+                                    for e in range(4):
+                                        out[k, 3 * ta + tb + 4, e] += w * own[code[i, j], s, e]
+
+
+@njit(cache=KEPT)
+def asymmetry(code, own):
+    """The largest entry of K - Kᵀ. Of places with the stencil of most one pair a direction is
+    enough."""
+    worst, seen, unseen = 0.0, np.zeros(9, np.bool_), 9
+    for i in range(1, code.shape[0] - 1):
+        for j in range(1, code.shape[1] - 1):
+            here = code[i, j]
+            if here < 0 or (here == 0 and not unseen):
+                continue
+            for s in range(9):
+                there = code[i + s // 3 - 1, j + s % 3 - 1]
+                if there < 0 or (here == 0 and (there > 0 or seen[s])):
+                    continue
+                if here == 0:
+                    seen[s] = True
+                    unseen -= 1
+                one, other = own[here, s], own[there, 8 - s]
+                for e in range(4):
+                    worst = max(worst, abs(one[e] - other[(0, 2, 1, 3)[e]]))
+    return worst
+
+
+@njit(cache=KEPT)
+def symmetrise(code, own):
+    """(K + Kᵀ) / 2, where places have stencils of their own."""
+    for i in range(1, code.shape[0] - 1):
+        for j in range(1, code.shape[1] - 1):
+            for s in range(5):
+                here, there = code[i, j], code[i + s // 3 - 1, j + s % 3 - 1]
+                if here < 0 or there < 0:
+                    continue
+                for e in range(4):
+                    t = (0, 2, 1, 3)[e]
+                    mean = (own[here, s, e] + own[there, 8 - s, t]) / 2
+                    own[here, s, e] = own[there, 8 - s, t] = mean
+
+
+@njit(cache=KEPT)
+def balance(code, own, factor):
+    """Factors of rows, from place to place, with which as much of K as can be is symmetric, from
+    those that are known, 0 where none is. Returns how many places have none, and how many had."""
+    before = 0
+    for i in range(code.shape[0]):
+        for j in range(code.shape[1]):
+            before += code[i, j] > 0 and factor[i, j] == 0.0
+    found, left = 1, before
+    while left and found:
+        found = 0
+        for i in range(1, code.shape[0] - 1):
+            for j in range(1, code.shape[1] - 1):
+                if code[i, j] <= 0 or factor[i, j] != 0.0:
+                    continue
+                both = square = 0.0
+                for s in range(9):
+                    a, b = i + s // 3 - 1, j + s % 3 - 1
+                    if s != 4 and code[a, b] >= 0 and factor[a, b] > 0.0:
+                        for e in range(4):
+                            mine = own[code[i, j], s, e]
+                            both += mine * factor[a, b] * own[code[a, b], 8 - s, (0, 2, 1, 3)[e]]
+                            square += mine * mine
+                if square > 0.0 and both > 0.0:
+                    factor[i, j] = both / square
+                    found += 1
+        left -= found
+    return left, before
+
+
+def run_coarsening():
+    """Calls each of these once, so that all are compiled."""
+    code = np.zeros((8, 8), np.int32)
+    code[0] = code[-1] = code[:, 0] = code[:, -1] = -1
+    code[2, 2] = 1
+    kind, own, halved = (code >= 0).astype(np.int8), np.ones((2, 9, 4)), (1, 1)
+    lists = np.zeros(9, np.int64), np.zeros(7, np.int32), np.zeros(7, np.int32)
+    lists += np.zeros(9, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
+    runs(code, *lists)
+    coarse_kind, coarse_code = np.zeros((6, 6), np.int8), np.zeros((6, 6), np.int32)
+    coarse_kinds(kind, halved, coarse_kind)
+    count = coarse_codes(code, coarse_kind, halved, coarse_code)
+    galerkin(code, own, coarse_code, halved, np.zeros((count + 1, 9, 4)))
+    asymmetry(code, own)
+    symmetrise(code, own)
+    balance(code, own, np.zeros((8, 8)))
+
+
+FAST = {"error_model": "numpy", "nogil": True, "cache": KEPT, "fastmath": True}
+
+
+@njit(**FAST)
+def descend(a, p, q, x, r, share, out, sums):
+    """x += a p, r -= a q; out = share · r in its precision; sums, by row, = r · r and the largest
+    |a p|."""
+    sums[:] = 0.0
+    for v in range(2):
+        for i in range(x.shape[1]):
+            xs, rs, ps, qs, os = x[v, i], r[v, i], p[v, i], q[v, i], out[v, i]
+            part = most = 0.0
+            for j in range(xs.size):
+                xs[j] += a * ps[j]
+                rs[j] -= a * qs[j]
+                os[j] = share * rs[j]
+                part += rs[j] * rs[j]
+                most = max(most, abs(ps[j]))
+            sums[0, i] += part
+            sums[1, i] = max(sums[1, i], abs(a) * most)
+
+
+@njit(**FAST)
+def turn(share, z, beta, p):
+    """p = share · z + beta p."""
+    for v in range(2):
+        for i in range(p.shape[1]):
+            zs, ps = z[v, i], p[v, i]
+            for j in range(ps.size):
+                ps[j] = share * zs[j] + beta * ps[j]
+
+
+@njit(**FAST)
+def dot(a, b, sums):
+    """sums, by row, = a · b."""
+    sums[:] = 0.0
+    for v in range(2):
+        for i in range(a.shape[1]):
+            one, other = a[v, i], b[v, i]
+            part = 0.0
+            for j in range(one.size):
+                part += one[j] * other[j]
+            sums[i] += part
+
+
+@njit(**FAST)
+def prolong(first, begin, end, lone, place, coarse, halved, x):
+    """x += P coarse at the free places of a grid: its runs and lone places by row."""
+    half, width = x.dtype.type(0.5), coarse.shape[2]
+    line, row = np.zeros(width + 1, x.dtype), np.zeros(2 * width + 2, x.dtype)
+    for i in range(first.size - 1):
+        if first[i] == first[i + 1] and lone[i] == lone[i + 1]:
+            continue
+        for v in range(2):
+            low = (i + 1) // 2 if halved[0] else i
+            high = i // 2 + 1 if halved[0] else i
+            one, other = coarse[v, low], coarse[v, high]
+            for n in range(width):
+                line[n] = half * (one[n] + other[n])
+            if halved[1]:
+                for n in range(width):
+                    row[2 * n] = half * (line[n] + line[n + 1])
+                    row[2 * n + 1] = line[n + 1]
+            else:
+                for n in range(width):
+                    row[n] = line[n]
+            for e in range(first[i], first[i + 1]):
+                lo, hi = begin[e], end[e]
+                to, of = x[v, i, lo:hi], row[lo:hi]
+                for j in range(hi - lo):
+                    to[j] += of[j]
+            for e in range(lone[i], lone[i + 1]):
+                x[v, i, place[e]] += row[place[e]]
+
+
+@njit(**FAST)
+def differences(still, moved, place, number, share, axis, out):
+    """share · (still - moved) at flat places, into place `number` of each one's stencil, as what
+    moves along an axis do. Returns the largest."""
+    largest = 0.0
+    for n in range(place.size):
+        for v in range(2):
+            value = share * (still[v, place[n]] - moved[v, place[n]])
+            out[n, number[n], v, axis] = value
+            largest = max(largest, abs(value))
+    return largest
+
+
+@njit(**FAST)
+def clear_noise(stencils, noise):
+    """Zero where all four numbers of a place of a stencil are as small."""
+    for n in range(stencils.shape[0]):
+        for s in range(stencils.shape[1]):
+            c = stencils[n, s]
+            if max(abs(c[0, 0]), abs(c[0, 1]), abs(c[1, 0]), abs(c[1, 1])) <= noise:
+                c[:] = 0.0
+
+
+def run_fields():
+    """Calls each of these once, so that all are compiled."""
+    r, z = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32)
+    descend(0.0, r, r, r.copy(), r.copy(), 1.0, z, np.zeros((2, 8)))
+    turn(1.0, z, 0.0, r)
+    dot(r, z, np.zeros(8))
+    dot(r, r, np.zeros(8))
+    differences(r.reshape(2, -1), r.reshape(2, -1), np.zeros(1, int), np.zeros(1, int), 1.0, 0,
+                np.zeros((1, 9, 2, 2)))  # fmt: skip
+    clear_noise(np.zeros((1, 9, 2, 2)), 0.0)
+    rows, some = np.zeros(9, np.int64), np.zeros(1, np.int32)
+    prolong(rows, some, some, rows, some, np.zeros((2, 6, 6), np.float32), (1, 1), z)
+
+
+Grid = namedtuple("Grid", "first begin end lone place which same own inverse own_inverse")
+"""Of each row its `first` run and `lone` place, with the ends of the last row at the end; the
+stencils, and the inverses of their middles."""
+
+
+@njit(**FAST)
+def around(x, i, lo, hi):
+    """The rows before, at and after a run, x and y, from one place before it to one after."""
+    lo, hi = lo - 1, hi + 1
+    before, after = (
+        (x[0, i - 1, lo:hi], x[1, i - 1, lo:hi]),
+        (x[0, i + 1, lo:hi], x[1, i + 1, lo:hi]),
+    )
+    return before[0], before[1], x[0, i, lo:hi], x[1, i, lo:hi], after[0], after[1]
+
+
+@njit(**FAST)
+def of_row(c, x, y, j):
+    """What three places of a row do to the one in their middle, by 12 numbers."""
+    x0, y0, x1, y1, x2, y2 = x[j], y[j], x[j + 1], y[j + 1], x[j + 2], y[j + 2]
+    kx = (c[0] * x0 + c[1] * y0) + (c[4] * x1 + c[5] * y1) + (c[8] * x2 + c[9] * y2)
+    ky = (c[2] * x0 + c[3] * y0) + (c[6] * x1 + c[7] * y1) + (c[10] * x2 + c[11] * y2)
+    return kx, ky
+
+
+@njit(**FAST)
+def of_run(c, rows, j):
+    """K x at place j of a run."""
+    ax, ay = of_row(c[0], rows[0], rows[1], j)
+    bx, by = of_row(c[1], rows[2], rows[3], j)
+    cx, cy = of_row(c[2], rows[4], rows[5], j)
+    return ax + bx + cx, ay + by + cy
+
+
+@njit(**FAST)
+def of_lone(grid, e, x, i):
+    """K x at a place with a stencil of its own."""
+    j, k = grid.place[e], grid.which[e]
+    kx = ky = x[0, 0, 0] * 0
+    for a in range(3):
+        for b in range(3):
+            c, u, v = grid.own[k, 3 * a + b], x[0, i + a - 1, j + b - 1], x[1, i + a - 1, j + b - 1]
+            kx += c[0] * u + c[1] * v
+            ky += c[2] * u + c[3] * v
+    return kx, ky
+
+
+@njit(**FAST)
+def product(grid, x, out, sums):
+    """out = K x; sums, by row, = x · K x."""
+    for i in range(grid.first.size - 1):
+        part = 0.0
+        for e in range(grid.first[i], grid.first[i + 1]):
+            lo, hi = grid.begin[e], grid.end[e]
+            rows, ox, oy = around(x, i, lo, hi), out[0, i, lo:hi], out[1, i, lo:hi]
+            for j in range(hi - lo):
+                ox[j], oy[j] = of_run(grid.same, rows, j)
+            for j in range(hi - lo):
+                part += rows[2][j + 1] * ox[j] + rows[3][j + 1] * oy[j]
+        for e in range(grid.lone[i], grid.lone[i + 1]):
+            j = grid.place[e]
+            kx, ky = of_lone(grid, e, x, i)
+            out[0, i, j], out[1, i, j] = kx, ky
+            part += x[0, i, j] * kx + x[1, i, j] * ky
+        sums[i] = part
+
+
+@njit(**FAST)
+def residual(grid, i, b, x, out):
+    """out = b - K x of a row, (axis, place)."""
+    for e in range(grid.first[i], grid.first[i + 1]):
+        lo, hi = grid.begin[e], grid.end[e]
+        rows, bx, by = around(x, i, lo, hi), b[0, i, lo:hi], b[1, i, lo:hi]
+        ox, oy = out[0, lo:hi], out[1, lo:hi]
+        for j in range(hi - lo):
+            kx, ky = of_run(grid.same, rows, j)
+            ox[j], oy[j] = bx[j] - kx, by[j] - ky
+    for e in range(grid.lone[i], grid.lone[i + 1]):
+        j = grid.place[e]
+        kx, ky = of_lone(grid, e, x, i)
+        out[0, j], out[1, j] = b[0, i, j] - kx, b[1, i, j] - ky
+
+
+@njit(**FAST)
+def solve_own(grid, i, r, weight, x):
+    """x += weight · D⁻¹ r at the places of a row, D the middles of the stencils."""
+    d = grid.inverse
+    for e in range(grid.first[i], grid.first[i + 1]):
+        lo, hi = grid.begin[e], grid.end[e]
+        rx, ry, ox, oy = r[0, lo:hi], r[1, lo:hi], x[0, i, lo:hi], x[1, i, lo:hi]
+        for j in range(hi - lo):
+            ox[j] += weight * (d[0] * rx[j] + d[1] * ry[j])
+            oy[j] += weight * (d[2] * rx[j] + d[3] * ry[j])
+    for e in range(grid.lone[i], grid.lone[i + 1]):
+        j, k, c = grid.place[e], grid.which[e], grid.own_inverse
+        x[0, i, j] += weight * (c[k, 0] * r[0, j] + c[k, 1] * r[1, j])
+        x[1, i, j] += weight * (c[k, 2] * r[0, j] + c[k, 3] * r[1, j])
+
+
+@njit(**FAST)
+def clear(x, i):
+    """A row of zeros."""
+    for v in range(2):
+        for j in range(x.shape[2]):
+            x[v, i, j] = 0
+
+
+@njit(**FAST)
+def relax(grid, b, x, row, weight, start, upwards):
+    """x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; `upwards` the other way round.
+    `start`: from x = 0, whatever it holds. `row` is room for one."""
+    rows = grid.first.size - 1
+    for i in range(1 if upwards else 0, rows + 1, 2):
+        # Row i, and the row before it, for which both beside it are now done.
+        if i < rows:
+            if start:
+                clear(x, i)
+                for v in range(2):
+                    for j in range(row.shape[1]):
+                        row[v, j] = b[v, i, j]
+            else:
+                residual(grid, i, b, x, row)
+            solve_own(grid, i, row, weight, x)
+        if i > 0:
+            if start:
+                clear(x, i - 1)
+            residual(grid, i - 1, b, x, row)
+            solve_own(grid, i - 1, row, weight, x)
+
+
+@njit(**FAST)
+def restrict(grid, b, x, halved, code, out):
+    """out = Pᵀ (b - K x) at the free places of the next grid, those of a `code` of at least 0.
+    `halved` tells along which axes it has half the places: its place n lies at 2n - 1, or at n."""
+    half, width, across = x.dtype.type(0.5), code.shape[1], x.shape[2]
+    odd, even = np.zeros((2, across), x.dtype), np.zeros((2, across), x.dtype)
+    sums = np.zeros((2, 2 * width + 2), x.dtype)
+    for n in range(code.shape[0]):
+        if halved[0]:
+            add_rows(sums, even, half, True)
+            whole_residual(grid, 2 * n - 1, b, x, odd)
+            add_rows(sums, odd, x.dtype.type(1.0), False)
+            whole_residual(grid, 2 * n, b, x, even)
+            add_rows(sums, even, half, False)
+        else:
+            whole_residual(grid, n, b, x, odd)
+            add_rows(sums, odd, x.dtype.type(1.0), True)
+        for v in range(2):
+            to, of, free = out[v, n], sums[v], code[n]
+            to[0] = to[width - 1] = 0
+            if halved[1]:
+                for m in range(1, width - 1):
+                    value = of[2 * m - 1] + half * (of[2 * m - 2] + of[2 * m])
+                    to[m] = value if free[m] >= 0 else value * 0
+            else:
+                for m in range(1, width - 1):
+                    to[m] = of[m] if free[m] >= 0 else of[m] * 0
+
+
+@njit(**FAST)
+def whole_residual(grid, i, b, x, out):
+    """The residual of a row, zero where nobody is free, and of a row that is not there."""
+    for v in range(2):
+        for j in range(out.shape[1]):
+            out[v, j] = 0
+    if 0 <= i < grid.first.size - 1:
+        residual(grid, i, b, x, out)
+
+
+@njit(**FAST)
+def add_rows(sums, row, share, anew):
+    """sums (+)= share · row, both axes."""
+    for v in range(2):
+        to, of = sums[v], row[v]
+        if anew:
+            for j in range(of.size):
+                to[j] = share * of[j]
+        else:
+            for j in range(of.size):
+                to[j] += share * of[j]
+
+
+@njit(**FAST)
+def scaled(grid, same, own, moves, out):
+    """out = S moves at free places, S by stencil as 4 numbers."""
+    for i in range(grid.first.size - 1):
+        for e in range(grid.first[i], grid.first[i + 1]):
+            lo, hi = grid.begin[e], grid.end[e]
+            for j in range(lo, hi):
+                u, v = moves[0, i, j], moves[1, i, j]
+                out[0, i, j], out[1, i, j] = same[0] * u + same[1] * v, same[2] * u + same[3] * v
+        for e in range(grid.lone[i], grid.lone[i + 1]):
+            j, c = grid.place[e], own[grid.which[e]]
+            u, v = moves[0, i, j], moves[1, i, j]
+            out[0, i, j], out[1, i, j] = c[0] * u + c[1] * v, c[2] * u + c[3] * v
+
+
+def run():
+    """Calls each of these once, so that all are compiled."""
+    run_coarsening()
+    run_fields()
+    lists = np.zeros(9, np.int64), np.zeros(7, np.int32), np.zeros(7, np.int32)
+    lists += np.zeros(9, np.int64), np.zeros(1, np.int32), np.zeros(1, np.int32)
+    grids, own = [], np.ones((2, 9, 4))
+    for real in (np.float32, np.float64):
+        same, middle = ((real(1.0),) * 12,) * 3, (real(1.0),) * 4
+        grids.append(Grid(*lists, same, own.astype(real), middle, np.ones((2, 4), real)))
+    rough, exact = grids
+    r, z, half = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32), np.float32(0.5)
+    product(exact, r, r.copy(), np.zeros(8))
+    relax(rough, z, z.copy(), np.zeros((2, 8), np.float32), half, True, False)
+    coarse, code = np.zeros((2, 6, 6), np.float32), np.zeros((6, 6), np.int32)
+    restrict(rough, z, z, (1, 1), code, coarse)
+    scaled(exact, (1.0,) * 4, np.ones((2, 4)), r, r)

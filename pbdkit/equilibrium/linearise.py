@@ -1,0 +1,169 @@
+"""Which system serves a scene: stencils on its lattice, or a matrix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import TypeVar
+
+import numpy as np
+
+from pbdkit.equilibrium.sparse import MatrixSystem
+from pbdkit.equilibrium.system import (
+    ALL,
+    Floats,
+    IndefiniteError,
+    Moves,
+    Rows,
+    StuckError,
+    System,
+    one_thread,
+    random_displacements,
+)
+from pbdkit.errors import NotSharedError
+from pbdkit.progress import Watch
+from pbdkit.scene.memory_estimate import asks_for_grids
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import State, initial_state
+
+T = TypeVar("T")
+NOT_SHARED = (
+    "has an equilibrium that several processes cannot share: leaders must hold all of the body, "
+    "it must be stable at rest, its frame show particles nearby, and each axis move the other or "
+    "neither; run it in one process"
+)
+
+
+def linearised(
+    scene: Scene,
+    state: State,
+    moment: float,
+    method: str,
+    watch: Watch,
+    moves: Moves | None = None,
+    rows: Rows = ALL,
+) -> System:
+    """The system of a scene at a state with the roles of a moment's step, by one of the solver's
+    methods; `moves`, where known, serve it.
+
+    Of a scene of which each process has some rows there is the one on stencils alone. Raises
+    ExperimentError where there is no unique solution, or none on stencils.
+    """
+    if rows.strip:
+        return _shared(scene, state, math.ceil(moment), watch, rows)
+    if scene.barriers:
+        from pbdkit.equilibrium.contact import ContactSystem
+
+        return ContactSystem(scene, state, moment, method, watch, moves or Moves(scene))
+    step = math.ceil(moment)
+
+    def by_matrix() -> System:
+        return MatrixSystem(scene, state, method, watch, step)
+
+    if find_spec("numba") and asks_for_grids(scene.experiment, method, scene.raster.count):
+        from pbdkit.equilibrium.lattice_system import lattice_system
+
+        if system := lattice_system(scene, state, step, watch, moves):
+            return _Replaceable(system, by_matrix, at_rest=not state.u.any())
+    return by_matrix()
+
+
+def mismatch_at_rest(scene: Scene, moves: Moves, size: float, method: str, watch: Watch) -> float:
+    """How far from linear the moves are of followers put elsewhere, at random and as far as a size:
+    as by System.mismatch, of the linearisation at rest."""
+    start, steps = initial_state(scene), scene.experiment.steps
+    rest = replace(start, u=np.zeros_like(start.u))
+    with one_thread():
+        system = linearised(scene, rest, steps, method, watch)
+        put = random_displacements(scene, size)
+        made = [moves.at(replace(rest, u=u), steps) for u in (rest.u, put.copy())]
+        return system.mismatch(put, *made)
+
+
+def _shared(scene: Scene, state: State, step: int, watch: Watch, rows: Rows) -> System:
+    from pbdkit.equilibrium.lattice_system import lattice_system
+
+    system = lattice_system(scene, state, step, watch, rows=rows)
+    if system is None:
+        raise NotSharedError(NOT_SHARED, ("rule",))
+    return system
+
+
+class _Replaceable(System):
+    """A system until it gets stuck, then another; but for a body that is not stable where it is
+    put, which is better put elsewhere."""
+
+    def __init__(self, system: System, otherwise: Callable[[], System], *, at_rest: bool) -> None:
+        self._system, self._otherwise, self._past = system, otherwise, 0
+        self._at_rest = at_rest
+
+    def solve(
+        self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
+    ) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.solve(moves, tolerance, owed, rounding))
+
+    def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.answer(moves, share, near))
+
+    def pushed_by(self, led: Floats) -> Floats | None:
+        """By the present one."""
+        return self._system.pushed_by(led)
+
+    def solve_transposed(self, weights: Floats, share: float) -> Floats:
+        """By the first that can."""
+        return self._first_able(lambda system: system.solve_transposed(weights, share))
+
+    def mismatch(self, c: Floats, before: Floats, after: Floats) -> float:
+        """By the present one."""
+        return self._system.mismatch(c, before, after)
+
+    def distance(self, moves: Floats, rounding: float) -> float:
+        """By the first that can."""
+        return self._first_able(lambda system: system.distance(moves, rounding))
+
+    def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
+        """By the present one."""
+        self._system.refuse_moving_floats(moves, rounding)
+
+    def is_stable(self) -> bool:
+        """By the present one."""
+        return self._system.is_stable()
+
+    def _first_able(self, does: Callable[[System], T]) -> T:
+        try:
+            return does(self._system)
+        except StuckError as error:
+            if isinstance(error, IndefiniteError) and not self._at_rest:
+                raise
+            self._past += self._system.iterations
+            self._system = self._otherwise()
+            return does(self._system)
+
+    @property
+    def methods(self) -> str:
+        """Of the present one."""
+        return self._system.methods
+
+    @property
+    def is_stuck(self) -> bool:
+        """Of the present one."""
+        return self._system.is_stuck
+
+    @property
+    def how(self) -> str:
+        """Of the present one."""
+        return self._system.how
+
+    @property
+    def amplification(self) -> float:
+        """Of the present one."""
+        return self._system.amplification
+
+    @property
+    def iterations(self) -> int:
+        """Of both."""
+        return self._past + self._system.iterations

@@ -1,0 +1,377 @@
+"""One grid of stencils, the coarser one that follows from it, and what a cycle does on it.
+
+The functions of a coarser grid are bilinear hats; its stencils are what those of the finer one do
+to them (Galerkin). Where one direction is much stiffer, only that one is made coarser.
+
+Multigrid on a lattice: ever coarser grids of stencils, and one V-cycle over them.
+
+Multigrid over processes: each has some rows of the finer grids, all have the coarser ones.
+
+With so many rows around its own that a cycle goes down and up without those of others: what is
+right of a field shrinks by some rows a grid. They meet once a cycle where it begins, and once where
+what is left comes together on the first grid that all have.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.equilibrium.kernels import kernels
+from pbdkit.equilibrium.stencil_matrix import (
+    OUTSIDE,
+    OWN,
+    Held,
+    coarser_held,
+    inverses,
+    with_held,
+    without_held,
+)
+from pbdkit.equilibrium.system import Rows, Strip, coarser_size, outside
+
+Floats = NDArray[np.floating[Any]]
+PRECISION = np.float32
+"""Of cycles."""
+WEIGHT = 0.8
+"""Of a relaxation; below 1, since the places of a row do not know of each other."""
+STIFFER = 3.0
+"""So many times stiffer, a direction is made coarser alone."""
+NARROW = 5
+"""Places across, with the ring around, at which a grid is not made narrower."""
+EVERY = slice(None)
+
+
+class Grid:
+    """One grid: its `code` and `kind` as of StencilMatrix, its `stencils`, and what kernels are
+    given of them in a precision. Corrections do not reach `held` components."""
+
+    def __init__(
+        self,
+        code: NDArray[np.int32],
+        kind: NDArray[np.int8],
+        stencils: Floats,
+        held: Held | None = None,
+    ) -> None:
+        self.code, self.kind, self.stencils, self.held = code, kind, stencils, held
+        rows = len(code) + 1
+        first, lone = np.empty(rows, np.int64), np.empty(rows, np.int64)
+        none = np.empty(0, np.int32)
+        run_count, lone_count = kernels().runs(code, first, none, none, lone, none, none)
+        begin, end = (np.empty(run_count, np.int32) for _ in range(2))
+        place, which = (np.empty(lone_count, np.int32) for _ in range(2))
+        kernels().runs(code, first, begin, end, lone, place, which)
+        self.lists = first, begin, end, lone, place, which
+        self.unknowns = 2 * (int((end - begin).sum()) + lone_count)
+
+    def given(self, precision: type[np.floating[Any]]) -> Any:
+        """The grid as kernels take it."""
+        middle = self._inverses
+        same = tuple(tuple(map(precision, row)) for row in self.stencils[0].reshape(3, 12))
+        own, inverse = (np.ascontiguousarray(v, precision) for v in (self.stencils, middle))
+        return kernels().Grid(*self.lists, same, own, tuple(map(precision, middle[0])), inverse)
+
+    @cached_property
+    def _inverses(self) -> Floats:
+        return inverses(self.stencils[:, OWN].reshape(-1, 2, 2)).reshape(-1, 4)
+
+    def field(self, precision: type[np.floating[Any]]) -> Floats:
+        """Room for one number an axis and place."""
+        return np.zeros((2, *self.code.shape), precision)
+
+    def halved(self, rows: int) -> tuple[int, int]:
+        """Along which axes the next grid has half the places, of a lattice of so many rows."""
+        along = [np.abs(_stiffness(self.stencils[0], axis)) for axis in range(2)]
+        columns = self.code.shape[1]
+        if rows <= NARROW or columns <= NARROW:
+            return int(rows > columns), int(columns >= rows)
+        if max(along) <= STIFFER * min(along):
+            return 1, 1
+        return int(along[0] > along[1]), int(along[1] > along[0])
+
+    def coarser(self, halved: tuple[int, int], known: slice = EVERY) -> Grid:
+        """The next grid, as far as it is known: some of its rows."""
+        shape = [
+            coarser_size(n) if half else n for n, half in zip(self.code.shape, halved, strict=True)
+        ]
+        kind, code = np.zeros(shape, np.int8), np.zeros(shape, np.int32)
+        kernels().coarse_kinds(self.kind, halved, kind)
+        count = kernels().coarse_codes(self.code, kind, halved, code)
+        for rows in outside(known, shape[0]):
+            kind[rows], code[rows] = OUTSIDE, -1
+        stencils, fine = np.zeros((count + 1, *self.stencils.shape[1:])), self.stencils
+        if self.held is not None:
+            fine = without_held(self.code, fine, self.held)
+        kernels().galerkin(self.code, fine, code, halved, stencils)
+        stencils[0] = _coarse_stencil(self.stencils[:1], halved)
+        if self.held is None:
+            return Grid(code, kind, stencils)
+        held = coarser_held(self.kind, self.held, halved, kind)
+        code, stencils, _ = with_held(code, stencils, held)
+        return Grid(code, kind, stencils, held)
+
+    def add_coarser(self, coarse: Floats, halved: tuple[int, int], x: Floats) -> None:
+        """x += P coarse."""
+        kernels().prolong(*self.lists[:5], coarse, halved, x)
+        if self.held is not None:
+            x[self.held] = 0.0
+
+    def is_definite_alone(self) -> bool:
+        """Whether the matrix is positive at each place by itself, where it is symmetric."""
+        a, b, c, d = self.stencils[:, OWN].T
+        return bool(((a > 0.0) & (a * d > b * c)).all())
+
+    def matrix(self) -> tuple[tuple[NDArray[np.intp], ...], Floats]:
+        """Where the unknowns are, and the matrix, dense."""
+        at = np.nonzero(self.code >= 0)
+        number = np.full(self.code.shape, -1)
+        number[at] = np.arange(len(at[0]))
+        K = np.zeros((len(at[0]), 2, len(at[0]), 2))
+        blocks = self.stencils[self.code[at]].reshape(-1, 9, 2, 2)
+        for s in range(9):
+            there = number[at[0] + s // 3 - 1, at[1] + s % 3 - 1]
+            some = np.flatnonzero(there >= 0)
+            K[some, :, there[some], :] += blocks[some, s]
+        return at, K.reshape(2 * len(at[0]), -1)
+
+
+class Level:
+    """A grid with room for what a cycle does there, in single precision; `halved` tells along which
+    axes the next one has half the places."""
+
+    def __init__(self, grid: Grid, halved: tuple[int, int] = (0, 0)) -> None:
+        self.grid, self.given, self.halved = grid, grid.given(PRECISION), halved
+        self.x, self.b = grid.field(PRECISION), grid.field(PRECISION)
+        self._row = np.zeros((2, grid.code.shape[1]), PRECISION)
+
+    def down(self, b: Floats, below: Level) -> None:
+        """Relaxes K x = b from zero; what is left goes to the next grid."""
+        kernel, x = kernels(), self.x
+        kernel.relax(self.given, b, x, self._row, PRECISION(WEIGHT), True, False)
+        kernel.restrict(self.given, b, x, self.halved, below.grid.code, below.b)
+
+    def up(self, b: Floats, coarse: Floats) -> None:
+        """Adds what the next grid has found, and relaxes."""
+        self.grid.add_coarser(coarse, self.halved, self.x)
+        kernels().relax(self.given, b, self.x, self._row, PRECISION(WEIGHT), False, True)
+
+
+class Grids(ABC):
+    """A grid and ever coarser ones: ``cycle(r)`` approximates K⁻¹ r, in single precision."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """How many grids there are."""
+
+    @abstractmethod
+    def grid(self, depth: int = 0) -> Grid:
+        """The finest, or one so much coarser."""
+
+    @abstractmethod
+    def cycle(self, r: Floats, depth: int = 0) -> Floats:
+        """One V-cycle from zero. What it gives out is valid until the next."""
+
+    @abstractmethod
+    def is_definite(self) -> bool:
+        """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
+        tell."""
+
+
+def _stiffness(stencil: Floats, axis: int) -> float:
+    """What a wave along an axis meets."""
+    c = np.moveaxis(stencil.reshape(3, 3, 2, 2), axis, 0)
+    sides: Floats = c[0].sum(axis=0) + c[2].sum(axis=0)
+    return float(np.trace(sides))
+
+
+def _coarse_stencil(stencils: Floats, halved: tuple[int, int]) -> Floats:
+    """What one stencil everywhere makes of itself."""
+    coarse = np.full((7, 7), -1, np.int32)
+    coarse[3, 3] = 1
+    found: Floats = np.zeros((2, *stencils.shape[1:]))
+    kernels().galerkin(np.zeros((12, 12), np.int32), stencils, coarse, halved, found)
+    return np.asarray(found[1])
+
+
+COARSEST = 200
+"""Unknowns below which a grid is solved with its inverse."""
+TURNS = 30
+"""Of the inverse iteration on the coarsest grid."""
+SINGULAR = 1e-12
+"""One part of what the inverse of the coarsest grid may magnify; a body that is not held gives way
+without end."""
+
+
+class FloatingError(Exception):
+    """Something of the body is not held."""
+
+
+class Multigrid(Grids):
+    """All of a grid and ever coarser ones, in this process.
+
+    Raises FloatingError where leaders leave a motion of the body free.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self._levels = [Level(grid)]
+        while grid.unknowns > COARSEST:
+            halved = self._levels[-1].halved = grid.halved(len(grid.code))
+            grid = grid.coarser(halved)
+            self._levels.append(Level(grid))
+        self._at, K = grid.matrix()
+        try:
+            inverse = np.linalg.inv(K)
+        except np.linalg.LinAlgError:
+            raise FloatingError from None
+        if not np.abs(inverse).max() * np.abs(K).max() * SINGULAR < 1.0:
+            raise FloatingError
+        self._coarsest = K
+        self._inverse, self._gives_way = inverse.astype(PRECISION), inverse.diagonal()
+
+    def is_definite(self) -> bool:
+        """Whether a symmetric matrix is positive, as the coarsest grid and each place by itself
+        tell: one that is not there is not on the finest either."""
+        K = (self._coarsest + self._coarsest.T) / 2.0
+        return self.grid().is_definite_alone() and bool(np.linalg.eigvalsh(K)[0] > 0.0)
+
+    def __len__(self) -> int:
+        """With the coarsest."""
+        return len(self._levels)
+
+    def grid(self, depth: int = 0) -> Grid:
+        """The finest, or one so much coarser."""
+        return self._levels[depth].grid
+
+    def cycle(self, r: Floats, depth: int = 0) -> Floats:
+        """On all grids from there on."""
+        level = self._levels[depth]
+        if depth == len(self._levels) - 1:
+            found = self._inverse @ r[:, self._at[0], self._at[1]].T.ravel()
+            level.x[:, self._at[0], self._at[1]] = found.reshape(-1, 2).T
+            return level.x
+        below = self._levels[depth + 1]
+        level.down(r, below)
+        level.up(r, self.cycle(below.b, depth + 1))
+        return level.x
+
+    @property
+    def whole(self) -> Multigrid:
+        """All of them."""
+        return self
+
+    @property
+    def softest(self) -> tuple[int, tuple[int, int], float]:
+        """Of the coarsest grid the axis and place that gives way most to a unit load, and how
+        far."""
+        n = int(self._gives_way.argmax())
+        i, j = (int(index[n // 2]) for index in self._at)
+        return n % 2, (i, j), float(self._gives_way[n])
+
+    def softest_field(self) -> Floats:
+        """On the coarsest grid: what gives way most to forces like itself."""
+        mode = np.random.default_rng(0).random(len(self._inverse))
+        for _ in range(TURNS):
+            mode = self._inverse @ (mode / np.abs(mode).max())
+        found = self._levels[-1].grid.field(PRECISION)
+        found[:, self._at[0], self._at[1]] = mode.reshape(-1, 2).T
+        return found
+
+    def finer_field(self, depth: int, field: Floats) -> Floats:
+        """A field of a grid on the one before it."""
+        above = self._levels[depth - 1]
+        found = above.grid.field(PRECISION)
+        coarse = field.astype(PRECISION, copy=False)
+        above.grid.add_coarser(coarse, above.halved, found)
+        return found
+
+    def finer_place(self, depth: int, place: tuple[int, int]) -> tuple[int, int]:
+        """Where a place of a grid lies on the one before it."""
+        halved = self._levels[depth - 1].halved
+        i, j = (2 * n - 1 if half else n for n, half in zip(place, halved, strict=True))
+        return i, j
+
+
+Array = NDArray[Any]
+SMALL = 100 * COARSEST
+"""Unknowns of a grid that is not worth sharing: more than four times those of the coarsest, so that
+all processes have two grids at least where any is parted."""
+
+
+class PartedGrids(Grids):
+    """Of a grid that each process has a strip of. Raises FloatingError where leaders leave a motion
+    of the body free."""
+
+    def __init__(self, grid: Grid, rows: Rows, strip: Strip) -> None:
+        self._rows = rows
+        self._levels, self._strips = [Level(grid)], [strip]
+        while self._strips[-1].depth and self._unknowns() > SMALL:
+            level, strip = self._levels[-1], self._strips[-1]
+            level.halved = level.grid.halved(strip.count)
+            strip = strip.coarser(level.halved[0])
+            self._strips.append(strip)
+            self._levels.append(Level(level.grid.coarser(level.halved, strip.known)))
+        self.whole = Multigrid(self._joined())
+        """The grids that all processes have."""
+
+    def _unknowns(self) -> int:
+        own, code = self._strips[-1].own, self._levels[-1].grid.code
+        return int(2 * sum(self._rows.every(int(np.count_nonzero(code[own] >= 0)))))
+
+    def _joined(self) -> Grid:
+        """The coarsest of the parted grids, with the rows of all."""
+        grid, own = self._levels[-1].grid, self._strips[-1].own
+        code = grid.code[own]
+        used, number = np.unique(code, return_inverse=True)
+        some = used > 0
+        stencils = self._rows.every(grid.stencils[used[some]])
+        before = sum(map(len, stencils[: self._rows.rank]))
+        renumbered = np.where(some, before + np.cumsum(some), used).astype(code.dtype)
+        held = None if grid.held is None else self._together(grid.held[:, own], 1)
+        return Grid(
+            self._together(renumbered[number].reshape(code.shape), 0),
+            self._together(grid.kind[own], 0),
+            np.concatenate([grid.stencils[:1], *stencils]),
+            held,
+        )
+
+    def _together(self, own: Array, axis: int) -> Array:
+        return np.concatenate(self._rows.every(own), axis)
+
+    def __len__(self) -> int:
+        """With those that all have."""
+        return len(self._levels) - 1 + len(self.whole)
+
+    def grid(self, depth: int = 0) -> Grid:
+        """A parted one."""
+        return self._levels[depth].grid
+
+    def is_definite(self) -> bool:
+        """In all processes."""
+        alone = self._levels[0].grid.is_definite_alone()
+        return not self._rows.any(not alone) and self.whole.is_definite()
+
+    def cycle(self, r: Floats, depth: int = 0) -> Floats:
+        """From the finest grid; renews the halo of r. What comes out is right in own rows and in
+        the one before and after them."""
+        assert depth == 0
+        self._rows.meet(r)
+        given = [r, *(level.b for level in self._levels[1:])]
+        for b, (level, below) in zip(given, pairwise(self._levels), strict=False):
+            level.down(b, below)
+        strip = self._strips[-1]
+        found = self.whole.cycle(self._together(given[-1][:, strip.own], 1))
+        low, rows = strip.low, given[-1].shape[1]
+        x = np.ascontiguousarray(found[:, low : low + rows])
+        for level, b in zip(self._levels[-2::-1], given[-2::-1], strict=True):
+            level.up(b, x)
+            x = level.x
+        return x
+
+
+def grids_of(grid: Grid, rows: Rows) -> Multigrid | PartedGrids:
+    """Those of the finest."""
+    return PartedGrids(grid, rows, rows.strip) if rows.strip else Multigrid(grid)

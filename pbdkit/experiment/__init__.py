@@ -1,1 +1,0 @@
-"""The experiment: read, checked, and kept with the places where it was written."""

@@ -1,1 +1,0 @@
-"""What a rule is physically, on its lattice and neighbours: from its answer to plane waves."""

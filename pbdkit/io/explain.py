@@ -1,0 +1,220 @@
+"""How far bonds are, or were, from breaking: from a dataset and the scene of its experiment."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.io.layout import OF_FRAME, as_step
+from pbdkit.lattice.raster import Places
+from pbdkit.plugin import Bonds, BreaksAtStrain, FractureModel
+from pbdkit.plugin.fracture import breaking_order
+from pbdkit.scene.constants import bond_numbers
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import describe_bonds
+
+if TYPE_CHECKING:
+    import xarray
+
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One bond: the numbers of its particles, its shell and rest length, and how it stands.
+
+    `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
+    (among the broken ones, from 1) and `strain_at_break` are None unless known; `breaks_above` is
+    the strain that it bears, None where the model does not say. `strain` is that of the recorded
+    step `at_step`.
+    """
+
+    bond: tuple[int, int]
+    shell: int
+    rest_length: float
+    state: str
+    step: int | None
+    order: int | None
+    strain_at_break: float | None
+    breaks_above: float | None
+    strain: float
+    at_step: float
+
+    @property
+    def share(self) -> float | None:
+        """How far it is on its way to breaking at that step, 1 where it breaks."""
+        return self.strain / self.breaks_above if self.breaks_above else None
+
+
+class Explained:
+    """What a dataset tells of its bonds. Raises ExperimentError where it has no table of them."""
+
+    def __init__(self, dataset: xarray.Dataset, scene: Scene) -> None:
+        if "bond_ends" not in dataset.variables:
+            raise ExperimentError(
+                "has no table of bonds: nothing could break in this run; run the experiment with "
+                "`fracture`, or with a diagnostic that uses bonds, as pe1 does"
+            )
+        self._dataset, self._scene = dataset, scene
+        self.model: FractureModel = scene.experiment.fracture
+        self._remembered = [number.name for number in bond_numbers(scene.experiment)]
+        self.bonds: Bonds = describe_bonds(scene)
+        self.steps = self._of_bonds("broken_step", np.int32(-1))
+        """(bond,): when each broke, -1 where it has not."""
+        self.strains_at_break: Floats = self._of_bonds("broken_strain", np.nan)
+        """(bond,): NaN where it is not known."""
+        known = "broken_strain" in dataset.variables
+        self.cut = known & (self.steps > 0) & np.isnan(self.strains_at_break)
+        """(bond,): those that were cut after the first step had begun."""
+        self.order: Rows = breaking_order(self.steps, self.strains_at_break)
+        """The rows of the broken bonds, in the order in which they broke."""
+        if not np.array_equal(self.bonds.ends, dataset["bond_ends"].values):
+            raise ExperimentError(
+                "its bonds are not those of the experiment that it carries: the file was changed, "
+                "or another version of a part made it"
+            )
+
+    def _of_bonds(self, name: str, unknown: Any) -> NDArray[Any]:
+        known = self._dataset.variables.get(name)
+        return np.full(len(self.bonds), unknown) if known is None else np.asarray(known.values)
+
+    @cached_property
+    def limits(self) -> Floats:
+        """(bond,): the strain above which each broke, or breaks at the last recorded step; NaN
+        where the model does not say."""
+        limits, last = np.full(len(self.bonds), np.nan), math.ceil(self._dataset["time"].values[-1])
+        moments = np.where(self.steps > 0, self.steps, last)
+        if not self._scene.experiment.courses:
+            moments[:] = last
+        for moment in np.unique(moments).tolist():
+            at = moments == moment
+            limits[at] = self._limits_at(moment)[at]
+        return limits
+
+    def _limits_at(self, moment: int) -> Floats:
+        limits, constants = np.full(len(self.bonds), np.nan), self._scene.at(moment).constants
+        known = all(name in self._dataset for name in self._remembered)
+        model = self.model
+        if not (known and model.can_break and isinstance(model, BreaksAtStrain)):
+            return limits
+        own = [_last(self._dataset[name]).astype(float) for name in self._remembered]
+        for n, plane in enumerate(self._scene.neighbourhood.planes):
+            rows = np.flatnonzero(self._scene.bonds.plane == n)
+            home = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
+            fixed = constants.limits_at(plane.slot, n, home)
+            c = constants.of_bond(*fixed, *(values[rows] for values in own))
+            limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
+        return limits
+
+    @cached_property
+    def spared(self) -> NDArray[np.bool_]:
+        """(bond,): those that cannot break."""
+        if not self.model.can_break:
+            return np.ones(len(self.bonds), np.bool_)
+        frame = self._dataset["role"].values == OF_FRAME
+        touches = frame[self.bonds.ends - 1].any(axis=1)
+        return np.asarray(touches & (not self.model.breaks_frame_bonds()))
+
+    def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
+        """(..., bond): of some bonds at recorded times, by their places along `time`."""
+        particles = np.unique(self.bonds.ends[rows] - 1)
+        at = {"time": time, "particle": particles}
+        if "u" in self._dataset:
+            u = self._dataset["u"].isel(at).values
+        else:
+            reference = self._dataset["reference"].isel(particle=particles).values
+            u = self._dataset["position"].isel(at).values - reference
+        if not np.isfinite(u).all():
+            raise StorageError("is damaged, or was changed: it has positions that are not finite")
+        a, b = (np.searchsorted(particles, self.bonds.ends[rows, end] - 1) for end in (0, 1))
+        rest = self.bonds.rest[rows]
+        now = rest + (u[..., b, :] - u[..., a, :])
+        return np.asarray(np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0)
+
+    def standings(self, rows: Rows, until: int | None = None) -> list[Standing]:
+        """How some bonds stand, strained as at the last recorded step, or the last one until a
+        step."""
+        place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
+        times = self._dataset["time"].values
+        time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
+        strains = self.strains(rows, time).tolist()
+        return [
+            Standing(
+                bond=tuple(self.bonds.ends[row].tolist()),
+                shell=int(self.bonds.shell[row]),
+                rest_length=float(np.hypot(*self.bonds.rest[row])),
+                state=self._state(row),
+                step=int(self.steps[row]) if row in place else None,
+                order=place.get(row),
+                strain_at_break=_known(self.strains_at_break[row]),
+                breaks_above=None if self.spared[row] else _known(self.limits[row]),
+                strain=strain,
+                at_step=as_step(times[time]),
+            )
+            for row, strain in zip(rows.tolist(), strains, strict=True)
+        ]
+
+    def _state(self, row: int) -> str:
+        if self.steps[row] < 0:
+            return "cannot break" if self.spared[row] else "intact"
+        if self.steps[row] == 0:
+            return "broken from the start"
+        return "cut" if self.cut[row] else "broken"
+
+    def nearest(self) -> Standing | None:
+        """The bond that is nearest to breaking at the last recorded step, if that is known."""
+        rows = np.flatnonzero((self.steps < 0) & ~self.spared & np.isfinite(self.limits))
+        if not len(rows):
+            return None
+        share = self.strains(rows) / self.limits[rows]
+        return self.standings(rows[[np.argmax(share)]])[0]
+
+    def row(self, a: int, b: int) -> int:
+        """The row of the bond between two numbers. Raises ExperimentError where there is none."""
+        count = int(self._dataset.sizes["particle"])
+        for number in (a, b):
+            if not 1 <= number <= count:
+                raise ExperimentError(
+                    f"there is no particle {number}; they are numbered 1 to {count}"
+                )
+        found = np.flatnonzero((self.bonds.ends == sorted((a, b))).all(axis=1))
+        if len(found):
+            return int(found[0])
+        mine = self.bonds.ends[(self.bonds.ends == a).any(axis=1)]
+        others = ", ".join(map(str, sorted(mine[mine != a].tolist()))) or "nobody"
+        raise ExperimentError(f"no bond joins {a} and {b}; the bonds of {a} are to {others}")
+
+    def around(self, row: int) -> Rows:
+        """The other bonds at the ends of a bond, the broken ones first and in their order."""
+        touches = np.asarray(np.isin(self.bonds.ends, self.bonds.ends[row]).any(axis=1))
+        touches[row] = False
+        broken = self.order[touches[self.order]]
+        touches[broken] = False
+        return np.append(broken, np.flatnonzero(touches))
+
+    def most_strained(self, row: int) -> tuple[float, float]:
+        """The recorded step at which a bond was the longest, and its strain then."""
+        history = self.strains(np.array([row]), slice(None))[:, 0]
+        most = int(np.argmax(history))
+        return as_step(self._dataset["time"].values[most]), float(history[most])
+
+    def remembered(self, row: int) -> dict[str, float]:
+        """What the model remembers of a bond, at the last recorded step."""
+        known = [name for name in self._remembered if name in self._dataset]
+        return {name: float(_last(self._dataset[name])[row]) for name in known}
+
+
+def _last(variable: xarray.DataArray) -> NDArray[Any]:
+    return np.asarray(variable.isel(time=-1, missing_dims="ignore").values)
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

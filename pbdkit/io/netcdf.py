@@ -1,0 +1,427 @@
+"""A dataset in the making, in a netCDF-4 file: written chunk by whole chunk, each once.
+
+A sink that makes a netCDF-4 file, which appears whole or not at all, and from the first second
+on keeps what is there, so that the run can be gone on with.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import StorageError, WriteError
+from pbdkit.io.atomic_file import FULL, Destination, is_full
+from pbdkit.io.checkpoint import Standing, UnfinishedRun, damaged
+from pbdkit.io.layout import Column, Values, When
+from pbdkit.io.paged_file import PagedFile, PiecedArray
+from pbdkit.io.seal import is_whole
+from pbdkit.io.sinks import KeepingSink
+from pbdkit.scene.memory_estimate import CHUNK_BYTES, OPEN_CHUNK
+
+LEVEL = 1
+"""Of zlib: the next levels cost much and gain little on positions."""
+LABELS = "coordinates"
+"""The attribute of CF that names such as are no dimension's; xarray reads that of the file too."""
+FIRST_LENGTH = 1024
+"""Of a dimension that grows, until there is more."""
+
+Array = NDArray[Any]
+Waiting = dict[str, list[Array]]
+"""Entries by column that fill no chunk yet."""
+
+
+class NetcdfFile:
+    """The columns of a dataset, put into a file as they come; `waiting` and `written`, how many
+    entries of a column are in the file, are what it remembers besides."""
+
+    def __init__(self, file: PagedFile, columns: list[Column], *, compress: bool = False) -> None:
+        self.file, self._compress = file, compress
+        self._h5: Any = None
+        self._content: Any = None
+        self._columns = {column.name: column for column in columns}
+        self.waiting: Waiting = {column.name: [] for column in columns if column.grows}
+        self.written = dict.fromkeys(self.waiting, 0)
+
+    def make(self, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
+        """Defines the variables in an empty file."""
+        self._open("w")
+        self._batch: dict[str, int] = {}
+        grow = dict.fromkeys(d for column in self._columns.values() for d in column.dims)
+        self._content.dimensions = {dim: sizes.get(dim) or None for dim in grow}
+        for column in self._columns.values():
+            self._define(column, sizes, planned)
+
+    def reopen(self, waiting: Waiting, written: Mapping[str, Any]) -> None:
+        """Goes on with a file as it was committed. Raises StorageError where it does not hold what
+        is said to be written."""
+        self.waiting |= waiting
+        self.written |= written
+        self._open("r+")
+        for name, rows in written.items():
+            if not (isinstance(rows, int) and 0 <= rows <= self._content[name].shape[0]):
+                raise StorageError(f"the store holds no {rows!r} entries of '{name}'")
+        self._batch = {name: self._content[name].chunks[0] for name in self.written}
+
+    def put(self, values: Values) -> None:
+        """Keeps growing columns until a chunk is full."""
+        for name, value in values.items():
+            if self._columns[name].grows:
+                one = isinstance(value, PiecedArray) and self._batch[name] == 1
+                self.waiting[name].append(value if one else np.asarray(value))
+                if len(self.waiting[name]) >= self._batch[name]:
+                    self._append(name)
+            else:
+                self._store(self._columns[name], value)
+
+    def flush(self) -> None:
+        """The file, with its pages, holds all but what waits."""
+        self._h5.flush()
+
+    def finish(self, attributes: Mapping[str, str]) -> None:
+        """Puts what waits, and closes. Nothing more comes."""
+        for name in self.waiting:
+            if self.waiting[name]:
+                self._append(name)
+        for dim, grown in self._content.dimensions.items():
+            along = [n for n in self.written if self._columns[n].dims[0] == dim]
+            if along and grown.size:
+                self._content.resize_dimension(dim, max(self.written[name] for name in along))
+        values = [{*column.dims} for column in self._columns.values() if not column.coordinate]
+        named = {name for dims in values for name in self._labels(dims)}
+        unnamed = (name for name in self._labels({*self._content.dimensions}) if name not in named)
+        self._content.attrs.update({**attributes, LABELS: " ".join(unnamed)})
+        self._content.close()
+        self._h5.close()
+
+    def add_group(self, name: str, facts: str, arrays: Mapping[str, Any]) -> None:
+        """Arrays, and what else there is to say of them, apart from the dataset."""
+        group = self._content.create_group(name)
+        group.attrs["facts"] = facts
+        for key, array in arrays.items():
+            dims = {f"{key}_{n}": length for n, length in enumerate(array.shape)}
+            group.dimensions.update(dims)
+            # The library would give empty arrays chunks larger than they are.
+            heuristic = {"chunking_heuristic": "h5py"}
+            variable = group.create_variable(key, tuple(dims), array.dtype, **heuristic)
+            _fill(variable, array)
+
+    def give_up(self) -> None:
+        """What was put is not wanted; nothing is raised."""
+        self.file.give_up()
+        for file in (self._content, self._h5):
+            with suppress(Exception):
+                file.close()
+
+    def _open(self, mode: str) -> None:
+        h5py, h5netcdf = import_module("h5py"), import_module("h5netcdf")
+        self._h5 = h5py.File(self.file, mode, track_order=True)
+        self._content = h5netcdf.File(self._h5, mode)
+
+    def _define(self, column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:
+        more: dict[str, Any] = {}
+        if column.grows:
+            more["chunks"] = _chunks(column, sizes, planned)
+            self._batch[column.name] = more["chunks"][0]
+        elif not all(sizes.get(dim) for dim in column.dims):
+            more["chunks"] = tuple(sizes.get(dim) or OPEN_CHUNK for dim in column.dims)
+        if self._compress and column.dtype != "str" and column.dims:
+            more |= {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
+        if column.grows:
+            dim = column.dims[0]
+            self._lengthen(dim, min(FIRST_LENGTH, planned[dim]))
+        dtype = import_module("h5py").string_dtype() if column.dtype == "str" else column.dtype
+        attributes = column.attributes
+        if column.dtype == "bool":  # as xarray writes it: netCDF has no such type
+            dtype, attributes = "i1", attributes | {"dtype": "bool"}
+        variable = self._content.create_variable(column.name, column.dims, dtype, **more)
+        variable.attrs.update(attributes)
+        if not column.coordinate and (labels := self._labels({*column.dims})):
+            variable.attrs[LABELS] = " ".join(labels)
+
+    def _labels(self, dims: set[str]) -> list[str]:
+        """The coordinates along these dimensions that are no dimension's own."""
+        of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
+        return [column.name for column in of_others if dims.issuperset(column.dims)]
+
+    def _lengthen(self, dim: str, length: int) -> None:
+        if self._content.dimensions[dim].size < length:
+            self._content.resize_dimension(dim, length)
+
+    def _append(self, name: str) -> None:
+        """What waits of a column, as one chunk along its first dimension."""
+        entries, begin = self.waiting[name], self.written[name]
+        variable, dim = self._content[name], self._columns[name].dims[0]
+        if (end := begin + len(entries)) > self._content.dimensions[dim].size:
+            self._lengthen(dim, 2 * end)
+        dataset = variable._h5ds
+        for first, part in _parts(entries, dataset.chunks):
+            place = (begin, first, *(0,) * part.ndim)[: part.ndim]
+            part = part.astype(dataset.dtype, copy=False)
+            self._write_chunk(dataset, place, _padded(part, dataset.chunks))
+        self.written[name], self.waiting[name] = end, []
+
+    def _write_chunk(self, dataset: Any, place: tuple[int, ...], chunk: Array) -> None:
+        data: Any = np.ascontiguousarray(chunk)
+        if dataset.compression:  # as HDF5's filters do it: bytes of like weight together
+            planes = data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T
+            data = np.frombuffer(zlib.compress(planes.tobytes(), LEVEL), np.uint8)
+        self.file.values_bytes = data.nbytes
+        dataset.id.write_direct_chunk(place, data.reshape(-1))
+        self.file.values_bytes = -1
+
+    def _store(self, column: Column, value: Any) -> None:
+        """The whole of a column that does not grow."""
+        variable = self._content[column.name]
+        if column.dtype == "str":
+            variable[...] = np.asarray(value, dtype=object)
+            return
+        values = value if isinstance(value, PiecedArray) else np.asarray(value, variable.dtype)
+        if column.when is When.END and column.dims and variable.shape != values.shape:
+            for dim, length in zip(column.dims, values.shape, strict=True):
+                self._lengthen(dim, length)
+        _fill(variable, values)
+
+
+def _fill(variable: Any, values: Array | PiecedArray) -> None:
+    """Writes all of a variable, as it comes."""
+    if isinstance(values, PiecedArray):
+        for place, tile in values.tiles(CHUNK_BYTES):
+            variable[place] = tile
+    elif values.size:
+        variable[...] = values
+
+
+def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
+    """Entries, (entry, ...), chunk by chunk along their first dimension, and where each begins."""
+    if isinstance(entries[0], PiecedArray):
+        for n, rows in enumerate(entries[0].rows(chunks[1])):
+            yield n * chunks[1], rows[None]
+        return
+    # A large one is stored as it is, not copied.
+    values = np.stack(entries) if len(entries) > 1 else np.asarray(entries[0])[None]
+    if values.ndim == 1:
+        yield 0, values
+        return
+    for first in range(0, max(1, values.shape[1]), chunks[1]):
+        yield first, values[:, first : first + chunks[1]]
+
+
+def _chunks(
+    column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]
+) -> tuple[int, ...]:
+    inner = [max(1, sizes[dim]) for dim in column.dims[1:]]
+    entry = int(np.prod(inner)) * np.dtype(column.dtype).itemsize
+    if inner:  # parts of equal size, so that the last one wastes nothing
+        inner[0] = -(-inner[0] // -(-entry // CHUNK_BYTES))
+    return max(1, min(CHUNK_BYTES // entry, planned[column.dims[0]])), *inner
+
+
+def _padded(part: Array, shape: tuple[int, ...]) -> Array:
+    """The part of an array at the beginning of a whole chunk."""
+    if part.shape == shape:
+        return part
+    whole = np.zeros(shape, part.dtype)
+    whole[tuple(slice(n) for n in part.shape)] = part
+    return whole
+
+
+FIRST_S, EVERY_S, SHARE = 1.0, 1.0, 50
+"""What is over by then leaves no store; so far apart are commits at least, in seconds and in times
+what the last one cost."""
+FINAL_STATE = "final_state"
+"""The group of the file with what a run needs to be gone on with to more steps."""
+WAITING = "waiting."
+
+
+class NetcdfSink(KeepingSink):
+    """Writes beside `path`, first under a temporary name, after a second as the records of an
+    unfinished run; `finish` makes it the result. `origin` says of the run where it comes from.
+
+    Raises StorageError where anything cannot be written; what was kept until then stays kept.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        replace: bool = False,
+        compression: str = "none",
+        *,
+        origin: Mapping[str, Any] | None = None,
+        first_s: float = FIRST_S,
+    ) -> None:
+        self._destination = Destination(path, replace=replace)
+        self._compress, self._first_s = compression == "zlib", first_s
+        self._origin = {"replace": replace, **(origin or {})}
+        self._file: NetcdfFile | None = None
+        self.unfinished: UnfinishedRun | None = None
+
+    @property
+    def written(self) -> Path:
+        """Where the result is, once it is finished: beside `path` where that was taken."""
+        return self._destination.written
+
+    @property
+    def kept(self) -> bool:
+        """Whether there is something to go on with."""
+        return self.unfinished is not None and self.unfinished.kept
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """Opens the file, so that what cannot be written is known before the first step."""
+        path = self._destination.path
+        if not path.absolute().parent.is_dir():
+            raise StorageError(f"{path}: there is no folder {path.parent}")
+        with self._storing():
+            disk = self._destination.temporary()
+            self._temporary = Path(disk.name)
+            self._file = NetcdfFile(PagedFile(disk), columns, compress=self._compress)
+            self._file.make(sizes, planned)
+        self._next = time.perf_counter() + self._first_s
+
+    def go_on(
+        self, unfinished: UnfinishedRun, standing: Standing, columns: list[Column], compression: str
+    ) -> None:
+        """Takes up an unfinished run instead of beginning."""
+        self.unfinished, self._temporary = unfinished, unfinished.records
+        file = unfinished.file(read_only=False)
+        file.verify()
+        with self._storing():
+            file.forget()
+            self._file = reopened(file, columns, standing, compress=compression == "zlib")
+        self._next = time.perf_counter() + EVERY_S
+
+    def conclude(self, unfinished: UnfinishedRun) -> None:
+        """Takes up a run that is finished but for its name."""
+        self.unfinished, self._temporary = unfinished, unfinished.records
+        file, status = unfinished.file(read_only=False), unfinished.facts["finished"]
+        with self._storing():
+            settled = is_whole(file.disk)
+            if settled and not file.is_settled():
+                raise damaged(unfinished.records, "it is another result")
+            self._complete(file, status, settled=settled)
+
+    def put(self, values: Values) -> None:
+        """Into the file, by whole chunks."""
+        with self._storing() as file:
+            file.put(values)
+
+    def due(self) -> bool:
+        """After a second, and then about once a second."""
+        return time.perf_counter() >= self._next
+
+    def keep(self, standing: Standing) -> None:
+        """One commit: what it returns from outlives the process and the machine."""
+        begun = time.perf_counter()
+        with self._storing() as file:
+            if self.unfinished is None:
+                output, disk = self._destination.path.absolute(), file.file.disk
+                self.unfinished = UnfinishedRun.begin(output, self._temporary, disk)
+                self._temporary = self.unfinished.records
+            file.flush()
+            about = standing.about | {"origin": self._origin}
+            said = Standing(about, standing.facts, standing.arrays)
+            self.unfinished.keep(said, file.file, file.waiting, file.written)
+        now = time.perf_counter()
+        self._next = now + max(EVERY_S, SHARE * (now - begun))
+
+    def suspend(self, standing: Standing) -> None:
+        """Keeps it and leaves it."""
+        self.keep(standing)
+        self.abandon()
+
+    def note_end(self, standing: Standing) -> None:
+        """As a group of the file."""
+        with self._storing() as file:
+            file.add_group(FINAL_STATE, json.dumps(standing.facts), standing.arrays)
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Completes the file, seals and syncs it, reads it back, and gives it its name; then the
+        store goes."""
+        with self._storing() as file:
+            file.finish(attributes)
+            file.file.check()
+            if self.unfinished:
+                self.unfinished.conclude(file.file, attributes["status"])
+            self._complete(file.file, attributes["status"])
+
+    def _complete(self, file: PagedFile, status: str, *, settled: bool = False) -> None:
+        """The last steps, from a file that is whole with its pages. Raises OSError."""
+        if not settled:
+            file.verify()
+            file.settle()
+        try:
+            self._destination.take(self._temporary, status)
+        finally:
+            if self.unfinished and not self._temporary.exists():
+                self.unfinished.remove()
+            file.disk.close()
+
+    def abandon(self) -> None:
+        """Removes the file; if it was kept, only what came after."""
+        if self._file is None:
+            return
+        self._file.give_up()
+        if self.unfinished:
+            self.unfinished.close()
+        else:
+            self._file.file.disk.close()
+            with suppress(OSError):
+                self._temporary.unlink(missing_ok=True)
+
+    @contextmanager
+    def _storing(self) -> Iterator[Any]:
+        path = self._destination.path
+        try:
+            yield self._file
+            if self._file:
+                self._file.file.check()
+        except StorageError:
+            self.abandon()
+            raise
+        except (OSError, RuntimeError, ValueError) as error:
+            reason = self._reason(error)
+            self.abandon()
+            raise WriteError(f"{path}: cannot be written: {reason}") from None
+
+    def _reason(self, error: Exception) -> str:
+        """The disk's own, where it has one: the library says little."""
+        try:
+            if self._file:
+                self._file.file.check()
+        except OSError as first:
+            error = first
+        full = is_full(self._destination.path.absolute().parent)
+        if full or getattr(error, "errno", None) == errno.ENOSPC:
+            return FULL
+        return str(getattr(error, "strerror", None) or error)
+
+
+def reopened(
+    file: PagedFile, columns: list[Column], standing: Standing, *, compress: bool
+) -> NetcdfFile:
+    """The dataset in the file of an unfinished run, with what waited."""
+    found = NetcdfFile(file, columns, compress=compress)
+    waiting = {
+        name.removeprefix(WAITING): list(array)
+        for name, array in standing.arrays.items()
+        if name.startswith(WAITING)
+    }
+    written = standing.facts.get("written")
+    if not isinstance(written, dict) or not {*waiting} <= {*written} == {*found.waiting}:
+        raise StorageError("the store holds another dataset than the experiment makes")
+    try:
+        found.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
+    except StorageError:
+        raise
+    except Exception as error:  # whatever the libraries below make of it
+        raise StorageError(f"the store holds a damaged file: {error}") from None
+    return found

@@ -1,0 +1,429 @@
+"""What stands where a result was wanted, by its content, and which command takes it.
+
+One member of the dataset of a sweep, chosen by its parameters.
+
+Opens result files.
+
+The dataset of a run that is not finished, as far as it was kept; nothing is written.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import (
+    ExperimentError,
+    PbdkitError,
+    PbdkitWarning,
+    StorageError,
+    WriteError,
+    did_you_mean,
+)
+from pbdkit.io.checkpoint import STORE, UnfinishedRun, has_committed, put_together
+from pbdkit.io.layout import SCHEMA_VERSION, Column, Values, base_columns, carried, in_this_layout
+from pbdkit.io.netcdf import NetcdfFile, reopened
+from pbdkit.io.recorder import Outcome, Recorder, Seen, columns_of
+from pbdkit.io.seal import BrokenSealError, SealedFile, opened, opened_in, seal_of
+from pbdkit.io.sinks import Sink
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.reading import EXPERIMENT, Source, kind_of, read_file, what_takes, with_value
+from pbdkit.model.shipped import shipped_names
+from pbdkit.plugin.discovery import one_line, refuse_retired
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.untrusted_files import BEGINNINGS, opened_unsealed, try_reading
+
+if TYPE_CHECKING:
+    import xarray
+
+
+TEXTS = (".yaml", ".yml", ".json")
+FAULTY = "faulty"
+"""The kind of what is no text, or of a text at fault."""
+
+
+def refuse_other_file(path: Path) -> None:
+    """Raises ExperimentError where it is known what a path leads to, and that is no result."""
+    if told := other_file(path):
+        raise ExperimentError(f"{path}: {told}")
+
+
+def other_file(path: Path) -> str:
+    """What it is and what takes it; empty for results, for nothing and for what nobody knows."""
+    if path.is_dir():
+        inner = path / "sweep.nc"
+        sweep = f"is the folder of a sweep; its dataset is {inner}"
+        return sweep if inner.is_file() else "is a folder, no result of pbdkit"
+    if not path.is_file():
+        known = path.as_posix() in shipped_names()
+        return f"is a shipped experiment; `pbdkit run {path}` makes a result of it" * known
+    kind = _kind_of_text(path)
+    if kind is None:
+        return ""
+    if kind == FAULTY:
+        return "is no result, by its name an experiment" if path.suffix in TEXTS else ""
+    if kind == EXPERIMENT:
+        return f"is an experiment; `pbdkit run {path}` makes a result of it, and says where"
+    takes = f"is {kind}, no result; {what_takes(kind, str(path))}"
+    return takes if kind else "is no result: those end in .nc"
+
+
+def is_experiment(path: Path) -> bool:
+    """Return whether a path leads to an experiment, in a file or shipped: one that cannot be read
+    is told by its name."""
+    if not path.is_file():
+        return path.as_posix() in shipped_names()
+    kind = _kind_of_text(path)
+    return kind == EXPERIMENT or (kind == FAULTY and path.suffix in TEXTS)
+
+
+def _kind_of_text(path: Path) -> str | None:
+    """What a text describes, FAULTY where it is no text of YAML; None for results, and what cannot
+    be read."""
+    try:
+        with path.open("rb") as file:
+            if file.read(8).startswith(BEGINNINGS):
+                return None
+        return kind_of(read_file(path).data)
+    except OSError:
+        return None
+    except ExperimentError:  # no text, or text that is at fault
+        return FAULTY
+
+
+def refuse_store(path: Path) -> None:
+    """Raises ExperimentError for the store of an unfinished run in place of its output."""
+    if path.name.endswith(STORE) and path.is_file():
+        output = path.with_name(path.name.removesuffix(STORE))
+        raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")
+
+
+SWEEP, STATUS = "sweep", "status"
+"""The attribute that only datasets of sweeps have, and the variable along all their dimensions."""
+TEXT = "_text"
+"""Added to the name of a dimension for the values that it counts, as text."""
+PARAMETER = "parameter"
+"""The attribute of a coordinate that names a parameter by its path in the experiment."""
+SHOWN = 6
+"""So many values are listed in messages."""
+
+
+def type_alone(text: str) -> str:
+    """Return of a part that has nothing but its type, that; else the text as it is."""
+    with suppress(ValueError, RecursionError):
+        part = json.loads(text)
+        if isinstance(part, dict) and part.keys() == {"type"}:
+            return str(part["type"])
+    return text
+
+
+def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset:
+    """Return the part of a sweep in which parameters have these values.
+
+    Where every parameter is chosen, the dataset carries the experiment of that member, and its
+    title names the choice.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The dataset of a sweep.
+    choice : mapping
+        Values by the names of parameters, which are numbers, or texts such as the `type` of a part.
+
+    Raises
+    ------
+    ExperimentError
+        For a dataset of one run, a name that is no parameter, and a value that no member has.
+    """
+    if SWEEP not in dataset.attrs:
+        raise ExperimentError(
+            f"{', '.join(choice)}: there is nothing to choose, as this is the result of one run"
+        )
+    chosen: dict[str, int] = {}
+    for name, value in choice.items():
+        dim, row = _place(dataset, name, value)
+        if chosen.setdefault(dim, row) != row:
+            raise ExperimentError(f"{name}={value}: no member has this with the other choices")
+    found = dataset.isel(chosen)
+    words = ", ".join(f"{name}={value}" for name, value in choice.items())
+    title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
+    found = found.assign_attrs(title=title) if choice else found
+    return found if found[STATUS].ndim else _with_experiment(found)
+
+
+def choices(dataset: xarray.Dataset) -> str:
+    """Return what can be chosen, as messages list it: ``steel: 1, 2, 3; rule: barycentre``."""
+    parts = []
+    for dim in map(str, dataset[STATUS].dims):
+        shown = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
+        more = ", ..." if dataset.sizes[dim] > SHOWN else ""
+        parts.append(f"{dim}: {', '.join(shown)}{more}")
+    return "; ".join(parts)
+
+
+def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
+    """The values along a dimension, or of a parameter beside it."""
+    for label in (f"{name}{TEXT}", name):
+        if label in dataset.coords:
+            return np.asarray(dataset[label].values)
+    return np.arange(dataset.sizes[name])
+
+
+def _word(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else type_alone(str(value))
+
+
+def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
+    """The dimension of a parameter, and the place along it of the value."""
+    grid = [str(dim) for dim in dataset[STATUS].dims]
+    beside = {str(n): str(c.dims[0]) for n, c in dataset.coords.items() if c.ndim == 1}
+    known = {dim: dim for dim in grid} | {n: dim for n, dim in beside.items() if dim in grid}
+    if name not in known:
+        hint = did_you_mean(name, known)
+        raise ExperimentError(f"{name}: is no parameter of this sweep{hint} ({choices(dataset)})")
+    labels = _labels(dataset, name)
+    rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
+    if not rows:
+        near = ", ".join(map(_word, labels.tolist()[:SHOWN]))
+        raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
+    return known[name], rows[0]
+
+
+def _is_alike(label: Any, value: Any) -> bool:
+    if isinstance(label, str):
+        return str(value) in (label, type_alone(label))
+    with suppress(TypeError, ValueError):
+        return bool(np.isclose(float(value), float(label), rtol=1e-6, atol=0.0))
+    return False
+
+
+def _with_experiment(one: xarray.Dataset) -> xarray.Dataset:
+    """The member with its experiment, and without the times that only others reached."""
+    source = Source(data=carried(one, SWEEP).get("experiment"))
+    for name, coordinate in one.coords.items():
+        path = coordinate.attrs.get(PARAMETER)
+        if path is None or coordinate.ndim or f"{name}{TEXT}" in one.coords:
+            continue
+        value, units = coordinate.item(), str(coordinate.attrs.get("units", "1"))
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = json.loads(value)
+        written = f"{value!r} {units}" if units != "1" and "unit" not in units else value
+        source = with_value(source, str(path), written, str(name), Experiment.defaults())
+    growing = [n for n, v in one.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"]
+    found = one.dropna("time", how="all", subset=growing) if growing else one.copy()
+    attributes = {name: value for name, value in one.attrs.items() if name != SWEEP}
+    found.attrs = attributes | {"experiment": json.dumps(source.data)}
+    return found
+
+
+UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
+
+
+def open(path: str | Path) -> xarray.Dataset:
+    """The dataset in a result file; its values are read, and checked, when they are used. Of a run
+    that is not finished, what was kept of it last, with the status "interrupted".
+
+    Raises ExperimentError for an experiment and a sweep, and StorageError where there is no such
+    file, where it is not as it was written, where it cannot be read as netCDF, where pbdkit did not
+    make it, where variables are missing, or where a newer pbdkit made it than this one can read. A
+    change that is met later, as values are read, raises StorageError too. Warns, with
+    pbdkit.PbdkitWarning, of a file without a seal, which is first read once in another process.
+    """
+    if not isinstance(path, str | Path):
+        raise ExperimentError(
+            f"open: expected the path of a result, got an object of type {type(path).__name__}"
+        )
+    file = Path(path)
+    left = _output_of(file)
+    if not left:
+        refuse_other_file(file)
+        refuse_no_file(file)
+    try:
+        dataset = in_this_layout(_unfinished(left) if left else _opened(file))
+    except PbdkitError:
+        raise
+    except Exception as error:  # whatever the libraries below make of a damaged file
+        if not left:
+            with SealedFile(file) as content:
+                content.check()
+        reason = getattr(error, "strerror", None) or error
+        raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
+    if fault := fault_of(dataset):
+        dataset.close()
+        raise StorageError(f"{file}: {fault}")
+    return dataset
+
+
+def refuse_no_file(file: Path) -> None:
+    """Raises StorageError where there is no plain file of that name."""
+    if file.is_dir():
+        raise StorageError(f"{file}: is a folder, no result of pbdkit")
+    if not file.is_file():
+        what = (
+            "is no plain file, and no result of pbdkit"
+            if file.exists()
+            else "there is no such file"
+        )
+        raise StorageError(f"{file}: {what}")
+
+
+def _opened(file: Path) -> xarray.Dataset:
+    with file.open("rb", buffering=0) as start:
+        sealed = seal_of(start) is not None
+    if not sealed:
+        try_reading(file)
+        dataset = opened_unsealed(file)
+        warnings.warn(f"{file}: {UNSEALED}", PbdkitWarning, stacklevel=3)
+        return dataset
+    import xarray
+
+    return _dataset(xarray.backends.CachingFileManager(opened, file.absolute(), mode="r"))
+
+
+def _dataset(content: Any) -> xarray.Dataset:
+    import xarray
+    from xarray.backends import StoreBackendEntrypoint
+
+    # Times are steps: nothing is to be decoded as a date, as in the dataset that `run` returns.
+    store = xarray.backends.H5NetCDFStore(content)
+    return xarray.open_dataset(store, engine=StoreBackendEntrypoint, decode_times=False)
+
+
+def _unfinished(output: Path) -> xarray.Dataset:
+
+    return _dataset(unfinished_dataset(output))
+
+
+def _output_of(file: Path) -> Path | None:
+    """The output of the unfinished run that is meant, by its own name or that of its store."""
+    if file.name.endswith(STORE) and file.is_file():
+        return file.with_name(file.name.removesuffix(STORE))
+    return file if not file.exists() and has_committed(file) else None
+
+
+@contextmanager
+def reading(
+    path: str | Path, *, sweeps: bool = False, at: Mapping[str, str] | None = None
+) -> Iterator[xarray.Dataset]:
+    """The dataset of a run in a result file, or with `sweeps` of either, to be read from in the
+    block; `at` chooses among the members of a sweep.
+
+    Raises ExperimentError for that of a sweep otherwise, what `open` does, and StorageError for
+    whatever reading and using its values raises: files are sound when written. Another file that
+    cannot be written in the block, a WriteError, is no fault of this one.
+    """
+    with open(path) as whole:
+        dataset = _chosen(whole, path, at) if at else whole
+        if SWEEP in dataset.attrs and not sweeps:
+            raise ExperimentError(
+                f"{path}: holds all members of a sweep, and this looks at one run; choose one with "
+                f"--at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE) ({choices(dataset)})"
+            )
+        try:
+            yield dataset
+        except (BrokenSealError, WriteError):
+            raise
+        except (ExperimentError, StorageError) as error:
+            raise type(error)(f"{path}: {'; '.join(str(error).splitlines())}") from None
+        except (PbdkitError, MemoryError):
+            raise
+        except Exception as error:
+            told = f"{type(error).__name__}: {error}"
+            raise StorageError(f"{path}: is damaged, or was changed: {one_line(told)}") from error
+
+
+def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) -> xarray.Dataset:
+    try:
+        return member(dataset, at)
+    except ExperimentError as error:
+        raise ExperimentError(f"{path}: --at {error}") from None
+
+
+def fault_of(dataset: xarray.Dataset) -> str | None:
+    """Why this pbdkit cannot read it, if it cannot."""
+    version = dataset.attrs.get("schema_version")
+    if version is None:
+        return "is no dataset of pbdkit: it has no attribute schema_version"
+    try:
+        newer = [int(part) for part in str(version).split(".")] > [int(SCHEMA_VERSION)]
+    except ValueError:
+        return f"has the schema_version '{version}', which no pbdkit writes"
+    if newer:
+        return (
+            f"has schema_version {version}, and this pbdkit reads up to {SCHEMA_VERSION}; "
+            "install a newer pbdkit"
+        )
+    if SWEEP in dataset.attrs:
+        missing = [name for name in ("status", "message") if name not in dataset.variables]
+        return f"has no variable '{missing[0]}': it is damaged, or was changed" if missing else None
+    for column in base_columns():
+        dims = dataset[column.name].dims if column.name in dataset.variables else None
+        if dims != column.dims:
+            what = "has no" if dims is None else f"has other dimensions, {dims}, of"
+            return f"{what} variable '{column.name}': it is damaged, or was changed"
+    return None
+
+
+class Overlay(Sink):
+    """Puts the end of a dataset over a file that stays as it is."""
+
+    def __init__(self, file: NetcdfFile) -> None:
+        self._file = file
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """It has begun."""
+
+    def put(self, values: Values) -> None:
+        """Over the file."""
+        self._file.put(values)
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Over the file."""
+        self._file.finish(attributes)
+
+    def abandon(self) -> None:
+        """Nothing was written."""
+
+
+def unfinished_dataset(output: Path) -> Any:
+    """The content as an h5netcdf.File, with status "interrupted", at the last commit: what was
+    recorded until then, its state and what is known at the end of a run.
+
+    Raises StorageError, and what building the experiment's scene raises.
+    """
+    left = UnfinishedRun.open(output, writing=False)
+    facts, file = left.facts, left.file(read_only=True)
+    if "finished" in facts:
+        left.release()
+        return opened_in(file)
+    standing = left.standing()
+    left.release()
+    try:
+        parts = json.loads(standing.about["experiment"])
+        kinds: dict[str, type] = {"State": State, "Seen": Seen}
+        state = put_together(facts["run"]["state"], standing.arrays, kinds)
+        seen = put_together(facts["seen"], standing.arrays, kinds)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise StorageError(f"{output}: its store is damaged: {error}") from None
+    refuse_retired(parts, f"{output}, which is unfinished,")
+    scene = build_scene(Experiment.build(Source(f"{output}, unfinished", parts)))
+    if not isinstance(state, State) or not state.fits(initial_state(scene)):
+        raise StorageError(f"{output}: its store holds a state of another experiment")
+    compress = scene.experiment.record.compression == "zlib"
+    making = reopened(file, columns_of(scene), standing, compress=compress)
+    recorder = Recorder(scene, Overlay(making))
+    recorder.seen = seen
+    reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
+    with suppress(FloatingPointError):  # a state that is not finite is not shown
+        recorder.observe(state, last=True)
+    recorder.finish(state, Outcome("interrupted", reason, state.step), {})
+    return opened_in(file)

@@ -1,0 +1,310 @@
+"""The first bytes of the records of an unfinished run: which store they belong to, and how many
+commits it holds.
+
+The file that the HDF5 library writes into: nothing that was committed is ever overwritten.
+
+Arrays that come piece by piece, because nobody holds the whole.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+import time
+from bisect import bisect_right
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from pbdkit.errors import StorageError
+from pbdkit.io.atomic_file import NewFile, write_all
+from pbdkit.io.seal import BLOCK, BrokenSealError, Extent, digest, is_whole, put_seal
+
+MAGIC = b"pbdkit-r"
+HDF5 = b"\x89HDF\r\n\x1a\n"
+LAYOUT = struct.Struct("<8s16sQ")
+HEADER_BYTES = LAYOUT.size + 8
+"""They end with a digest. HDF5's superblock, which lies here in the finished file, is longer; until
+then it is in a page of the store."""
+TRIES, PAUSE_S = 3, 0.02
+"""A reader may meet a header that is just being written."""
+
+
+class Header(NamedTuple):
+    """The identity of a store, and the number of commits that returned."""
+
+    identity: bytes
+    commits: int
+
+
+SETTLED = Header(b"", 1)
+"""Stands for the beginning of a file that is settled for its end, which follows a commit."""
+
+
+def write_header(file: io.FileIO, header: Header) -> None:
+    """Write the header into open records, in one sector of the disk. Raises OSError."""
+    fields = LAYOUT.pack(MAGIC, *header)
+    file.seek(0)
+    write_all(file, fields + xxhash.xxh3_64_digest(fields))
+
+
+def read_header(file: io.FileIO) -> Header | None:
+    """Read the header of open records; None where none was written yet.
+
+    Raises StorageError where other bytes stand there, and OSError.
+    """
+    for _ in range(TRIES):
+        file.seek(0)
+        data = file.read(HEADER_BYTES)
+        if not data.strip(b"\0"):
+            return None
+        if data.startswith(HDF5):
+            return SETTLED
+        fields = data[: LAYOUT.size]
+        if data.startswith(MAGIC) and data[LAYOUT.size :] == xxhash.xxh3_64_digest(fields):
+            return Header(*LAYOUT.unpack(fields)[1:])
+        time.sleep(PAUSE_S)
+    raise StorageError(f"{file.name}: is damaged: its first bytes are not what was written")
+
+
+PAGE = 4096
+LARGE_BYTES = 2**16
+"""What is written in one go and is larger goes to the disk at once."""
+
+
+class PagedFile(NewFile):
+    """A file on the disk, and pages in memory that lie over it.
+
+    What is large goes to the disk as it comes, behind all that was there at the last `commit`, and
+    each extent of it once. All else, what the library notes of its variables, stays in memory until
+    `settle`. So the bytes on the disk, with the pages, extents and size of a commit, are the file
+    as it was then, whatever is written afterwards. With `read_only` everything stays in memory.
+
+    Extents that are handed over are checked before a byte of them is given out: BrokenSealError.
+    """
+
+    def __init__(
+        self,
+        disk: io.FileIO,
+        size: int = 0,
+        pages: Mapping[int, bytes] | None = None,
+        extents: Sequence[Extent] = (),
+        *,
+        read_only: bool = False,
+    ) -> None:
+        super().__init__(disk)
+        self.size = size
+        self.pages = {number: bytearray(page) for number, page in (pages or {}).items()}
+        """By number."""
+        self.extents = list(extents)
+        """What lies on the disk, by place."""
+        self.changed: set[int] = set()
+        """The pages written since the last commit."""
+        self.values_bytes = -1
+        """So many bytes in one go are values, too, however few."""
+        self.noted = len(self.extents)
+        """So many of them were there at the last commit."""
+        self._unchecked = {extent.start for extent in extents}
+        self._append_from, self._place = (2**63 if read_only else size), 0
+
+    @property
+    def added(self) -> list[Extent]:
+        """The extents written since the last commit."""
+        return self.extents[self.noted :]
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """As in any file."""
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.size}[whence]
+        self._place = max(0, start + offset)
+        return self._place
+
+    def truncate(self, size: int | None = None) -> int:
+        """As in any file; the disk hears of it when all is settled."""
+        self.size = self._place if size is None else size
+        return self.size
+
+    def readinto(self, buffer: Any) -> int:
+        """From the pages, and from the disk where there is none."""
+        view = memoryview(buffer).cast("B")
+        view = view[: max(0, self.size - self._place)]
+        self.verify(self._place, self._place + len(view))
+        view[:] = self._on_disk(self._place, len(view))
+        for page, inside, outside in _overlaps(self._place, len(view), self.pages):
+            view[outside] = self.pages[page][inside]
+        self._place += len(view)
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        """To the disk what is large and new, into pages what is not."""
+        view = memoryview(data).cast("B")
+        values = len(view) >= LARGE_BYTES or len(view) == self.values_bytes
+        to_disk = values and self._place >= self._append_from
+        if to_disk:
+            self._append(view)
+        there = self.pages if to_disk else None
+        for page, inside, outside in _overlaps(self._place, len(view), there):
+            if page not in self.pages:
+                self.pages[page] = bytearray(self._on_disk(page * PAGE, PAGE))
+            self.pages[page][inside] = view[outside]
+            self.changed.add(page)
+        self._place += len(view)
+        self.size = max(self.size, self._place)
+        return len(view)
+
+    def verify(self, start: int = 0, stop: int = 2**63) -> None:
+        """Checks the extents that were handed over and of which bytes lie between two places, once
+        each. Raises BrokenSealError."""
+        if not self._unchecked:
+            return
+        first = bisect_right(self.extents, start, key=lambda extent: extent.stop)
+        for extent in self.extents[first:]:
+            if extent.start >= stop:
+                return
+            if extent.start in self._unchecked:
+                if digest(self._on_disk(extent.start, extent.stop - extent.start)) != extent.digest:
+                    where = f"bytes {extent.start} to {extent.stop}"
+                    raise BrokenSealError(f"{self.disk.name}: {where} are not what was written")
+                self._unchecked.discard(extent.start)
+
+    def give_up(self) -> None:
+        """Nothing more goes to the disk."""
+        self.fail(OSError("given up"))
+
+    def forget(self) -> None:
+        """What was written after the last commit, by a process that was killed. Raises OSError."""
+        self.disk.truncate(max((extent.stop for extent in self.extents), default=HEADER_BYTES))
+
+    def commit(self) -> None:
+        """What is there now stays: pages, extents and size were noted elsewhere."""
+        self._append_from = max(self._append_from, self.size)
+        self.noted, self.changed = len(self.extents), set()
+
+    def settle(self) -> None:
+        """Puts the pages in their places, seals the file, syncs it and reads all of it back. Raises
+        OSError where it cannot be written, or is not what was written."""
+        self.check()
+        for number, page in sorted(self.pages.items()):
+            self.disk.seek(number * PAGE)
+            write_all(self.disk, page)
+        self.disk.truncate(self.size)
+        put_seal(self.disk, [self._settled(e) for e in self.extents if e.stop <= self.size])
+        self.sync()
+        if not is_whole(self.disk):
+            raise OSError(f"{self.disk.name}: the disk gives back what was not written")
+
+    def is_settled(self) -> bool:
+        """Whether the pages are in their places on the disk, of which the seal follows the last."""
+        for number, page in self.pages.items():
+            length = min(PAGE, max(0, self.size - number * PAGE))
+            if self._on_disk(number * PAGE, length) != page[:length]:
+                return False
+        return True
+
+    def _settled(self, extent: Extent) -> Extent:
+        """With the digest that it has now, should a page lie over it."""
+        pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
+        if not any(page in self.pages for page in pages):
+            return extent
+        data = self._on_disk(extent.start, extent.stop - extent.start)
+        return extent._replace(digest=digest(data))
+
+    def _append(self, view: memoryview) -> None:
+        self.disk.seek(self._place)
+        self._write_all(view)
+        for start in range(0, len(view), BLOCK):
+            piece = view[start : start + BLOCK]
+            place = self._place + start
+            self.extents.append(Extent(place, place + len(piece), digest(piece)))
+        self._append_from = self.extents[-1].stop
+
+    def _on_disk(self, start: int, length: int) -> bytes:
+        """So many bytes; zero behind the end."""
+        self.disk.seek(start)
+        return self.disk.read(length).ljust(length, b"\0")
+
+
+def _overlaps(
+    begin: int, length: int, among: Container[int] | None = None
+) -> Iterator[tuple[int, slice, slice]]:
+    """The pages that some bytes touch, all or those `among` some: number, part of the page, part of
+    the bytes."""
+    end = begin + length
+    touched = range(begin // PAGE, -(-end // PAGE))
+    for page in touched if among is None else [page for page in touched if page in among]:
+        first, last = max(begin, page * PAGE), min(end, (page + 1) * PAGE)
+        inside = slice(first - page * PAGE, last - page * PAGE)
+        yield page, inside, slice(first - begin, last - begin)
+
+
+Array = NDArray[Any]
+Bytes = NDArray[np.uint8]
+
+
+class PiecedArray:
+    """An array of a shape and dtype, of which the `pieces` come in the order of memory. Who asks
+    for it takes them: that can be done once."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], pieces: Iterable[Array]):
+        self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
+        self.nbytes = math.prod(shape) * dtype.itemsize
+        self._pieces = map(as_bytes, pieces)
+        self._left: Bytes = np.empty(0, np.uint8)
+
+    @classmethod
+    def of(cls, array: Array) -> PiecedArray:
+        """One that is there, as a single piece."""
+        return cls(array.shape, array.dtype, [array])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        """The whole."""
+        whole = self._read(self.nbytes).view(self.dtype).reshape(self.shape)
+        return whole if dtype is None else whole.astype(dtype, copy=False)
+
+    def blocks(self, nbytes: int) -> Iterator[Bytes]:
+        """Of so many bytes each; the last has what is left."""
+        for at in range(0, self.nbytes, nbytes):
+            yield self._read(min(nbytes, self.nbytes - at))
+
+    def rows(self, count: int) -> Iterator[Array]:
+        """So many entries of the first axis each; the last has what is left."""
+        each = math.prod(self.shape[1:]) * self.dtype.itemsize
+        for block in self.blocks(max(1, count * each)):
+            yield block.view(self.dtype).reshape(-1, *self.shape[1:])
+
+    def tiles(self, nbytes: int) -> Iterator[tuple[tuple[Any, ...], Array]]:
+        """Places of it and what stands there, of about so many bytes each: some entries along an
+        axis, the first of two axes or of fewer, else the last but one."""
+        *lead, count = self.shape[: max(1, self.ndim - 1)]
+        inner = self.shape[len(lead) + 1 :]
+        each = math.prod(inner) * self.dtype.itemsize
+        step = max(1, nbytes // max(1, each))
+        for at in np.ndindex(*lead):
+            for first in range(0, count, step):
+                last = min(first + step, count)
+                found = self._read((last - first) * each).view(self.dtype)
+                yield (*at, slice(first, last)), found.reshape(last - first, *inner)
+
+    def drain(self) -> None:
+        """Takes what nobody has asked for."""
+        for _ in self._pieces:
+            pass
+
+    def _read(self, nbytes: int) -> Bytes:
+        """So many bytes more."""
+        found, size = [self._left], self._left.size
+        while size < nbytes:
+            found.append(next(self._pieces))
+            size += found[-1].size
+        whole = np.concatenate(found) if len(found) > 2 or found[0].size else found[-1]
+        self._left = whole[nbytes:]
+        return whole[:nbytes]
+
+
+def as_bytes(array: Array) -> Bytes:
+    """The bytes of an array, in the order of memory."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)

@@ -1,0 +1,85 @@
+"""Write datasets as sealed result files, and refuse names that are taken before any work."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.atomic_file import kind_of, written
+from pbdkit.io.checkpoint import make_room
+from pbdkit.io.open import fault_of
+from pbdkit.io.paged_file import PagedFile
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> Path:
+    """Write a dataset as a sealed result, as `pbdkit run` does, and return the path.
+
+    The file appears whole or not at all, and `pbdkit.open`, `pbdkit verify` and all commands take
+    it.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of a run or a sweep.
+    path : str or path
+        The name of the file, which ends in .nc by custom.
+    force : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    ExperimentError
+        For a name that is taken, and a dataset that lacks what a result has.
+    StorageError
+        Where the file cannot be written.
+    """
+    file = Path(path)
+    refuse_taken(file, force=force)
+    if fault := fault_of(dataset):
+        raise ExperimentError(
+            f"save: the dataset {fault.partition(':')[0]}, which a result needs; parts and tables "
+            "of a result are written by `to_netcdf`"
+        )
+    write_dataset(dataset, file, replace=force)
+    return file
+
+
+def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None:
+    """Write a dataset whole and sealed, or not at all. Raises WriteError."""
+    import h5netcdf
+    import h5py
+    from xarray.backends import H5NetCDFStore
+
+    plain = dataset.drop_encoding()
+    for name, variable in dataset.variables.items():
+        if variable.encoding.get("zlib"):
+            plain[name].encoding["zlib"] = True
+    with (
+        written(path, PagedFile, replace=replace) as file,
+        h5py.File(file, "w", track_order=True) as content,
+        h5netcdf.File(content, "w") as made,
+    ):
+        plain.dump_to_store(H5NetCDFStore(made, autoclose=False))
+
+
+def refuse_taken(path: Path, *, force: bool) -> None:
+    """Raise ExperimentError where no file is to be written: beside an unfinished run and over a
+    file without `force`, and over what is no plain file."""
+    try:
+        kind = kind_of(path)
+    except OSError as error:
+        raise ExperimentError(f"{path}: cannot be written: {error.strerror}") from None
+    if kind:
+        raise ExperimentError(f"{path}: is {kind}, which is not replaced; name another file")
+    if os.path.lexists(path) and not force:
+        raise ExperimentError(f"{path}: exists; force=True replaces it")
+    if not make_room(path, discard=force):
+        raise ExperimentError(
+            f"{path}: an unfinished run of it is here; pbdkit.resume({str(path)!r}) goes on with "
+            "it, force=True discards it"
+        )

@@ -1,0 +1,1 @@
+"""Particles on rasters: sites, neighbourhoods, cells and selections of a lattice."""

@@ -1,0 +1,3 @@
+"""The experiment: read, checked, and kept with the places where it was written."""
+
+from __future__ import annotations

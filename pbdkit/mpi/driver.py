@@ -1,0 +1,419 @@
+"""The engine of one part: steps it by any other engine, and renews its halo in time.
+
+The driver of a part: what all processes decide together about a run.
+
+The rows of a part, in the search for an equilibrium.
+
+The driver of a part for the solver `equilibrium`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.equilibrium.certificate import Certificate, Settling
+from pbdkit.equilibrium.solve import Way
+from pbdkit.equilibrium.system import Rows, Strip, StuckError
+from pbdkit.errors import NotSharedError
+from pbdkit.model.solver import Settle
+from pbdkit.mpi.communicator import Ranks
+from pbdkit.mpi.partition import (
+    MOST_STEPS,
+    Halo,
+    Subdomain,
+    farthest_apart,
+    part_of,
+    part_of_state,
+    reaches,
+    subdomains,
+)
+from pbdkit.plugin import Draws
+from pbdkit.progress import StoppedError, Watch
+from pbdkit.scene.memory_estimate import asks_for_grids
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.simulation import SECONDS_A_VALUE, Driver, Stepwise, Straight
+from pbdkit.stepping.divergence import EVERY, Guard, most_of, size_of
+from pbdkit.stepping.engine_choice import Choice, choose, make_engine
+from pbdkit.stepping.leaders import steady_steps
+from pbdkit.stepping.numba_engine.time_skewing import Skew
+from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.state import State, initial_state
+
+
+class DividedStepper(Engine):
+    """Makes as many steps at once as the halo serves for, and as no leaders begin to lead in: where
+    they begin is taken from a state that is whole."""
+
+    def __init__(self, ranks: Ranks, scene: Scene, engine: Engine, halo: Halo, steps: int) -> None:
+        self.name, self.threads = engine.name, engine.threads
+        self._ranks, self._scene, self._engine = ranks, scene, engine
+        self._halo, self._steps = halo, steps
+
+    def advance(self, state: State, steps: int = 1) -> State:
+        """Every process its own part. What one raises all of them do."""
+        end = state.step + steps
+        while state.step < end:
+            most = min(self._steps, end - state.step)
+            count = steady_steps(self._scene, state.step + 1, most, moving=True)
+            error: Exception | None = None
+            try:
+                state = self._engine.advance(state, count)
+            except Exception as raised:
+                error = raised
+            self._ranks.raise_first(error)
+            self._halo.renew(state)
+            for rows in self._halo.received.values():
+                self._engine.renewed(state, rows)
+        return state
+
+
+def whole_of(ranks: Ranks, scene: Scene) -> Scene | None:
+    """The scene that processes have parts of, in the first of them."""
+    if not ranks.first:
+        return None
+    return build_scene(scene.experiment) if scene.raster.extent else scene
+
+
+class Division:
+    """A scene cut up among processes: this one's part, and how a state of it is put together with
+    those of the others. The first process keeps the `whole` scene where somebody looks at that."""
+
+    def __init__(self, ranks: Ranks, scene: Scene, parts: list[Subdomain]) -> None:
+        self.ranks, self.count, self.subdomains = ranks, scene.raster.total, parts
+        self.part = part_of(scene, self.subdomains[ranks.rank])
+        self.scene, experiment = self.part.scene, scene.experiment
+        self.halo = Halo(ranks, self.subdomains, self.part)
+        self.whole: Scene | None = None
+        measured = any(not each.local for each in experiment.diagnostics)
+        with ranks.agreeing():
+            if measured or experiment.stepping.settle:
+                self.whole = self.whole_of(scene)
+
+    def whole_of(self, scene: Scene) -> Scene | None:
+        """The scene that others have parts of, in the first process."""
+        return self.whole or whole_of(self.ranks, scene)
+
+    def begun(self, scene: Scene) -> tuple[State, bool]:
+        """The part of the state at time 0, and whether it can be made again from the part alone:
+        random numbers are drawn for the whole, by the first process."""
+        experiment, whole = scene.experiment, None
+        draws = any(isinstance(part, Draws) for part in (experiment.rule, experiment.fracture))
+        if not (experiment.initial.is_drawn or draws):
+            state, at_rest = initial_state(self.scene), experiment.initial.at_rest
+            if not at_rest:
+                self.halo.renew(state)
+            return state, at_rest
+        with self.ranks.agreeing():
+            if found := self.whole_of(scene):
+                whole = initial_state(found)
+        return self.dealt(whole), False
+
+    def dealt(self, whole: State | None) -> State:
+        """The part of a state that the first process has."""
+        members = self.ranks.every(self.halo.members)
+        if whole is None or not self.ranks.first:
+            return self._state(None)
+        axes = self.scene.axes
+        parts = zip(self.subdomains, members, strict=True)
+        return self._state(part_of_state(whole, axes, own, some) for own, some in parts)
+
+    def _state(self, each: Iterable[State] | None) -> State:
+        found: State = self.ranks.dealt(each)
+        return found
+
+    def gathered(self, state: State) -> State | None:
+        """The whole state, in the first process."""
+        return self.halo.gathered(state)
+
+    def standing(self, own: dict[str, Any]) -> dict[str, Any]:
+        """That of a driver of the part with the state of the whole, as it is joined."""
+        return own | {"state": self.halo.joined(own["state"])}
+
+    def taken_up(self, standing: Mapping[str, Any]) -> dict[str, Any]:
+        """For the part, where the first process has that of the whole."""
+        rest = self.ranks.told({key: part for key, part in standing.items() if key != "state"})
+        state = self.dealt(standing.get("state") if self.ranks.first else None)
+        return {**rest, "state": state}
+
+    def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
+        """Of the part: a thread a process, unless more are asked for."""
+        if self.scene.experiment.stepping.threads == "auto":
+            choice = replace(choice, threads=1)
+        with self.ranks.agreeing():
+            engine, choice = make_engine(self.scene, choice)
+        steps = self.part.subdomain.steps
+        return DividedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
+
+
+class DividedWatch(Watch):
+    """All stop where one is asked to; the first shows how far the run is."""
+
+    def __init__(self, ranks: Ranks, watch: Watch) -> None:
+        super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
+
+
+@dataclass
+class DividedGuard(Guard):
+    """Looks at all parts."""
+
+    ranks: Ranks
+
+    def most(self, state: State) -> float:
+        """The largest of all."""
+        return self.ranks.most(super().most(state))
+
+    def worst(self, scene: Scene, state: State) -> int:
+        """That of the part with the largest, the first on ties."""
+        found = self.ranks.every((super().most(state), super().worst(scene, state)))
+        return int(found[int(np.argmax([most for most, _ in found]))][1])  # NaN is largest
+
+
+class DividedSettling(Settling):
+    """The first process looks whether the whole has settled."""
+
+    def __init__(self, division: Division, settle: Settle) -> None:
+        self._division, self._settling = division, None
+        if whole := division.whole:
+            self._settling = Settling(whole, settle, initial_state(whole), Watch())
+        self._agree(None)
+
+    def _agree(self, found: Certificate | None) -> Certificate | None:
+        """On what the first process has found."""
+        own = self._settling
+        told = self._division.ranks.told(own and (found, own.pace, own.obstacle))
+        certificate: Certificate | None = told[0]
+        self.pace, self.obstacle = told[1:]
+        return certificate
+
+    def look(self, state: State) -> Certificate | None:
+        """As one process does. Raises StoppedError in all."""
+        whole, found, ranks = self._division.gathered(state), None, self._division.ranks
+        error: Exception | None = None
+        if self._settling and whole is not None:
+            self._settling.pace, self._settling.obstacle = self.pace, self.obstacle
+            try:
+                found = self._settling.look(whole)
+            except StoppedError as stopped:
+                error = stopped
+        ranks.raise_first(error)
+        return self._agree(found)
+
+
+class DividedStepwise(Stepwise):
+    """Steps a part; decides with the others."""
+
+    def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
+        ranks, self._division = division.ranks, division
+        nearness = scene.experiment.neighbours.nearness()
+        refuse(
+            scene,
+            [
+                (bool(nearness), ("neighbours",), "neighbours are found anew in every step"),
+                (ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME),
+            ],
+        )
+        start, anew = division.begun(scene)
+        Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
+        self._engine, self.choice = division.stepper(ranks.told(choose(scene)))
+        self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
+        size = size_of(scene) + ranks.most(most_of(start))
+        self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
+        self.settling, self.kept = None, -1
+        if asked := scene.experiment.stepping.settle:
+            self.settling = DividedSettling(division, asked)
+
+    def _steps_in(self, seconds_a_step: float) -> int:
+        """As the first process finds it."""
+        return int(self._division.ranks.told(super()._steps_in(seconds_a_step)))
+
+    def standing(self) -> dict[str, Any]:
+        """With the state of the whole, as it is joined."""
+        return self._division.standing(super().standing())
+
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """From the state of the whole, which the first process has."""
+        super().take_up(self._division.taken_up(standing))
+
+
+CHANGING_FRAME = "a frame whose map follows numbers of the rule that change in time"
+
+
+def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
+    """Raises NotSharedError for the first clash of what does not fit, of a field."""
+    for clash, field, text in unfit:
+        if clash:
+            refusal = f"{text}, which several processes cannot share yet; run it in one process"
+            raise scene.experiment.located(NotSharedError(refusal, field))
+
+
+Floats = NDArray[np.floating[Any]]
+SHARE = 4
+"""The first grid that all processes have is by so much smaller than the part of one."""
+A_CYCLE = 6
+"""Rows of that grid beyond its own that a process takes into a cycle: what is right shrinks by 4
+on the way down, and by 2 on the way up."""
+
+
+class DividedRows(Rows):
+    """Those of one of some ranks."""
+
+    def __init__(self, ranks: Ranks, halo: Halo, strip: Strip) -> None:
+        self._ranks, self._halo = ranks, halo
+        self.strip, self.rank = strip, ranks.rank
+
+    def every(self, value: Any) -> list[Any]:
+        """By rank."""
+        return self._ranks.every(value)
+
+    def agreeing(self) -> AbstractContextManager[None]:
+        """As the ranks do."""
+        return self._ranks.agreeing()
+
+    def meet(self, field: NDArray[Any]) -> None:
+        """From other parts."""
+        self._halo.meet(field)
+
+    def random(self, shape: tuple[int, ...]) -> Floats:
+        """What one process draws for these rows: a number is one turn of its generator."""
+        assert self.strip
+        planes, (rows, places) = shape[:-2], shape[-2:]
+        found: Floats = np.empty((math.prod(planes), rows, places))
+        for n, plane in enumerate(found):
+            turned = np.random.PCG64(0).advance((n * self.strip.count + self.strip.low) * places)
+            plane[...] = np.random.Generator(turned).uniform(-1.0, 1.0, (rows, places))
+        return found.reshape(shape)
+
+
+def deep_subdomains(scene: Scene, parts: int) -> list[Subdomain]:
+    """Parts with halos that serve for a cycle of multigrid, and arrays that begin where all grids
+    that are parted have a row. Raises ExperimentError where rows are too few."""
+    spread = 2 ** _depth(parts)
+    each, edge = reaches(scene)
+    halo, rows = _margin(scene) + A_CYCLE * spread, len(scene.raster.row_counts)
+    found = []
+    for own in subdomains(scene, parts):
+        low = max(0, own.begin - halo) // spread * spread
+        high = min(rows, own.end + halo)
+        steps = max(1, min(MOST_STEPS, (halo - edge) // max(1, each)))
+        found.append(Subdomain(own.begin, own.end, low, high, edge, steps))
+    return found
+
+
+def deep_halo(each: int, edge: int, least: int, parts: int) -> int:
+    """More rows than `deep_subdomains` take as halos, as `widest_halo` is."""
+    return 3 * edge + each + (A_CYCLE + 1) * int(2 ** _depth(parts))
+
+
+def strip_of(scene: Scene, own: Subdomain, parts: int) -> Strip:
+    """What a part knows of the grid of a scene."""
+    count, margin = scene.raster.whole_shape[1], _margin(scene)
+    first = own.low + margin if own.low else 0
+    last = own.high - margin if own.high < count else count
+    return Strip(count, own.low, own.begin, own.end, first, last, _depth(parts))
+
+
+def _depth(parts: int) -> int:
+    """How many grids are parted among so many processes."""
+    return math.ceil(math.log(SHARE * parts, 4))
+
+
+def _margin(scene: Scene) -> int:
+    """The outermost rows of a part that are empty, that stand still, and whose particles see those,
+    or frame points that follow them."""
+    return 3 * Skew(scene).axes[0].reach + farthest_apart(scene)
+
+
+STUCK = "the iteration that several processes share gets nowhere; run it in one process"
+
+
+class DividedStraight(Straight):
+    """Finds the equilibrium of a part with the others: of rules that are linear, without bonds that
+    break and without obstacles, on the stencils of a lattice with one site a cell."""
+
+    def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
+        ranks, self._division = division.ranks, division
+        refuse(scene, [(ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME)])
+        _refuse(scene)
+        start, anew = division.begun(scene)
+        super().__init__(division.scene, start, DividedWatch(ranks, watch))
+        self._start = None if anew else start.copy()
+        strip = strip_of(scene, division.part.subdomain, ranks.size)
+        self._rows = DividedRows(ranks, division.halo, strip)
+
+    def standing(self) -> dict[str, Any]:
+        """With the state of the whole, as it is joined."""
+        return self._division.standing(super().standing())
+
+    def take_up(self, standing: Mapping[str, Any]) -> None:
+        """From the state of the whole, which the first process has."""
+        super().take_up(self._division.taken_up(standing))
+
+    def _way(self, state: State) -> Way:
+        from pbdkit.equilibrium.solve import finder_of, increments
+
+        scene, start = self.scene, self._start or initial_state(self.scene)
+        try:
+            finder = finder_of(scene, start, self.watch, rows=self._rows)
+            way = increments(scene, state, self.watch, self.moment, finder, self._stops)
+            certificate = yield from self._renewed(way)
+        except StuckError:
+            raise NotSharedError(STUCK, ("solver",)) from None
+        self._division.halo.renew(state)
+        return certificate
+
+    def _renewed(self, way: Way) -> Way:
+        """The same with what frame points show at each equilibrium."""
+        while True:
+            try:
+                reached = next(way)
+            except StopIteration as end:
+                certificate: Certificate = end.value
+                return certificate
+            if reached.at_rest:
+                self._division.halo.renew(reached.state)
+            yield reached
+
+
+def _refuse(scene: Scene) -> None:
+    from pbdkit.equilibrium.stencil_matrix import PrimitiveRaster
+
+    experiment, rule = scene.experiment, f"the equilibrium of rule '{scene.experiment.rule.type}'"
+    method, grid = experiment.solver.sought.method, PrimitiveRaster.of(scene)
+    refuse(
+        scene,
+        [
+            (scene.has_fracture, ("fracture",), "an equilibrium with bonds that break"),
+            (bool(scene.barriers), ("obstacles",), "an equilibrium before obstacles"),
+            (not experiment.rule.linear, ("rule",), f"{rule}, which is not linear"),
+            (scene.inner is not None, ("rule",), f"{rule}, which applies twice"),
+            (
+                bool(experiment.neighbours.nearness()) or grid is None,
+                ("neighbours",),
+                "an equilibrium whose neighbours lie farther away than in the next cell",
+            ),
+            (
+                grid is None or not grid.is_the_scenes,
+                ("lattice",),
+                "the equilibrium of a lattice with several sites a cell",
+            ),
+            (
+                method not in ("auto", "multigrid"),
+                ("solver", "method"),
+                f"an equilibrium by method '{method}'",
+            ),
+            (not find_spec("numba"), ("solver",), "an equilibrium without numba"),
+            (
+                not asks_for_grids(experiment, method, scene.raster.total),
+                ("solver", "method"),
+                "an equilibrium so small that factors of a matrix find it",
+            ),
+        ],
+    )

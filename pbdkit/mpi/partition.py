@@ -1,0 +1,637 @@
+"""Parts that several processes have, joined piece by piece in the first of them.
+
+Parts of a lattice: rows of repeat cells.
+
+A part holds its own rows and, beyond them, a halo of those of its neighbours. Its outermost rows,
+as many as neighbours reach, are empty; as many stand as frame points that follow nobody, but for
+leaders. In each step what is known
+shrinks from there by what a step reaches, so that several can be made before the halo is renewed.
+
+A part of a scene as a scene of its own: its rows of everything that a scene has.
+
+States in parts: the halo renewed from neighbours, parts joined, and a whole cut up.
+
+How many particles every line of sites has, found by all processes together: each counts some.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.paged_file import Bytes, PiecedArray, as_bytes
+from pbdkit.lattice.cells import WeighedCells
+from pbdkit.lattice.fill import Lines, framed, window
+from pbdkit.lattice.raster import (
+    ALONE,
+    EMPTY,
+    FOLLOWER,
+    FRAME,
+    Extent,
+    LeftOut,
+    Mask,
+    Others,
+    Raster,
+    Stretch,
+    hull,
+)
+from pbdkit.mpi.communicator import Ranks
+from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.lattice import Index
+from pbdkit.scene.constants import SceneConstants
+from pbdkit.scene.frame import Frame
+from pbdkit.scene.leaders import Leading
+from pbdkit.scene.loads import Loads
+from pbdkit.scene.scene import Ground, Scene
+from pbdkit.stepping.numba_engine.time_skewing import Skew
+from pbdkit.stepping.state import State
+
+Array = NDArray[Any]
+BLOCK = 2**23
+"""Bytes that are sent at once."""
+
+
+class Share:
+    """What another process than the first has of an array, along an axis. It has the array's kind
+    alone, and can be sent."""
+
+    def __init__(self, part: Array, axis: int) -> None:
+        self.shape, self.dtype, self.ndim = part.shape, part.dtype, part.ndim
+        self.nbytes = part.nbytes
+        self._part, self._axis = part, axis
+
+    def send(self, ranks: Ranks) -> None:
+        """To the first process."""
+        for block in _blocks(self._part, self._axis):
+            ranks.send(block, 0)
+
+
+def joined(ranks: Ranks, part: Array, axis: int, lengths: Sequence[int]) -> Any:
+    """An array of which each process has a part, so many long along an axis, in the order of ranks:
+    in the first process a PiecedArray, in the others their share of it."""
+    if not ranks.first:
+        return Share(part, axis)
+    shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
+    return PiecedArray(shape, part.dtype, _received(ranks, part, axis, lengths))
+
+
+def _received(ranks: Ranks, part: Array, axis: int, lengths: Sequence[int]) -> Iterator[Array]:
+    for lead in np.ndindex(part.shape[:axis]):
+        yield part[lead]
+        for rank, length in enumerate(lengths[1:], 1):
+            left = length * _row_bytes(part, axis)
+            while left:
+                piece = np.empty(min(left, BLOCK), np.uint8)
+                ranks.receive(piece, rank)
+                left -= piece.size
+                yield piece
+
+
+def _row_bytes(part: Array, axis: int) -> int:
+    return int(np.prod(part.shape[axis + 1 :], dtype=int)) * part.itemsize
+
+
+def _blocks(part: Array, axis: int) -> Iterator[Bytes]:
+    for lead in np.ndindex(part.shape[:axis]):
+        whole = as_bytes(part[lead])
+        for at in range(0, whole.size, BLOCK):
+            yield whole[at : at + BLOCK]
+
+
+MOST_STEPS = 16
+"""Steps between two exchanges, at most: by then halos are a hundredth of a part of 1500 rows."""
+MADE_TWICE = 0.05
+"""This share of its own rows a part makes on either side that others make too, at most."""
+LOOKED_AT = 3
+"""So many rows beside its own that move a part has at least, where somebody measures."""
+
+
+@dataclass(frozen=True)
+class Subdomain:
+    """Rows `begin` to `end` of repeat cells with those from `low` to `high` around them, of which
+    the outermost `edge` are empty, and as many stand still; `steps` can be made between two
+    exchanges."""
+
+    begin: int
+    end: int
+    low: int
+    high: int
+    edge: int
+    steps: int
+
+    @property
+    def own(self) -> slice:
+        """Its own rows, in arrays of the part."""
+        return slice(self.begin - self.low, self.end - self.low)
+
+    def after(self, rows: int) -> Subdomain:
+        """The same, counted from a row that is so many after the first."""
+        begin, end, low, high = (n - rows for n in (self.begin, self.end, self.low, self.high))
+        return replace(self, begin=begin, end=end, low=low, high=high)
+
+    def cut(self, array: Array, axes: int) -> Array:
+        """The part of an array whose last `axes` are those of cells, in memory of its own."""
+        return rows_of(array, axes, slice(self.low, self.high)).copy()
+
+    def seen(self, rows: int) -> tuple[int, int]:
+        """The rows of a lattice of so many that are not empty."""
+        return self._within(rows, self.edge)
+
+    def inner(self, rows: int) -> tuple[int, int]:
+        """Those that do not stand still either."""
+        return self._within(rows, 2 * self.edge)
+
+    def _within(self, rows: int, edge: int) -> tuple[int, int]:
+        low = self.low + edge if self.low > 0 else 0
+        return low, self.high - edge if self.high < rows else rows
+
+
+def rows_of(array: Array, axes: int, rows: slice) -> Array:
+    """Some rows of an array whose last `axes` are those of cells, as a view."""
+    return array[(*(slice(None),) * (array.ndim - axes), rows)]
+
+
+def reaches(scene: Scene) -> tuple[int, int]:
+    """How many rows a step reaches, and its neighbours."""
+    skew, levels, below = Skew(scene).axes[0], 1, scene.inner
+    while below:
+        levels, below = levels + 1, below.inner
+    # Masses see their neighbours before these see where the masses have gone.
+    levels += any(leading.share is not None for leading in scene.leading)
+    return levels * (skew.reach + farthest_apart(scene)), skew.reach
+
+
+def farthest_apart(scene: Scene) -> int:
+    """How many rows at most a frame point lies apart from those whom it follows."""
+    return int(max(scene.raster.others.every(Skew(scene).axes[0].apart)))
+
+
+def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
+    """Parts with about equally many particles, of whole rows. Raises ExperimentError where rows
+    are too few."""
+    (each, edge), experiment = reaches(scene), scene.experiment
+    counts = scene.raster.row_counts
+    bounds = bounds_of(counts, parts)
+    steps = _steps(each, int(np.diff(bounds).min()))
+    # After the last of these steps all of its own rows are right, and whom frame points follow.
+    looked_at = edge + LOOKED_AT * any(d.local for d in experiment.diagnostics)
+    # Bonds from own frame points lead to particles that do not stand still.
+    halo = max(steps * each, looked_at, 2 * edge * experiment.shows_bonds) + edge
+    if scene.has_fracture and not experiment.fracture.breaks_frame_bonds():
+        halo += edge  # bonds to what stands are spared: it must be beyond those of own rows
+    return [
+        Subdomain(b, e, max(0, b - halo), min(len(counts), e + halo), edge, steps)
+        for b, e in pairwise(bounds)
+    ]
+
+
+def widest_halo(each: int, edge: int, least: int, parts: int) -> int:
+    """More rows than `subdomains` take as halos, where a step reaches `each` rows at most, and
+    neighbours `edge`, of parts of `least` rows."""
+    return _steps(each, least) * each + 3 * edge + LOOKED_AT + int(MADE_TWICE * least)
+
+
+def bounds_of(counts: NDArray[Any], parts: int) -> list[int]:
+    """The rows at which parts begin, and the end of the last; `counts` are the particles of each
+    row. Raises ExperimentError where rows are too few."""
+    share = np.cumsum(counts) / max(1, counts.sum())
+    cuts = np.searchsorted(share, np.arange(1, parts) / parts) + 1
+    bounds = [0, *cuts.tolist(), len(counts)]
+    if np.diff(bounds).min() < 1:
+        raise ExperimentError(
+            f"has {np.count_nonzero(counts)} rows of cells, too few for {parts} processes; start "
+            "fewer",
+            ("body",),
+        )
+    return bounds
+
+
+def _steps(each: int, least: int) -> int:
+    """Between two exchanges, where a step reaches so many rows, of parts of so many rows."""
+    return min(MOST_STEPS, 1 + int(MADE_TWICE * least / each)) if each else MOST_STEPS
+
+
+@dataclass(frozen=True)
+class Part:
+    """A subdomain's part of a scene: the scene of the part, and what is known of the whole.
+    `ours` are which particles of each leader group that the part has are of its own rows, and
+    `early` how many of these groups' particles come before."""
+
+    subdomain: Subdomain
+    scene: Scene
+    ours: tuple[Mask, ...]
+    early: tuple[int, ...]
+    rows: slice
+    """Of the table of its scene, those of its own particles."""
+
+
+def part_of(scene: Scene, subdomain: Subdomain) -> Part:
+    """That part of a scene that has these rows and more around them, or all."""
+    window = _Window(scene.raster, subdomain)
+    places = [each.place[window.leads(each)] for each in scene.leading]
+    ours, early = map(window.has_own, places), map(window.comes_before, places)
+    return Part(
+        subdomain,
+        window.scene(scene),
+        tuple(ours),
+        tuple(int(these.sum()) for these in early),
+        window.own_rows,
+    )
+
+
+class _Window:
+    """The rows of a part on a raster that has more, of the whole or of its surroundings."""
+
+    def __init__(self, raster: Raster, subdomain: Subdomain) -> None:
+        before = raster.extent.before if raster.extent else 0
+        self._whole, self._sub = raster, (subdomain := subdomain.after(before))
+        self._axes = len(raster.shape) - 1
+        period = raster.lattice.cell().period[0]
+        lines = raster.sites.shape[0]
+
+        def line(row: int) -> int:
+            """The first line of sites of a row of cells, in the table."""
+            return int(np.clip((raster.first[0] + row) * period - raster.low[0], 0, lines))
+
+        low, high = line(subdomain.low), line(subdomain.high)
+        sites, kind = raster.sites[low:high].copy(), subdomain.cut(raster.kind, self._axes)
+        seen, inner = (of(raster.shape[1]) for of in (subdomain.seen, subdomain.inner))
+        for rows, before, after in ((inner, FOLLOWER, FRAME), (seen, FRAME, EMPTY)):
+            moved = np.moveaxis(kind, 1, 0)
+            for of, (a, b), at in ((sites, map(line, rows), low), (moved, rows, subdomain.low)):
+                for outside in (of[: a - at], of[b - at :]):
+                    outside[outside == before] = after
+        counts = np.cumsum([0, *np.count_nonzero(raster.sites != EMPTY, axis=_others(sites))])
+        first = (raster.first[0] + subdomain.low, *raster.first[1:])
+        self.raster = replace(
+            raster,
+            shape=kind.shape,
+            first=first,
+            kind=kind,
+            low=(raster.low[0] + low, *raster.low[1:]),
+            sites=sites,
+            before=raster.before + int(counts[line(seen[0])]),
+            extent=Extent(raster.row_counts, before + subdomain.low),
+            others=ALONE,
+        )
+        ends = (subdomain.begin, subdomain.end)
+        begin, end = (counts[line(row)] - counts[line(seen[0])] for row in ends)
+        self.own_rows = slice(int(begin), int(end))
+
+    def scene(self, scene: Scene) -> Scene:
+        """The part of a scene on it."""
+        frame, inner = scene.frame, scene.inner
+        return replace(
+            scene,
+            raster=self.raster,
+            constants=self._constants(scene.constants),
+            frame=self._frame(frame) if frame else None,
+            cells=self._cells(scene.cells) if scene.cells else None,
+            inner=self.scene(inner) if inner else None,
+            leading=tuple(map(self._leading, scene.leading)),
+            loads=self._loads(scene.loads) if scene.loads else None,
+        )
+
+    def leads(self, leading: Leading) -> Mask:
+        """Which particles of a group the part has; masses only where their neighbours are known."""
+        masses = leading.share is not None
+        rows = (self._sub.inner if masses else self._sub.seen)(self._whole.shape[1])
+        return self._between(leading.place, *rows)
+
+    def moves(self, place: Indices) -> Mask:
+        """Which places of the whole lie in rows of the part that do not stand still."""
+        return self._between(place, *self._sub.inner(self._whole.shape[1]))
+
+    def has_own(self, place: Indices) -> Mask:
+        """Which lie in its own rows."""
+        return self._between(place, self._sub.begin, self._sub.end)
+
+    def comes_before(self, place: Indices) -> Mask:
+        """Which lie in rows before these."""
+        return self._between(place, 0, self._sub.begin)
+
+    def _between(self, place: Indices, low: int, high: int) -> Mask:
+        row = np.unravel_index(place, self._whole.shape)[1]
+        return np.asarray((row >= low) & (row < high))
+
+    def _places(self, place: Indices) -> Indices:
+        """The same places on the raster of the part."""
+        s, row, *rest = np.unravel_index(place, self._whole.shape)
+        return np.ravel_multi_index((s, row - self._sub.low, *rest), self.raster.shape)
+
+    def _cut(self, planes: Array) -> Array:
+        return self._sub.cut(planes, self._axes)
+
+    def _constants(self, constants: SceneConstants) -> SceneConstants:
+        kinds = constants.by_particle, constants.by_bond
+        cut = [{name: self._cut(planes) for name, planes in kind.items()} for kind in kinds]
+        return replace(constants, by_particle=cut[0], by_bond=cut[1])
+
+    def _leading(self, leading: Leading) -> Leading:
+        some = self.leads(leading)
+        return replace(
+            leading,
+            rows=leading.rows[some] - self.raster.before + self._whole.before,
+            place=self._places(leading.place[some]),
+            reference=leading.reference[some],
+            share=None if leading.share is None else leading.share[some],
+        )
+
+    def _frame(self, frame: Frame) -> Frame | None:
+        """The points whom the part can let follow; the others are renewed with the halo."""
+        counts, follow = len(frame.place), frame.map
+        known = self._between(frame.body_place, *self._sub.seen(self._whole.shape[1]))
+        some = self.moves(frame.place) & (np.bincount(follow.point[~known], minlength=counts) == 0)
+        if not some.any():
+            return None
+        entries = some[follow.point]
+        point = (np.cumsum(some) - 1)[follow.point[entries]]
+        body = follow.body[entries] - self.raster.before + self._whole.before
+        cut = replace(follow, point=point, body=body, weight=follow.weight[entries])
+        place = self._places(frame.place[some])
+        return Frame(place, cut, self._places(frame.body_place[entries]))
+
+    def _cells(self, cells: WeighedCells) -> WeighedCells:
+        share = None if cells.share is None else self._cut(cells.share)
+        weight = (
+            share if cells.weight is cells.share and share is not None else self._cut(cells.weight)
+        )
+        phase = None if cells.phase is None else self._cut(cells.phase)
+        mixed = tuple(map(self._cut, cells.mixed))
+        return replace(cells, share=share, weight=weight, mixed=mixed, phase=phase)
+
+    def _loads(self, loads: Loads) -> Loads:
+        each = []
+        for one in loads.each:
+            some = self.moves(one.place)
+            rows = one.rows[some] - self.raster.before + self._whole.before
+            place, share = self._places(one.place[some]), one.share[some]
+            each.append(replace(one, rows=rows, place=place, share=share))
+        return Loads(tuple(each), self.raster.shape, loads.held_at)
+
+
+def _others(sites: Array) -> Sequence[int]:
+    return tuple(range(1, sites.ndim))
+
+
+class Halo:
+    """The halo of a part: what other parts have of their own rows."""
+
+    def __init__(self, ranks: Ranks, parts: Sequence[Subdomain], part: Part) -> None:
+        self._ranks, self._part, self._axes = ranks, part, part.scene.axes
+        self._parts = parts
+        sizes = ranks.every([int(ours.sum()) for ours in part.ours])
+        self._counts = list(zip(*sizes, strict=True))
+        before = [sum(counts[: ranks.rank]) for counts in self._counts]
+        self.members = tuple(
+            np.arange(len(ours)) + first - early
+            for ours, early, first in zip(part.ours, part.early, before, strict=True)
+        )
+        """The particles of each leader group that the part has, by their number in the group."""
+        own, rank, rows = part.subdomain, ranks.rank, parts[-1].end
+        others = [n for n in range(len(parts)) if n != rank]
+        sides = [n for n in others if _touch(own, parts[n]) or _touch(parts[n], own)]
+        self.received = {n: self._rows(_shared(own, parts[n])) for n in sides}
+        """By rank the rows that come from there."""
+        self._sent = {n: self._rows(_shared(parts[n], own)) for n in sides}
+        places = [each.place for each in part.scene.leading]
+        self._at = [np.unravel_index(place, part.scene.raster.shape)[1] for place in places]
+        moving = {n: self._rows(parts[n].inner(rows)) for n in (*sides, rank)}
+        self._theirs = {n: self._members(self._sent[n], moving[n]) for n in sides}
+        self._mine = {n: self._members(self.received[n], moving[rank]) for n in sides}
+        solver = part.scene.experiment.stepping
+        self._looks_back = solver.memory != 0.0 or "memory" in solver.courses
+        self._pushed = [n for n, each in enumerate(part.scene.leading) if each.share is not None]
+
+    def _rows(self, rows: tuple[int, int]) -> slice:
+        """Rows of the whole as they are counted in the part."""
+        low, count = self._part.subdomain.low, self._part.scene.raster.shape[1]
+        first, last = (min(max(row - low, 0), count) for row in rows)
+        return slice(first, max(first, last))
+
+    def _members(self, *within: slice) -> list[Array]:
+        """Of each leader group those in some rows."""
+        ins = [[(at >= rows.start) & (at < rows.stop) for rows in within] for at in self._at]
+        return [np.flatnonzero(np.logical_and.reduce(one)) for one in ins]
+
+    def renew(self, state: State) -> None:
+        """Writes the halo of a state, in place; and the velocities of masses that lie there. The
+        displacements of the step before are left out where no step reads them."""
+        arrays = [
+            array for array in state.arrays() if self._looks_back or array is not state.previous
+        ]
+        starts = [(n, start) for n in self._pushed if (start := state.starts[n]) is not None]
+        theirs = {r: [s[:, self._theirs[r][n]] for n, s in starts] for r in self._sent}
+        mine = {
+            r: [np.empty((len(s), len(those[n])), s.dtype) for n, s in starts]
+            for r, those in self._mine.items()
+        }
+        self._exchange(arrays, theirs, mine)
+        for rank, found in mine.items():
+            for (n, start), values in zip(starts, found, strict=True):
+                start[:, self._mine[rank][n]] = values
+
+    def meet(self, field: Array) -> None:
+        """Writes the halo of an array whose last axes are those of cells, in place."""
+        self._exchange([field], {}, {})
+
+    def look_back(self, state: State) -> None:
+        """Writes the halo of the displacements of the step before, in place."""
+        if not self._looks_back:
+            self.meet(state.previous)
+
+    def _exchange(
+        self, arrays: list[Array], theirs: dict[int, list[Array]], mine: dict[int, list[Array]]
+    ) -> None:
+        """Sends own rows of arrays, and others from there into these; and further ones."""
+        sent, received = (
+            {r: [*self._blocks(arrays, rows), *map(as_bytes, more.get(r, []))] for r, rows in each}
+            for each, more in ((self._sent.items(), theirs), (self.received.items(), mine))
+        )
+        self._ranks.exchange(sent, received)
+
+    def _blocks(self, arrays: list[Array], rows: slice) -> Iterator[Bytes]:
+        """Some rows as they lie in memory, plane by plane."""
+        for array in arrays:
+            for plane in np.ndindex(array.shape[: array.ndim - self._axes]):
+                yield as_bytes(array[plane][rows])
+
+    def joined(self, state: State) -> State:
+        """The state of the whole, of arrays that are joined when somebody asks for them; in other
+        processes than the first, of their shares."""
+        own, rows = self._part.subdomain.own, [part.end - part.begin for part in self._parts]
+
+        def whole(array: Array) -> Any:
+            axis = array.ndim - self._axes
+            return joined(self._ranks, rows_of(array, self._axes, own), axis, rows)
+
+        starts = tuple(
+            None if start is None else joined(self._ranks, start[:, ours], 1, counts)
+            for start, ours, counts in zip(state.starts, self._part.ours, self._counts, strict=True)
+        )
+        return _each(state, whole, starts)
+
+    def gathered(self, state: State) -> State | None:
+        """The state of the whole, in the first process; None in the others."""
+        shares = self.joined(state)
+        if self._ranks.first:
+            starts = (None if start is None else np.asarray(start) for start in shares.starts)
+            # In the order in which the others send.
+            found = _each(shares, np.asarray, ())
+            return replace(found, starts=tuple(starts))
+        every: list[Any] = [*shares.arrays(), *(s for s in shares.starts if s is not None)]
+        for share in every:
+            share.send(self._ranks)
+        return None
+
+
+def _shared(part: Subdomain, other: Subdomain) -> tuple[int, int]:
+    """The rows of a part's halo that are another's own."""
+    return max(part.low, other.begin), min(part.high, other.end)
+
+
+def _touch(part: Subdomain, other: Subdomain) -> bool:
+    low, high = _shared(part, other)
+    return low < high
+
+
+def _each(state: State, function: Callable[[Array], Any], starts: tuple[Any, ...]) -> State:
+    """A state with what a function makes of each array."""
+
+    def of(array: Array | None) -> Any:
+        return None if array is None else function(array)
+
+    return replace(
+        state,
+        u=function(state.u),
+        previous=function(state.previous),
+        broken_step=of(state.broken_step),
+        broken_length=of(state.broken_length),
+        starts=starts,
+        bond_values=tuple(map(function, state.bond_values)),
+        particle_values=tuple(map(function, state.particle_values)),
+    )
+
+
+def part_of_state(
+    whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
+) -> State:
+    """A part of a whole state, in memory of its own, with some members of the leader groups."""
+    starts = zip(whole.starts, members, strict=True)
+    found = tuple(None if start is None else np.asarray(start)[:, some] for start, some in starts)
+    return _each(whole, lambda array: subdomain.cut(array, axes), found)
+
+
+SITES_AT_ONCE = 2**22
+"""So many are counted at a time: what that takes does not grow with the body."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What all processes know of a lattice: the body's box of sites, from `low` to below `high`;
+    how many particles each line of sites has, frame included, from the first on that has any; how
+    many indices a repeat cell has, and how many cells neighbours reach, along the first axis; the
+    cells left out at narrow voids."""
+
+    low: Index
+    high: Index
+    lines: NDArray[np.int64]
+    period: int
+    reach: int
+    layers: int
+    left_out: LeftOut
+
+    @property
+    def first(self) -> int:
+        """The repeat cells of the first row of the lattice, which is padding."""
+        return self._start // self.period - self.reach
+
+    @cached_property
+    def rows(self) -> NDArray[np.int64]:
+        """(row,): how many particles each row of repeat cells has, padding included."""
+        row = (self._start + np.arange(len(self.lines))) // self.period - self.first
+        rows = np.bincount(row, self.lines, row[-1] + 1 + self.reach)
+        return rows.astype(np.int64)
+
+    def stretch(self, begin: int, end: int) -> Stretch:
+        """Of the rows from `begin` to below `end`."""
+        first, last = self._line(begin), self._line(end)
+        near, far = first - self.layers, last + self.layers
+        return Stretch(
+            (first, last),
+            (max(self.low[0], near), *self.low[1:]),
+            (min(self.high[0], far), *self.high[1:]),
+            int(self.lines[: first - self._start].sum()),
+            self.rows,
+            self.first,
+            self.left_out,
+        )
+
+    @property
+    def _start(self) -> int:
+        """The index i of the first line."""
+        return self.low[0] - self.layers
+
+    def _line(self, row: int) -> int:
+        """The first line of sites of a row, among those with particles."""
+        line = (self.first + row) * self.period
+        return min(max(line, self._start), self._start + len(self.lines))
+
+
+def survey(ground: Ground, others: Others, rank: int) -> Survey | None:
+    """Of a body, and of its frame; None where there is no body. Each process looks at as many lines
+    as the others."""
+    lattice, layers = ground.experiment.lattice, ground.layers
+    (first, *_), (last, *_) = low, high = window(ground.experiment.body, lattice)
+    spill = layers + ground.spill
+    cuts = np.linspace(first - spill, last + 1 + spill, others.size + 1).astype(int).tolist()
+    across = math.prod(b - a + 1 for a, b in zip(low[1:], high[1:], strict=True))
+    found = [_counted(ground, some) for some in _bands(cuts[rank : rank + 2], across)]
+    every = [one for own in others.every(found) for one in own]
+    boxes = [box for box, _, _ in every if box]
+    if not boxes:
+        return None
+    lines = np.concatenate([counts for _, counts, _ in every])
+    left_out = sum((cells for *_, cells in every), LeftOut())
+    low, high = hull(boxes)
+    begin = low[0] - layers - cuts[0]
+    lines = lines[begin : high[0] + layers - cuts[0]]
+    period = ground.cell.period[0]
+    reach = ground.neighbourhood.reach_in_cells[0]
+    return Survey(low, high, lines, period, reach, layers, left_out)
+
+
+def _bands(lines: list[int], across: int) -> Iterator[Lines]:
+    first, last = lines
+    some = max(1, SITES_AT_ONCE // across)
+    for begin in range(first, last, some):
+        yield begin, min(begin + some, last)
+
+
+def _counted(
+    ground: Ground, lines: Lines
+) -> tuple[tuple[Index, Index] | None, NDArray[np.int64], LeftOut]:
+    """(box of the body, particles on each line, cells left out) of some lines."""
+    first, last = lines
+    counts, layers = np.zeros(last - first, np.int64), ground.layers
+    filling = ground.filled((first - layers, last + layers))
+    left_out = filling.left_out_on(lines)
+    if not (box := filling.box):
+        return None, counts, left_out
+    low, kinds = framed(ground.experiment.lattice, filling.within(*box), layers)
+    many = np.count_nonzero(kinds != EMPTY, axis=tuple(range(1, kinds.ndim)))
+    line = np.arange(low[0], low[0] + len(many))
+    own = (line >= first) & (line < last)
+    counts[line[own] - first] = many[own]
+    inside = [max(first, box[0][0]), min(last, box[1][0])]
+    if inside[0] >= inside[1]:
+        return None, counts, left_out
+    return ((inside[0], *box[0][1:]), (inside[1], *box[1][1:])), counts, left_out

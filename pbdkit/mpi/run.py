@@ -1,0 +1,478 @@
+"""The scene of a part, which each process builds of its own rows and what is near.
+
+What the processes of a run record: each of its own particles; the first writes.
+
+A run on several processes, and its recording.
+
+Whether several processes were started together.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, PbdkitError
+from pbdkit.io.checkpoint import Standing
+from pbdkit.io.layout import Column, Values, When, when_measured
+from pbdkit.io.paged_file import PiecedArray
+from pbdkit.io.recorder import Measured, Recorder, columns_of
+from pbdkit.io.sinks import KeepingSink, Sink
+from pbdkit.io.snapshot import StateMoment, Tables
+from pbdkit.lattice.raster import Floats, Mask, Others, Stretch
+from pbdkit.linear.stencil import Bound, wave_bound
+from pbdkit.model.experiment import Experiment
+from pbdkit.model.solver import Equilibrium, Solver, Stepping
+from pbdkit.mpi.communicator import Ranks
+from pbdkit.mpi.driver import (
+    DividedStepwise,
+    DividedStraight,
+    Division,
+    deep_halo,
+    deep_subdomains,
+    whole_of,
+)
+from pbdkit.mpi.partition import (
+    Share,
+    Subdomain,
+    bounds_of,
+    joined,
+    subdomains,
+    survey,
+    widest_halo,
+)
+from pbdkit.plugin import AppliesTwice, Cell, Diagnostic, FollowerRule
+from pbdkit.plugin.discovery import blaming, refuse_without
+from pbdkit.plugin.frame import Indices
+from pbdkit.progress import Watch
+from pbdkit.scene.memory_estimate import TooLargeError
+from pbdkit.scene.scene import Ground, Scene, build_scene
+from pbdkit.simulation import Driver, Processes, Run
+from pbdkit.stability.forecast import prediction, quick_warnings
+from pbdkit.stability.relaxation import tuned, with_solver
+from pbdkit.stepping.state import State
+
+
+class Cut(NamedTuple):
+    """What cuts a scene into parts for a solver; and how wide halos are at most, where neighbours
+    and frame points of a step reach so many rows, neighbours alone so many, of parts of so many
+    rows and more, and of so many parts."""
+
+    subdomains: Callable[[Scene, int], list[Subdomain]]
+    widest: Callable[[int, int, int, int], int]
+
+
+CUTS: dict[type[Solver], Cut] = {
+    Stepping: Cut(subdomains, widest_halo),
+    Equilibrium: Cut(deep_subdomains, deep_halo),
+}
+
+
+class ElsewhereError(PbdkitError):
+    """Another process has given up."""
+
+
+class OtherRanks(Others):
+    """The other processes. Where one gives up, all others do at their next call."""
+
+    def __init__(self, ranks: Ranks) -> None:
+        self._ranks, self.size, self.on_machine = ranks, ranks.size, ranks.on_machine()
+        self._own = self._framed = 0, 0
+
+    def at(self, stretch: Stretch, own: tuple[int, int], framed: tuple[int, int]) -> None:
+        """What this process builds, and of which lines of sites it counts what it finds, and knows
+        whom frame points follow."""
+        self.stretch, self._own, self._framed = stretch, own, framed
+
+    def every(self, value: Any) -> list[Any]:
+        """By rank."""
+        found = self._ranks.every((True, value))
+        if not all(goes_on for goes_on, _ in found):
+            raise ElsewhereError("another process has given up")
+        return [one for _, one in found]
+
+    def least(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """By rank."""
+        self.every(None)
+        return self._ranks.least(numbers)
+
+    def is_own(self, lines: Indices) -> Mask:
+        """As it was told."""
+        return (lines >= self._own[0]) & (lines < self._own[1])
+
+    def sees_frame(self, lines: Indices) -> Mask:
+        """As it was told."""
+        return (lines >= self._framed[0]) & (lines < self._framed[1])
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """What is raised in the block, in any process, ends it in all of them: by ElsewhereError
+        where it is not this one's."""
+        try:
+            yield
+        except ElsewhereError:
+            raise
+        except BaseException:
+            self._ranks.every((False, None))
+            raise
+        self.every(None)
+
+
+def built(ranks: Ranks, experiment: Experiment) -> Scene:
+    """The scene of a process's own rows and what is near; of the whole where parts cannot be built
+    alone: where frame points follow particles far away, and to say what is wrong as one process
+    does. Raises what `build_scene` does, in all processes."""
+    if experiment.frame.local:
+        error: Exception | None = None
+        try:
+            others = OtherRanks(ranks)
+            with others.together():
+                return _built(ranks, experiment, others)
+        except Exception as raised:
+            error = None if isinstance(raised, ElsewhereError) else raised
+        bug = error is not None and not isinstance(error, PbdkitError)
+        if ranks.any(bug or _is_too_large(experiment)):
+            if isinstance(error, ExperimentError):
+                error = experiment.located(error)
+            ranks.raise_first(error)
+    with ranks.agreeing():
+        return build_scene(experiment)
+
+
+def _is_too_large(experiment: Experiment) -> bool:
+    """Whether the whole is too large for one process."""
+    try:
+        Ground(experiment)
+    except TooLargeError:
+        return True
+    except PbdkitError:
+        pass
+    return False
+
+
+def _built(ranks: Ranks, experiment: Experiment, others: OtherRanks) -> Scene:
+    ground = Ground(experiment, others)
+    if not (known := survey(ground, others, ranks.rank)):
+        raise ground.nothing()
+    bounds = bounds_of(known.rows, ranks.size)
+    begin, end = bounds[ranks.rank : ranks.rank + 2]
+    search, reach = _search(ground), ground.neighbourhood.reach_in_cells[0]
+    each, least = _levels(experiment.rule) * (reach + search), int(np.diff(bounds).min())
+    cut = CUTS[type(experiment.solver)]
+    halo = cut.widest(each, reach, least, ranks.size)
+
+    def around(rows: int) -> Stretch:
+        return known.stretch(begin - rows, end + rows)
+
+    others.at(around(halo + search + reach), around(0).lines, around(halo).lines)
+    scene = build_scene(experiment, others)
+    if any(
+        p.low < p.begin - halo or p.high > p.end + halo for p in cut.subdomains(scene, ranks.size)
+    ):
+        raise ExperimentError("its points follow particles farther away than it says", ("frame",))
+    return scene
+
+
+def _levels(rule: FollowerRule) -> int:
+    """So many times what a step reaches a particle sees at most: masses see one step farther."""
+    levels = 2
+    while isinstance(rule, AppliesTwice):
+        with blaming(rule, "when asked for its inner rule", "rule"):
+            levels, rule = levels + 1, rule.inner()
+    return levels
+
+
+def _search(ground: Ground) -> int:
+    """So many rows from a frame point at most are the particles that are nearest to it, and those
+    twice as far as the frame is deep, in site indices."""
+    cell: Cell = ground.cell
+    steps = [math.hypot(*v) / p for v, p in zip(cell.vectors, cell.period, strict=True)]
+    farthest = ground.layers * sum(steps) + sum(math.hypot(*v) for v in cell.vectors)
+    vectors: Floats = np.array(cell.vectors)
+    height = 1.0 / float(np.linalg.norm(np.linalg.inv(vectors)[:, 0]))
+    near = math.ceil(farthest / height) if ground.layers else 0
+    return 1 + max(near, math.ceil(2 * ground.layers / cell.period[0]))
+
+
+class DividedRecorder(Recorder):
+    """Records a part. Diagnostics that are not `local` measure the whole state, which the first
+    process gathers for them."""
+
+    def __init__(self, division: Division, sink: PartSink) -> None:
+        super().__init__(division.scene, sink)
+        self._joining = sink
+        self._division, self._ranks = division, division.ranks
+        whole = division.whole
+        self._wholes = (Tables(whole), Measured(whole)) if whole else None
+        self._whole: State | None = None
+        diagnostics = division.scene.experiment.diagnostics
+        self._gathered = {when_measured(d) for d in diagnostics if not d.local}
+        self._local = {when_measured(d) for d in diagnostics if d.local}
+
+    def begin(self, history: Iterable[Values] | None = None) -> None:
+        """A history is that of the whole, which the first process has."""
+        super().begin(None if history is None else ())
+        if history is not None:
+            self._joining.take(history)
+
+    def observe(self, state: State, *, last: bool = False, within: float | None = None) -> None:
+        """As one process does, which has no increments `within` steps. What one refuses all of them
+        do."""
+        if state.step <= self.seen.step and not last:
+            return
+        recorded = last or self._scene.experiment.records(state.step)
+        measured = {When.STEP, When.RECORD} if recorded else {When.STEP}
+        if measured & self._gathered:
+            self._whole = self._division.gathered(state)
+        if measured & self._local:
+            self._division.halo.look_back(state)
+        with self._ranks.agreeing(), np.errstate(all="ignore"):
+            values = self._taken(state, last)
+        self._put(state, values)
+
+    def finish(self, state: State, outcome: Any, prediction: dict[str, Any]) -> None:
+        """As one process does."""
+        self._whole = self._division.gathered(state) if When.END in self._gathered else None
+        if When.END in self._local:
+            self._division.halo.look_back(state)
+        super().finish(state, outcome, prediction)
+
+    def _diagnosed(self, when: When, moment: StateMoment) -> Values:
+        values = self._measured.diagnosed(when, moment, _is_local)
+        if self._wholes and self._whole and when in self._gathered:
+            tables, measured = self._wholes
+            whole = moment.of(self._whole, tables)
+            values |= measured.diagnosed(when, whole, lambda d: not _is_local(d))
+        return values
+
+    def _inside_out(self, state: State) -> str | None:
+        """Only where some part has turned over is the whole looked at."""
+        if not self._ranks.any(super()._inside_out(state) is not None):
+            return None
+        whole = self._division.gathered(state)
+        if whole is None:
+            return None
+        tables = self._wholes[0] if self._wholes else Tables(build_scene(self._scene.experiment))
+        return StateMoment(whole, tables).cells.inside_out()
+
+
+def _is_local(diagnostic: Diagnostic) -> bool:
+    return diagnostic.local
+
+
+class PartSink(KeepingSink):
+    """Takes the parts of all processes, and puts them into the sink that the first one has."""
+
+    def __init__(self, division: Division, inner: KeepingSink) -> None:
+        self._ranks = division.ranks
+        self._inner = inner if self._ranks.first else None
+        self._own = {"particle": division.part.rows}
+        if division.scene.experiment.shows_bonds:
+            rows, ends = division.part.rows, division.scene.bonds.ends[:, 0]
+            self._own["bond"] = slice(*np.searchsorted(ends, (rows.start, rows.stop)).tolist())
+        counts = {dim: own.stop - own.start for dim, own in self._own.items()}
+        self._lengths = {dim: self._ranks.every(count) for dim, count in counts.items()}
+        self._sizes = {dim: sum(lengths) for dim, lengths in self._lengths.items()}
+        diagnostics = division.scene.experiment.diagnostics
+        self._not_local = {v.name for d in diagnostics if not d.local for v in d.variables()}
+        columns = columns_of(division.scene)
+        self._parts = {c.name: found for c in columns if (found := self._parted(c))}
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """With the sizes of the whole."""
+        self._first(lambda inner: inner.begin(columns, sizes | self._sizes, planned))
+
+    def take(self, history: Iterable[Values]) -> None:
+        """Entries of the whole, which the first process has."""
+
+        def put(inner: Sink) -> None:
+            for values in history:
+                inner.put(values)
+
+        self._first(put)
+
+    def _parted(self, column: Column) -> tuple[str, int] | None:
+        """The dimension of which processes have parts, and which axis of an entry it is; None where
+        each has all."""
+        dims = column.dims[1:] if column.grows else column.dims
+        along = [n for n, dim in enumerate(dims) if dim in self._own]
+        if not along or column.name in self._not_local:
+            return None
+        return dims[along[0]], along[0]
+
+    def put(self, values: Values) -> None:
+        """Parts are joined; of all else that of the first process counts."""
+        whole = dict(values)
+        for name in [name for name in values if name in self._parts]:
+            dim, axis = self._parts[name]
+            part = np.asarray(values[name])[(*(slice(None),) * axis, self._own[dim])]
+            if name == "bond":  # a part counts its own
+                part += sum(self._lengths[name][: self._ranks.rank]) + 1 - part[:1]
+            whole[name] = joined(self._ranks, part, axis, self._lengths[dim])
+        self._first(lambda inner: inner.put(whole), whole)
+
+    def due(self) -> bool:
+        """As the first process finds it."""
+        return bool(self._ranks.told(self._inner is not None and self._inner.due()))
+
+    def keep(self, standing: Standing) -> None:
+        """One for all, with the state of the whole."""
+        self._first(lambda inner: inner.keep(standing), standing.arrays)
+
+    def suspend(self, standing: Standing) -> None:
+        """As it is kept."""
+        self._first(lambda inner: inner.suspend(standing), standing.arrays)
+
+    def note_end(self, standing: Standing) -> None:
+        """As it is kept."""
+        self._first(lambda inner: inner.note_end(standing), standing.arrays)
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Says on how many processes it was run."""
+        self._first(lambda inner: inner.finish(attributes | {"ranks": str(self._ranks.size)}))
+
+    def abandon(self) -> None:
+        """Only the first process has anything to remove."""
+        if self._inner:
+            self._inner.abandon()
+
+    def _first(
+        self, call: Callable[[KeepingSink], None], joining: Mapping[str, Any] | None = None
+    ) -> None:
+        """Calls the sink, in the first process; what goes wrong there is raised in all. Others send
+        their shares of what is joined meanwhile."""
+        with self._ranks.agreeing():
+            if self._inner:
+                try:
+                    call(self._inner)
+                finally:
+                    for array in (joining or {}).values():
+                        if isinstance(array, PiecedArray):
+                            array.drain()
+            else:
+                for share in (joining or {}).values():
+                    if isinstance(share, Share):
+                        share.send(self._ranks)
+
+
+DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
+    Stepping: DividedStepwise,
+    Equilibrium: DividedStraight,
+}
+"""What carries it out on one of them."""
+
+
+class DividedRun(Run):
+    """One run that several processes share: each has its part of the scene. What it gives out are
+    states of the part. Raises what any run does, in all processes."""
+
+    def __init__(self, ranks: Ranks, scene: Scene, watch: Watch) -> None:
+        chosen = scene.experiment.stepping.open_parameters
+        scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
+        with ranks.agreeing():
+            parts = CUTS[kind].subdomains(scene, ranks.size)
+        self.division = Division(ranks, scene, parts)
+        self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
+        self.driver = DRIVERS[kind](self.division, scene, watch)
+        self.driver.chosen = chosen
+        bound = wave_bound(scene)
+        self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
+
+    def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
+        """Whether masses are too light the first process finds, of the whole."""
+        if not any(leading.share is not None for leading in scene.leading):
+            return quick_warnings(scene, bound)
+        with self.division.ranks.agreeing():
+            whole = self.division.whole_of(scene)
+            return quick_warnings(whole, bound) if whole else ()
+
+    def outlook(self) -> list[str]:
+        """Nothing: `check` looks at the whole."""
+        return []
+
+    @property
+    def particles(self) -> int:
+        """Of the whole."""
+        return self.division.count
+
+    def recorder(self, sink: Sink) -> Recorder:
+        """Of the part, into what `sink` gives."""
+        assert isinstance(sink, PartSink)
+        return DividedRecorder(self.division, sink)
+
+    def sink(self, inner: KeepingSink) -> KeepingSink:
+        """Joins the parts for the sink of the first process."""
+        return PartSink(self.division, inner)
+
+
+def _tuned(ranks: Ranks, scene: Scene) -> Scene:
+    """With numbers in place of `auto`, which the first process finds, of the whole."""
+    if not scene.experiment.stepping.is_open:
+        return scene
+    found = None
+    with ranks.agreeing():
+        if whole := whole_of(ranks, scene):
+            found = tuned(whole).experiment.stepping
+    return with_solver(scene, ranks.told(found))
+
+
+class SharingRanks(Ranks):
+    """Processes that share every run."""
+
+    def scene(self, experiment: Experiment) -> Scene:
+        """Each what it needs for its part."""
+        return built(self, experiment)
+
+    def tuned(self, scene: Scene) -> Scene:
+        """Each its part of the scene, with the numbers that are found for the whole."""
+        return _tuned(self, scene)
+
+    def run(self, scene: Scene, watch: Watch) -> Run:
+        """Each its part."""
+        return DividedRun(self, scene, watch)
+
+
+SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
+"""How many processes launchers of MPI programs say in the environment that there are."""
+RANK = "PMIX_RANK"
+"""What others leave there."""
+
+
+@contextmanager
+def launched() -> Iterator[Processes]:
+    """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
+    and this one alone where it was not.
+
+    Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
+    launcher.
+    """
+    size = max(int(os.environ.get(name, 1)) for name in SIZES)
+    if RANK not in os.environ and size == 1:
+        yield Processes()
+        return
+    refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:
+        raise ExperimentError(
+            "mpi4py finds no MPI library; install one, for instance by pip install mpich, and "
+            f"start the processes by its mpiexec ({str(error).splitlines()[0]})"
+        ) from None
+    if MPI.COMM_WORLD.size == 1:
+        if size > 1:
+            raise ExperimentError(
+                f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
+                "another launcher; start them by that one's mpiexec"
+            )
+        yield Processes()
+        return
+
+    ranks = SharingRanks(MPI.COMM_WORLD)
+    with ranks.speaking():
+        yield ranks

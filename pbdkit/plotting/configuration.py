@@ -1,0 +1,518 @@
+"""Pictures of a dataset's configurations: kinds, or a variable as dots, bonds or a field; and of an
+experiment before it runs.
+
+Two datasets side by side on one scale, or what the second has more than the first.
+
+Dots, lines or pixels: what is legible where particles lie so far apart on the page.
+
+A figure of a body at several steps, or of several bodies, with one scale and one legend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.transforms import ScaledTranslation
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.layout import in_this_layout
+from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
+from pbdkit.plotting.data import (
+    Body,
+    Extent,
+    Quantity,
+    Recording,
+    Snapshot,
+    extent_of,
+    joined,
+    of_one_run,
+    quantity_of,
+)
+from pbdkit.plotting.layers import (
+    BondField,
+    Bonds,
+    BondValues,
+    Classes,
+    Dots,
+    Field,
+    Grid,
+    Layer,
+    draw_numbers,
+    draw_outline,
+)
+from pbdkit.plotting.layout import Legend, Page, Panels, ScaleBar, dress_bar, legend_handles
+from pbdkit.plotting.style import Look, figure_of, label
+from pbdkit.plugin.discovery import refuse_no_matplotlib
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from pbdkit.model.experiment import Experiment
+
+
+def plot(
+    dataset: xarray.Dataset,
+    color: str | None = None,
+    time: float | Iterable[float | None] | None = None,
+    *,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    numbers: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = 200,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> Axes | list[Axes]:
+    """Draw recorded steps with the same limits and one scale of colours.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of one run.
+    color : str, optional
+        A variable of particles or bonds: its values, the length of a vector, or a component as
+        `u_x`. By default the kinds of particles.
+    time : float or iterable of float, optional
+        A recorded step, or several, a panel each. By default the last.
+    filled : bool, optional
+        True draws the variable as a field over the body, False as dots; by default a field where
+        dots would hide one another.
+    contours : bool
+        Draw the field in steps at round levels.
+    bonds, broken : bool
+        Draw bonds (by default where there is room), and broken ones too, dashed.
+    outline : bool
+        Draw the outline of the body at rest.
+    numbers : bool
+        Write the numbers of the particles, as many as there is room for.
+    vmin, vmax : float, optional
+        The lower and the upper limit of the colours. By default those of all panels, and where
+        there are both signs the same on both sides of zero.
+    cmap : str, optional
+        A colour map of matplotlib.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels an inch.
+    ax : Axes or sequence of Axes, optional
+        Axes to draw into, one for each step. By default a new figure is made.
+
+    Returns the axes: one, or a list where `time` is iterable. Raises ExperimentError for a step
+    that was not recorded, for no step at all, for a variable that cannot be drawn, for options
+    that make no picture, and where matplotlib is missing.
+    """
+    look = Look(
+        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
+    return draw(dataset, color, time, look, ax)
+
+
+def draw(
+    dataset: xarray.Dataset,
+    color: str | None,
+    time: float | Iterable[float | None] | None,
+    look: Look,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> Axes | list[Axes]:
+    """Draw as `plot` does, with the options in `look`."""
+    refuse_no_matplotlib()
+
+    recording = Recording(dataset, color or "kind")
+    several = isinstance(time, Iterable)
+    rows = [recording.row(one) for one in _listed(time)]
+    if not rows:
+        raise ExperimentError("a figure needs at least one time")
+    shown = list(recording.snapshots(rows))
+    titles = [f"step {now.step}" for now in shown]
+    if not several or len(shown) == 1:
+        titles = [f"{recording.title}, {titles[0]}".lstrip(", ")]
+    extent = extent_of(recording, shown, look)
+    given = None if ax is None else [*ax] if isinstance(ax, Iterable) else [ax]
+    if given is not None and len(given) != len(shown):
+        raise ExperimentError(f"{len(shown)} steps need as many axes; {len(given)} are given")
+    sheet = Sheet([recording] * len(shown), titles, recording.title, extent, look, given)
+    for panel, now in zip(sheet.panels, shown, strict=True):
+        panel.show(now)
+        if look.numbers:
+            sheet.number(panel.ax, now)
+    return sheet.axes if several else sheet.axes[0]
+
+
+def plot_experiment(
+    experiment: Experiment,
+    *,
+    ax: Axes | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = 200,
+) -> Axes:
+    """Draw the set-up of an experiment before it runs, and return the axes.
+
+    The picture shows the body with its frame and regions, supports and leaders, loads, obstacles,
+    cracks and cuts. Arrows are as long in proportion to each other as motions and forces are.
+    Coordinates are in mm where the experiment has `units`. `ax` are axes to draw into; without them
+    a figure is made, of that `figsize` in inches, with so many `dpi`.
+
+    Raises ExperimentError where there is no such scene, where space is no plane, and where
+    matplotlib is missing.
+    """
+    refuse_no_matplotlib()
+    from pbdkit.plotting.scene import draw_on_axes
+    from pbdkit.scene.scene import build_scene
+
+    look, scene = Look(figsize=figsize, dpi=dpi), build_scene(experiment)
+    if scene.axes != 2:
+        raise ExperimentError(f"pictures are of the plane, and this lattice has {scene.axes} axes")
+    return draw_on_axes(scene, look, ax)
+
+
+def _listed(time: Any) -> list[Any]:
+    return [*time] if isinstance(time, Iterable) and not isinstance(time, str) else [time]
+
+
+def compare(
+    first: xarray.Dataset,
+    second: xarray.Dataset,
+    color: str | None = None,
+    time: float | None = None,
+    *,
+    difference: bool = False,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    numbers: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = 200,
+) -> Axes | list[Axes]:
+    """Draw one step of two datasets side by side, with the same limits and one scale of colours.
+
+    Parameters
+    ----------
+    first, second : xarray.Dataset
+        Results of one run each.
+    color : str, optional
+        What is drawn, as in `plot`; of a `difference` by default the distance of positions.
+    time : float, optional
+        A recorded step, by default the last of each.
+    difference : bool
+        Draw in one panel `color` of the second less that of the first, at the places that the
+        second has at rest; particles are joined by number.
+
+    The other parameters are those of `plot`.
+
+    Returns
+    -------
+    list of Axes, or Axes
+        Both axes; of a `difference` its own.
+
+    Raises
+    ------
+    ExperimentError
+        As `plot` does, and where no particle is in both.
+    """
+    look = Look(
+        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
+    first, second = in_this_layout(first), in_this_layout(second)
+    if difference:
+        changed, name = difference_of(first, second, color or "position", time)
+        return draw(changed, name, None, look)
+    return _side_by_side([first, second], color, time, look)
+
+
+def _side_by_side(
+    datasets: list[xarray.Dataset], color: str | None, time: float | None, look: Look
+) -> list[Axes]:
+    refuse_no_matplotlib()
+
+    recordings = [Recording(dataset, color or "kind") for dataset in datasets]
+    shown = [next(r.snapshots([r.row(time)])) for r in recordings]
+    extent = joined([extent_of(r, [now], look) for r, now in zip(recordings, shown, strict=True)])
+    titles = [
+        f"{r.title}, step {now.step}".lstrip(", ") for r, now in zip(recordings, shown, strict=True)
+    ]
+    sheet = Sheet(recordings, titles, "", extent, look)
+    for panel, now in zip(sheet.panels, shown, strict=True):
+        panel.show(now)
+    return sheet.axes
+
+
+def difference_of(
+    first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
+) -> tuple[xarray.Dataset, str]:
+    """Return the second dataset at one step, at rest, with the difference in `color` as a variable
+    more, where a particle of that number is in both; and the name of what to draw."""
+    both = [of_one_run(dataset) for dataset in (first, second)]
+    quantity, _ = (quantity_of(dataset, color) for dataset in reversed(both))
+    if quantity.owner != "particle":
+        raise ExperimentError(f"a difference is one of particles, and '{color}' is of bonds")
+    now = [d.isel(time=Recording(d).row(time)) for d in both]
+    numbers = np.intersect1d(now[0]["number"].values, now[1]["number"].values)
+    if not len(numbers):
+        raise ExperimentError("the two have no particle in common: no number is in both")
+    a, b = (d.isel(particle=np.flatnonzero(np.isin(d["number"], numbers))) for d in now)
+    before, after = (d[quantity.variable].transpose("particle", "axis", missing_dims="ignore")
+                     for d in (a, b))  # fmt: skip
+    less = after.variable.copy(data=after.values.astype(float) - before.values)
+    less.attrs["long_name"] = f"difference in {less.attrs.get('long_name', quantity.variable)}"
+    rest = b["reference"].transpose(*b["position"].dims).values
+    title = f"{b.attrs.get('title', '')} less {a.attrs.get('title', '')}"
+    found = b.assign(difference=less, position=b["position"].copy(data=rest))
+    name = f"difference{color.removeprefix(quantity.variable)}"
+    return found.assign_attrs(title=title), name
+
+
+ROOMY_PT, LINED_PT, CROWDED_PT = 8.0, 5.0, 2.4
+"""Distances of particles on the page: from the first on a field leaves room for dots, from the
+second on bonds are lines of their own, below the third particles are pixels."""
+DETAILED, MANY_BONDS = 50_000, 200_000
+"""More particles than that are never dots, nor more bonds lines."""
+
+
+@dataclass(frozen=True)
+class Manner:
+    """`filled`: there is a field. `crowded`: particles are no dots, unless that is asked for.
+    `lined`: whole bonds are lines. `dots` are the quantity's ("values"), its classes ("classes"),
+    the kinds of particles beside something else in colour ("kinds"), or none (""). `apart` is how
+    far from one another particles lie on the page, in points."""
+
+    filled: bool
+    crowded: bool
+    lined: bool
+    dots: str
+    apart: float
+
+    @property
+    def dot(self) -> float:
+        """The diameter of a dot in points."""
+        share, most = {"values": (0.62, 9.0), "classes": (0.45, 7.0)}.get(self.dots, (0.3, 5.0))
+        return min(share * self.apart, most)
+
+    @property
+    def alone(self) -> float:
+        """That of a particle beside a field; 0 where it would be next to nothing."""
+        size = min(0.62 * self.apart, 9.0)
+        return size if size > 1.0 else 0.0
+
+    @property
+    def line(self) -> float:
+        """The width of a bond in points."""
+        return min(max(0.05 * self.apart, 0.25), 0.8)
+
+
+def manner_of(body: Body, quantity: Quantity, look: Look, apart: float) -> Manner:
+    """What is asked for, and else what is legible. Raises ExperimentError where what is asked for
+    is not there or would be too much."""
+    crowded = len(body.reference) > DETAILED or apart < CROWDED_PT
+    of_bonds, filled = quantity.owner == "bond", _is_filled(body, quantity, look, apart)
+    if quantity.words:
+        dots = "" if crowded else "classes"
+    elif filled or of_bonds:
+        dots = "kinds" if apart >= ROOMY_PT and not crowded else ""
+    else:
+        dots = "values"
+    return Manner(filled, crowded, _is_lined(body, of_bonds, filled, look, apart), dots, apart)
+
+
+def _is_filled(body: Body, quantity: Quantity, look: Look, apart: float) -> bool:
+    many = len(body.reference) > DETAILED
+    can, asked = quantity.owner == "particle" and not quantity.words, look.contours or look.filled
+    if asked and not can:
+        raise ExperimentError(
+            f"contours need numbers at particles as color, and '{quantity.variable}' has none; "
+            "leave them out, or name another variable"
+        )
+    if look.filled is False and many:
+        raise ExperimentError(
+            f"{len(body.reference)} particles are too many for dots; at most {DETAILED}"
+        )
+    wanted = asked or (look.filled is None and can and (many or apart < ROOMY_PT))
+    if wanted and not len(body.cells):
+        if asked or many:
+            raise ExperimentError("contours need a body of particles that are not in line")
+        return False
+    return bool(wanted)
+
+
+def _is_lined(body: Body, of_bonds: bool, filled: bool, look: Look, apart: float) -> bool:
+    asked, many = look.bonds or look.broken, len(body.ends) > MANY_BONDS
+    if asked and not len(body.ends):
+        raise ExperimentError(
+            "there are no bonds to draw: a dataset has them where there is fracture, a cut, or a "
+            "diagnostic that uses them"
+        )
+    if asked and many:
+        raise ExperimentError(f"{len(body.ends)} bonds are too many to draw; at most {MANY_BONDS}")
+    if look.bonds is not None:
+        return look.bonds
+    return not many and (of_bonds or (not filled and apart >= LINED_PT))
+
+
+NUMBERED_PT, LARGEST = 20.0, 2.5
+"""How far apart numbers want particles, and how many times as large a page becomes for them."""
+
+
+class Panel:
+    """Axes with layers, each of which shows a step."""
+
+    def __init__(self, ax: Axes, drawn: list[Layer]) -> None:
+        self.ax, self._layers = ax, drawn
+        self.artists = [artist for layer in drawn for artist in layer.artists]
+
+    def show(self, now: Snapshot) -> None:
+        """That step, in place of the one before."""
+        for layer in self._layers:
+            layer.show(now)
+
+
+class Sheet:
+    """Axes, `axes`, of which each shows steps of a recording, `panels`.
+
+    All have the limits and the scale of an extent. Fields have `finer` times as many pixels, either
+    way, as the picture. `axes` given are used as they are; else a figure is made around them,
+    one `alone` or of pyplot.
+    Raises ExperimentError for what there is no room or no data for.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        titles: list[str],
+        heading: str,
+        extent: Extent,
+        look: Look,
+        axes: list[Axes] | None = None,
+        finer: float = 2.0,
+        *,
+        alone: bool = False,
+    ) -> None:
+        self._extent, self._look, self._finer = extent, look, finer
+        first = recordings[0]
+        assert first.quantity is not None
+        self._quantity, self._body = first.quantity, first.body
+        self._palette = palette_of(self._quantity) if self._quantity.words else None
+        panels = Panels(extent.box, titles, heading, first.axis_labels)
+        self._page = Page(panels, look.dpi, look.figsize, alone=alone) if axes is None else None
+        self.axes = self._page.axes if self._page else list(axes or [])
+        self._larger = 1.0
+        if self._page:
+            self._page.arrange(None, None)
+            if look.numbers:
+                self._larger = min(max(1.0, NUMBERED_PT / self._apart()), LARGEST)
+                self._page.arrange(None, None, self._larger)
+        else:
+            self._dress(panels)
+        self._manner = manner_of(self._body, self._quantity, look, self._apart())
+        self._scale = self._scale_of_all()
+        self._key()
+        self._manner = replace(self._manner, apart=self._apart())  # the key took some of the page
+        self.panels = [
+            Panel(ax, list(self._layers(ax, recording)))
+            for ax, recording in zip(self.axes, recordings, strict=True)
+        ]
+
+    @property
+    def figure(self) -> Figure:
+        """That of the axes."""
+        return figure_of(self.axes[0])
+
+    def number(self, ax: Axes, now: Snapshot) -> None:
+        """Writes numbers at the particles of that step, beside their dots."""
+        manner = self._manner
+        draw_numbers(ax, self._body.number, now, manner.dot if manner.dots else 0.0)
+
+    def _apart(self) -> float:
+        """How far apart particles at rest lie on the page, in points."""
+        ax, (left, right, bottom, top) = self.axes[0], self._extent.box
+        inches = ax.get_window_extent().transformed(self.figure.dpi_scale_trans.inverted())
+        scale = min(inches.width / (right - left), inches.height / (top - bottom))
+        return float(72 * scale * self._body.spacing)
+
+    def _scale_of_all(self) -> Scale | None:
+        if self._palette is not None:
+            return None
+        filled = self._manner.filled
+        values = self._extent.of_body if filled else self._extent.of_all
+        return scale_of(self._quantity, values, self._look, filled)
+
+    def _layers(self, ax: Axes, recording: Recording) -> Iterator[Layer]:
+        """What is drawn, from below."""
+        body, scale, manner, grid = recording.body, self._scale, self._manner, self._grid(ax)
+        if manner.filled and scale:
+            yield Field(ax, body, grid, scale, manner.alone)
+        elif self._palette and manner.crowded:
+            yield Classes(ax, body, grid, self._palette)
+        if manner.lined:
+            yield Bonds(ax, body, manner.line)
+        if self._look.broken:
+            yield Bonds(ax, body, manner.line, broken=True)
+        if self._quantity.owner == "bond" and scale:
+            many = len(body.ends) > MANY_BONDS
+            width = 2.0 * manner.line
+            yield BondField(ax, body, grid, scale) if many else BondValues(ax, body, width, scale)
+        if self._look.outline:
+            draw_outline(ax, body.outline)
+        if manner.dots:
+            colours = {"values": scale, "classes": self._palette}.get(manner.dots)
+            yield Dots(ax, manner.dot, colours or OF_KINDS, body.beyond & manner.filled)
+
+    def _grid(self, ax: Axes) -> Grid:
+        """The pixels of a field, finer than those of the picture where cells are few."""
+        extent = ax.get_window_extent()
+        finer = 1 if len(self._body.reference) > DETAILED else self._finer
+        across, up = (max(2, round(finer * side)) for side in (extent.width, extent.height))
+        return Grid(self._extent.box, across, up)
+
+    def _key(self) -> None:
+        """The bar of the scale, and a legend of the kinds where they are seen."""
+        quantity, scale, page = self._quantity, self._scale, self._page
+        text = label(quantity.meaning, quantity.units, scale.exponent if scale else 0)
+        of_kinds = self._manner.dots == "kinds"
+        palette = OF_KINDS if of_kinds else self._palette
+        if page:
+            bar = ScaleBar(page.figure, scale, text) if scale else None
+            present = set(self._extent.kinds if of_kinds else self._extent.classes)
+            handles = legend_handles(palette, present) if palette else []
+            legend = Legend(page.figure, handles) if palette else None
+            page.arrange(bar, legend, self._larger)
+            return
+        if scale:
+            bar_of = self.figure.colorbar(
+                ScalarMappable(scale.norm, scale.colours), ax=self.axes, extend=scale.extend
+            )
+            length = bar_of.ax.get_window_extent().height / self.figure.dpi
+            dress_bar(bar_of, scale, length)
+            bar_of.set_label(text)
+        if palette:
+            self._add_legend(palette)
+
+    def _dress(self, panels: Panels) -> None:
+        """Axes that were given: limits, titles and labels."""
+        left, right, bottom, top = panels.box
+        for ax, title in zip(self.axes, panels.titles, strict=True):
+            ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=title)
+            ax.set(xlabel=panels.labels[0], ylabel=panels.labels[1])
+
+    def _add_legend(self, palette: Palette) -> None:
+        """Below axes that were given."""
+        below = self.axes[0].transAxes + ScaledTranslation(0, -0.45, self.figure.dpi_scale_trans)
+        handles = legend_handles(palette, set(self._extent.kinds | self._extent.classes))
+        self.axes[0].legend(
+            handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below,
+            ncols=3, frameon=False, handletextpad=0.1,
+        )  # fmt: skip

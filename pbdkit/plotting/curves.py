@@ -1,0 +1,557 @@
+"""Force and displacement of what drives a body: a leader group, a load or an obstacle.
+
+A panel of lines: its axes and labels, the colours of the lines, and who is who.
+
+A line for each member of a sweep; one for a single run.
+
+Curves of a run: force over displacement, stress over strain, energies, one number over another.
+
+Of a sweep there is a line a member.
+
+Histories: what becomes of single particles and bonds, step by step.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.layout import INDICES, rows_at, scene_of
+from pbdkit.io.open import TEXT, type_alone
+from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
+from pbdkit.plotting.style import in_its_units, label, plain
+from pbdkit.plugin.discovery import refuse_no_matplotlib
+from pbdkit.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+
+
+Floats = NDArray[np.float64]
+FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
+"""The forces on a curve, by the dimension of what exerts them."""
+NEEDED_FORCES = (
+    "a curve of force over displacement needs a diagnostic of forces: add "
+    "{type: load-displacement, youngs_modulus: ...} for loads, {type: contact, ...} for obstacles "
+    "or {type: reaction, ...} for leader groups to `diagnostics`, and run again"
+)
+
+
+@dataclass(frozen=True)
+class Way:
+    """`force` over `displacement`, DataArrays along time that say along which axis."""
+
+    displacement: Any
+    force: Any
+
+
+def way(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> Way:
+    """That of the chosen group, load or obstacle, else of the one that goes farthest, along the
+    axis along which it does.
+
+    Raises ExperimentError where the dataset has no such forces, or not of the chosen one.
+    """
+    dim, moved = _moved(dataset, chosen)
+    force, place = in_units(dataset[FORCE_OF[dim]]), chosen.get(CHOSEN_BY[dim])
+    known = force[dim].values.tolist()
+    if place is None:
+        place = known[int(np.argmax(_greatest(moved, dim)))]
+    if place not in known:
+        said = f"there is no {dim.replace('_', ' ')} {place}"
+        raise ExperimentError(f"{said}; there are {', '.join(map(str, known))}")
+    force, moved = force.sel({dim: place}), moved.sel({dim: place})
+    leads = moved if _greatest(moved, "axis").any() else force
+    axis = int(np.argmax(_greatest(leads, "axis")))
+    force, moved, leads = (values.isel(axis=axis) for values in (force, moved, leads))
+    backwards = -float(leads.min()) > float(leads.max())
+    along = f"{'−' if backwards else ''}{dataset['axis'].values[axis]}"
+    name = f"{dim.replace('_', ' ')} {place} along {along}"
+    return Way(*(
+        (-values if backwards else values).assign_attrs(values.attrs | {"long_name": said})
+        for values, said in ((moved, f"displacement of {name}"), (force, f"force of {name}"))
+    ))  # fmt: skip
+
+
+def _moved(dataset: xarray.Dataset, chosen: Mapping[str, int | None]) -> tuple[str, Any]:
+    """What exerts the forces, and how it moves: what is asked for, else the first that moves."""
+    asked = [dim for dim, argument in CHOSEN_BY.items() if chosen.get(argument) is not None]
+    there = [dim for dim in asked or FORCE_OF if FORCE_OF[dim] in dataset.variables]
+    found = [(dim, _displacements(dataset, dim)) for dim in there]
+    if not found:
+        raise ExperimentError(NEEDED_FORCES)
+    return next((each for each in found if np.nan_to_num(each[1].values).any()), found[0])
+
+
+def _greatest(values: Any, dim: str) -> Floats:
+    """(place along dim,): the largest absolute value there."""
+    found = np.abs(values.transpose(dim, ...).values).reshape(values.sizes[dim], -1)
+    return np.asarray(np.nanmax(found, axis=1))
+
+
+def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
+    """(time, group, axis): the mean displacement of whoever exerts the force, with units."""
+    import xarray
+
+    if dim == "load":
+        return in_units(dataset["load_displacement"])
+    if more := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
+        raise ExperimentError(
+            f"who moves how far is not known of all members of a sweep (along {', '.join(more)}): "
+            "take one with isel, or name x and y"
+        )
+    scene = scene_of(dataset, "the way of leaders and obstacles")
+    if dim == "obstacle":
+        steps = dataset["time"].values
+        moved = np.stack([_of_barriers(scene, int(step)) for step in steps])
+    else:
+        moved = np.stack([_of_rows(dataset, leading.rows) for leading in scene.leading], axis=1)
+    factor, units = in_its_units(dataset["position"].attrs)
+    along = {"time": dataset["time"], dim: dataset[dim], "axis": dataset["axis"]}
+    return xarray.DataArray(moved * factor, along, ("time", dim, "axis"), attrs={"units": units})
+
+
+def _of_barriers(scene: Scene, step: int) -> Floats:
+    """(obstacle, axis): how far each has gone by a step; it stays where it last was."""
+    found = []
+    for barrier in scene.barriers:
+        n = min(step, barrier.group.last(step)) - barrier.group.from_ + 1
+        found.append(barrier.offset(n).mean(axis=0) if n > 0 else np.zeros(scene.axes))
+    return np.array(found)
+
+
+def _of_rows(dataset: xarray.Dataset, rows: NDArray[Any]) -> Floats:
+    """(time, axis): the mean displacement of some particles, so many steps at a time."""
+    low, high = int(rows.min()), int(rows.max()) + 1
+    reference = dataset["reference"].isel(particle=slice(low, high)).transpose("particle", "axis")
+    position = dataset["position"].isel(particle=slice(low, high))
+    block = max(1, SUM_BLOCK_BYTES // max(1, reference.nbytes))
+    found = []
+    for begin in range(0, dataset.sizes["time"], block):
+        part = position.isel(time=slice(begin, begin + block)).transpose("time", "particle", "axis")
+        moved = part.values[:, rows - low] - reference.values[rows - low]
+        found.append(moved.mean(axis=1))
+    return np.concatenate(found)
+
+
+Array = NDArray[Any]
+SIZE_IN, DPI = (4.8, 3.3), 200
+HUES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+"""Colours of Okabe and Ito, without the yellow that no white page shows."""
+MANY, MOST, WITHIN, FEW_POINTS = "viridis", 12, 4, 40
+"""The colours of more lines than that; so many are told by a legend, and by one within the panel;
+so many points are marked."""
+BROAD, TALL, NAMED = 44, 34, 34
+"""Characters of a line of a label below and beside the panel, and of the legend."""
+QUICK, LEGEND_IN = 20_000, 1.9
+"""Of so many points it is found out where a legend hides none; so broad is one beside the panel."""
+ROUND = [1, 2, 5, 10]
+"""Ticks lie at multiples of these."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Values `y` over `x`. Lines of one `hue`, a particle or a member of a sweep, have one colour,
+    which stands for `value` where there is a number; `dashed` tells a second component."""
+
+    x: Array
+    y: Array
+    name: str = ""
+    hue: int = 0
+    value: float | None = None
+    dashed: bool = False
+
+
+def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
+    """The axes of a figure of that size, in inches."""
+    refuse_no_matplotlib()
+    from pbdkit.plotting.style import new_figure
+
+    return new_figure(figsize=(width, height), dpi=DPI, layout="constrained").add_subplot()
+
+
+def draw_lines(ax: Axes, lines: Sequence[Line], title: str, hues: str) -> None:
+    """Draws lines with a legend; with a scale of colours, of what `hues` says, where they are more
+    than a legend tells."""
+    from matplotlib import colormaps
+    from matplotlib.ticker import MaxNLocator
+
+    order = {hue: n for n, hue in enumerate(dict.fromkeys(line.hue for line in lines))}
+    shares = _shares(lines, order)
+    for line in lines:
+        few = len(order) <= len(HUES)
+        colour = HUES[order[line.hue]] if few else colormaps[MANY](shares[line.hue])
+        ax.plot(
+            line.x, line.y, color=colour, lw=1.2, ls="--" if line.dashed else "-", ms=3.0,
+            marker="o" if len(line.x) <= FEW_POINTS else None, label=_wrapped(line.name),
+        )  # fmt: skip
+    ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+    whole = all((np.mod(line.x, 1.0) == 0.0).all() for line in lines)
+    ax.xaxis.set_major_locator(MaxNLocator(6, integer=whole, steps=ROUND))
+    ax.yaxis.set_major_locator(MaxNLocator(6, steps=ROUND))
+    ax.margins(x=0.02)
+    ax.grid(color="#E8E8E8", lw=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.set_title(label(title, broad=BROAD), fontsize="medium", pad=12)
+    if len(lines) > MOST:
+        _scale(ax, lines, order, hues)
+    elif any(line.name for line in lines):
+        _legend(ax, lines, hues)
+
+
+def _legend(ax: Axes, lines: Sequence[Line], hues: str) -> None:
+    style: dict[str, Any] = {"frameon": False, "fontsize": "small", "title_fontsize": "small"}
+    style["title"] = label(hues, broad=NAMED)
+    if len(lines) <= WITHIN and sum(len(line.x) for line in lines) < QUICK:
+        ax.legend(loc="best", **style)
+        return
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **style)
+    whole = ax.get_figure(root=True)
+    if whole and len(whole.axes) == 1:
+        whole.set_size_inches(whole.get_figwidth() + LEGEND_IN, whole.get_figheight())
+
+
+def _wrapped(name: str) -> str:
+    return textwrap.fill(plain(name), NAMED, break_on_hyphens=False)
+
+
+def _shares(lines: Sequence[Line], order: dict[int, int]) -> dict[int, float]:
+    """Where the colour of each hue lies between the first and the last, 0 to 0.9."""
+    low, high = _range(lines, order)
+    at = {line.hue: _value(line, order) for line in lines}
+    return {hue: 0.9 * (value - low) / ((high - low) or 1.0) for hue, value in at.items()}
+
+
+def _value(line: Line, order: dict[int, int]) -> float:
+    return order[line.hue] if line.value is None else line.value
+
+
+def _range(lines: Sequence[Line], order: dict[int, int]) -> tuple[float, float]:
+    values = [_value(line, order) for line in lines]
+    return min(values), max(values)
+
+
+def _scale(ax: Axes, lines: Sequence[Line], order: dict[int, int], hues: str) -> None:
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    shown = ListedColormap(colormaps[MANY](np.linspace(0.0, 0.9, 256)))
+    colours = ScalarMappable(Normalize(*_range(lines, order)), shown)
+    ax.figure.colorbar(colours, ax=ax, aspect=25).set_label(label(hues, broad=BROAD))
+
+
+def member_dims(values: Any) -> list[str]:
+    """The dimensions that are those of a sweep, or of runs put side by side."""
+    return [str(dim) for dim in values.dims if dim not in OF_A_RUN]
+
+
+def hues_of(values: Any) -> str:
+    """What the colours of members tell apart; nothing for a single run."""
+    dims = member_dims(values)
+    return dims[0] if len(dims) == 1 else "member of the sweep" if dims else ""
+
+
+def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
+    """The lines of y over x, DataArrays with one dimension of a run between them: each named by the
+    parameters of its member, without what is NaN."""
+    import xarray
+
+    across, drawn = xarray.broadcast(x, y)
+    dims = member_dims(drawn)
+    across, drawn = (values.transpose(*dims, ...) for values in (across, drawn))
+    found = []
+    places = product(*(range(drawn.sizes[dim]) for dim in dims))
+    for hue, place in enumerate(places):
+        at, over = across.values[place], drawn.values[place]
+        there = np.isfinite(at) & np.isfinite(over)
+        along = dict(zip(dims, place, strict=True))
+        name = ", ".join(f"{dim} {_said(dataset, dim, n)}" for dim, n in along.items())
+        value = _number(dataset, dims[0], place[0]) if len(dims) == 1 else None
+        if there.any():
+            found.append(Line(at[there], over[there], name, hue, value))
+    return found
+
+
+def _said(dataset: xarray.Dataset, dim: str, place: int) -> str:
+    for name in (f"{dim}{TEXT}", dim):
+        if name in dataset.coords and dataset[name].dims == (dim,):
+            value = dataset[name].values[place]
+            return f"{value:.4g}" if isinstance(value, np.floating) else type_alone(str(value))
+    return str(place)
+
+
+def _number(dataset: xarray.Dataset, dim: str, place: int) -> float | None:
+    """What a place stands for, where that is a number."""
+    if f"{dim}{TEXT}" in dataset.coords or dim not in dataset.coords:
+        return None
+    value = dataset[dim].values[place]
+    return float(value) if isinstance(value, (np.number, int, float)) else None
+
+
+Kind = Literal["load-displacement", "stress-strain", "energies"]
+KINDS: tuple[Kind, ...] = ("stress-strain", "load-displacement", "energies")
+"""In the order in which they are looked for."""
+ENERGIES = ("strain_energy", "pe1", "pe1_intact", "pe2")
+NEEDED_DIAGNOSTICS = {
+    "stress-strain": "stress over strain needs the diagnostic stress-strain: add "
+    "{type: stress-strain, youngs_modulus: ..., width: ...} to `diagnostics`, and run again",
+    "energies": "energies need a diagnostic: add {type: pe1}, or of a calibrated rule "
+    "{type: strain-energy, youngs_modulus: ...}, to `diagnostics`, and run again",
+}
+
+
+def curve(
+    dataset: xarray.Dataset,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    kind: Kind | None = None,
+    group: int | None = None,
+    load: int | None = None,
+    obstacle: int | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a curve and return its axes.
+
+    `kind` is which, by default the first that the dataset has. `curve(y)` draws a variable over
+    the time instead and `curve(x, y)` one over another, one number a step each: a component as
+    `reaction_x`, and of what particles have the sum or mean. `group`, `load` and `obstacle` choose
+    the one whose forces are drawn; without them it is the one that goes farthest. Lengths, forces
+    and energies are in mm, N and mJ where the dataset has their scale. A dataset of a sweep has a
+    line a member.
+
+    Raises ExperimentError for what is not there, with the diagnostic that it takes, and where
+    matplotlib is missing.
+    """
+    chosen = {"group": group, "load": load, "obstacle": obstacle}
+    if y is None:
+        x, y = None, x
+    if y is not None and kind is not None:
+        raise ExperimentError(f"give y or the kind '{kind}', not both")
+    if y is not None:
+        drawn = [scalar(dataset, y, chosen)]
+        across = scalar(dataset, x or _own_axis(drawn[0]), chosen)
+        return _draw(dataset, across, drawn, ax)
+    return _of_kind(dataset, kind or _first_kind(dataset), chosen, ax)
+
+
+def _own_axis(values: Any) -> str:
+    return next((str(d) for d in values.dims if d in OF_A_RUN), "time")
+
+
+def _first_kind(dataset: xarray.Dataset) -> Kind:
+    has = {
+        "stress-strain": "nominal_stress" in dataset,
+        "load-displacement": any(name in dataset for name in FORCE_OF.values()),
+        "energies": any(name in dataset for name in ENERGIES),
+    }
+    for kind in KINDS:
+        if has[kind]:
+            return kind
+    raise ExperimentError(
+        f"there is no curve in it: {NEEDED_FORCES}; {NEEDED_DIAGNOSTICS['stress-strain']}"
+    )
+
+
+def _of_kind(
+    dataset: xarray.Dataset, kind: Kind, chosen: dict[str, int | None], ax: Axes | None
+) -> Axes:
+    if kind == "load-displacement":
+        found = way(dataset, chosen)
+        return _draw(dataset, found.displacement, [found.force], ax)
+    if kind not in NEEDED_DIAGNOSTICS:
+        raise ExperimentError(f"there is no curve '{kind}'; there are {', '.join(KINDS)}")
+    names = ["nominal_stress"] if kind == "stress-strain" else _energies(dataset)
+    if any(name not in dataset for name in names) or not names:
+        raise ExperimentError(NEEDED_DIAGNOSTICS[kind])
+    across = "nominal_strain" if kind == "stress-strain" else "time"
+    drawn = [scalar(dataset, name, chosen) for name in names]
+    return _draw(dataset, scalar(dataset, across, chosen), drawn, ax)
+
+
+def _energies(dataset: xarray.Dataset) -> list[str]:
+    """Those that have one unit: the energy if there is one, else the pseudo-energies."""
+    there = [name for name in ENERGIES if name in dataset]
+    units = [dataset[name].attrs.get("units") for name in there]
+    return [name for name, unit in zip(there, units, strict=True) if unit == units[0]]
+
+
+def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) -> Axes:
+    several = len(drawn) > 1
+    lines = []
+    for n, y in enumerate(drawn):
+        for line in lines_of(dataset, x, y):
+            said = [line.name, y.attrs["long_name"]] if several else [line.name]
+            hue = line.hue if member_dims(y) else n
+            name = ", ".join(filter(None, said))
+            lines.append(replace(line, name=name, hue=hue, dashed=n > 0))
+    if not lines:
+        raise ExperimentError(f"'{drawn[0].name}' has no value that could be drawn")
+    ax = ax or new_axes()
+    ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], broad=BROAD))
+    common = "pseudo-energy" if several else drawn[0].attrs["long_name"]
+    ax.set_ylabel(label(common, drawn[0].attrs["units"], broad=TALL))
+    draw_lines(ax, lines, str(dataset.attrs.get("title", "")), hues_of(drawn[0]))
+    return ax
+
+
+MOST_LINES = 200
+"""So many lines are drawn at most."""
+Numbers = int | Iterable[int]
+
+
+def history(
+    dataset: xarray.Dataset,
+    name: str | None = None,
+    *,
+    particle: Numbers | None = None,
+    i: int | None = None,
+    j: int | None = None,
+    bond: Sequence[int] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a variable of particles over the steps and return the axes.
+
+    The particles are told by number, one or several, or by their site indices: `i` and `j` are one
+    particle, one of them alone is a line of them. `name` is any variable of particles, a vector
+    (its first component is drawn through, the others dashed) or a component as `u_x`; by default
+    the displacement `u`, made of positions where it was not recorded. `track` shows every step.
+    `bond` names a bond by the numbers of its two particles: its strain, or a variable of bonds.
+    Only what is drawn is read.
+
+    Raises ExperimentError for what is not there, for more than 200 lines, and where matplotlib is
+    missing.
+    """
+    if not isinstance(name, str | None):
+        raise ExperimentError(
+            f"history: expected the name of a variable first, such as 'u', got {name!r}; a "
+            "particle is given as particle=67"
+        )
+    if bond is not None:
+        drawn = [_of_bond(dataset, name or "strain", bond)]
+    else:
+        numbers = _numbers(dataset, particle, i, j)
+        drawn = _of_particles(dataset, name or "u", numbers)
+    alone = len(drawn) == 1
+    lines = [line for n, one in enumerate(drawn) for line in _lines(dataset, one, n, alone)]
+    if not 0 < len(lines) <= MOST_LINES:
+        what = f"{len(lines)} lines are too many" if lines else "there is no value to draw"
+        raise ExperimentError(f"{what}; name other particles, for at most {MOST_LINES} lines")
+    shown, title = drawn[0].values, str(dataset.attrs.get("title", ""))
+    hues = "bond" if bond is not None else "number of the particle"
+    if len(drawn) == 1 and (members := hues_of(shown)):
+        title, hues = f"{title}, {hues} {drawn[0].name}".replace("number of the ", ""), members
+    ax = ax or new_axes()
+    ax.set_xlabel(label("time", "step", broad=BROAD))
+    ax.set_ylabel(label(shown.attrs["long_name"], shown.attrs["units"], broad=TALL))
+    draw_lines(ax, lines, title, hues)
+    return ax
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Of whom, by name and number, which `values`, a DataArray along time."""
+
+    name: str
+    number: float | None
+    values: Any
+
+
+def _lines(dataset: xarray.Dataset, one: Followed, n: int, alone: bool) -> Iterator[Line]:
+    """A line a component and a member of a sweep. Colours tell particles apart, or where there is
+    one particle alone the members."""
+    along = "step" if "step" in one.values.dims else "time"
+    vector = "axis" in one.values.dims
+    parts = [one.values.isel(axis=k) for k in range(one.values.sizes["axis"])] if vector else []
+    for k, part in enumerate(parts or [one.values]):
+        axis = str(part["axis"].item()) if vector else ""
+        for line in lines_of(dataset, part[along], part):
+            by_member = alone and line.name
+            said = [line.name, axis] if by_member else [one.name, axis, line.name]
+            hue, value = (line.hue, line.value) if by_member else (n, one.number)
+            name = ", ".join(filter(None, said))
+            yield replace(line, name=name, hue=hue, value=value, dashed=k > 0)
+
+
+def _numbers(
+    dataset: xarray.Dataset, particle: Numbers | None, i: int | None, j: int | None
+) -> list[int] | None:
+    """Those asked for; None where nothing is said, which only `track` knows what to do with."""
+    if particle is not None:
+        if i is not None or j is not None:
+            raise ExperimentError("name particles by number or by i and j, not by both")
+        return [particle] if isinstance(particle, int | np.integer) else [*particle]
+    asked = {name: value for name, value in zip(INDICES, (i, j), strict=False) if value is not None}
+    return dataset["number"].values[rows_at(dataset, asked)].tolist() if asked else None
+
+
+def _of_particles(dataset: xarray.Dataset, name: str, numbers: list[int] | None) -> list[Followed]:
+    dim = "tracked" if name.partition("_")[0] == "track" else "particle"
+    if numbers is None and dim == "particle":
+        raise ExperimentError(
+            f"history: no particle is given; write history('{name}', particle=67), or i=4, j=5"
+        )
+    made = name.partition("_")[0] == "u" and "u" not in dataset.variables
+    found = variable(dataset, name.replace("u", "position", 1) if made else name)
+    if dim not in found.dims:
+        raise ExperimentError(f"'{name}' has no values at particles; `curve` draws it")
+    known, followed = dataset[dim].values, []
+    for number in known if numbers is None else numbers:
+        if number not in known:
+            few = f"tracked are {known.tolist()}" if dim == "tracked" else f"there are {len(known)}"
+            raise ExperimentError(f"there is no particle {number}; {few}")
+        values = found.isel({dim: int(np.flatnonzero(known == number)[0])})
+        if made:
+            values = _displacement(dataset, values, number)
+        followed.append(Followed(_name(dataset, number), float(number), in_units(values)))
+    return followed
+
+
+def _displacement(dataset: xarray.Dataset, position: Any, number: int) -> Any:
+    """What is left of positions of a particle, or a component of them, less that at rest."""
+    reference = dataset["reference"].sel(particle=number)
+    if "axis" not in position.dims:
+        reference = reference.sel(axis=position["axis"])
+    said = str(position.attrs["long_name"]).replace("position", "displacement")
+    return (position - reference).assign_attrs(position.attrs | {"long_name": said})
+
+
+def _name(dataset: xarray.Dataset, number: int) -> str:
+    one = dataset["site"].sel(particle=number).values
+    return f"{number} ({', '.join(f'{n} {k}' for n, k in zip(INDICES, one, strict=False))})"
+
+
+def _of_bond(dataset: xarray.Dataset, name: str, bond: Sequence[int]) -> Followed:
+    """The strain between two particles, or what a bond remembers."""
+    ends = sorted(bond)
+    if len(ends) != 2 or not np.isin(ends, dataset["number"].values).all():
+        raise ExperimentError(f"a bond is named by two numbers of particles, not by {[*bond]}")
+    said = f"{ends[0]}-{ends[1]}"
+    if name == "strain":
+        return Followed(said, None, _strain(dataset, ends))
+    found = variable(dataset, name)
+    if {"bond", "time"} - {*found.dims}:
+        known = [n for n, v in dataset.data_vars.items() if {"bond", "time"} <= {*v.dims}]
+        raise ExperimentError(f"bonds have no history of '{name}'; they have {['strain', *known]}")
+    rows = np.flatnonzero((dataset["bond_ends"].values == ends).all(axis=-1))
+    if not len(rows):
+        raise ExperimentError(f"there is no bond between {ends[0]} and {ends[1]}")
+    return Followed(said, None, in_units(found.isel(bond=int(rows[0]))))
+
+
+def _strain(dataset: xarray.Dataset, ends: list[int]) -> Any:
+    """By what share two particles are farther apart than at rest."""
+    a, b = (dataset["position"].sel(particle=number) for number in ends)
+    X, Y = (dataset["reference"].sel(particle=number) for number in ends)
+    rest = float(np.hypot(*(Y.values - X.values)))
+    apart = ((b - a) ** 2).sum("axis", skipna=False) ** 0.5
+    return (apart / rest - 1.0).assign_attrs(long_name="strain of the bond", units="1")

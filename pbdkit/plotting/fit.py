@@ -1,0 +1,171 @@
+"""The picture of a fit: what was measured, what was fitted, what is left, and where the data tell
+each parameter."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.plugin.discovery import refuse_no_matplotlib
+from pbdkit.plugin.units import LENGTH
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+    from pbdkit.fitting.result import Fitted
+
+
+Floats = NDArray[np.floating[Any]]
+PANEL_IN, MARGIN_IN, CURVE_IN, CURVES = 3.8, 0.75, 2.5, 3
+WITHIN = 3.0
+"""Residuals beyond so many times the noise have the last colour."""
+
+
+def draw_fit(fitted: Fitted) -> Figure:
+    """Each measurement by itself. A field: ux and uy as measured, as fitted, the residual over its
+    noise, and for each parameter how much each point tells of it; side by side where the body is
+    wide, else below each other. Tracks and curves: what was measured and fitted, the residual, and
+    what is told, along time or displacement. Raises ExperimentError where matplotlib is missing.
+    """
+    refuse_no_matplotlib()
+    from pbdkit.plotting.style import new_figure
+
+    count = 3 + len(fitted.values)
+    kinds = [observation.kind for observation in fitted.problem.observations]
+    sizes = [
+        _field_size(fitted, n, count) if kind == "field" else _curve_size(count)
+        for n, kind in enumerate(kinds)
+    ]
+    heights = [height for _, height in sizes]
+    size = (max(width for width, _ in sizes), sum(heights))
+    figure = new_figure(figsize=size, dpi=150, layout="constrained")
+    parts = figure.subfigures(len(kinds), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for n, (part, kind) in enumerate(zip(parts, kinds, strict=True)):
+        (_draw_field if kind == "field" else _draw_curve)(part, fitted, n)
+    return figure
+
+
+def _is_wide(fitted: Fitted, n: int) -> bool:
+    wide, tall = np.ptp(fitted.field(n).points, axis=0)
+    return bool(wide > tall)
+
+
+def _field_size(fitted: Fitted, n: int, count: int) -> tuple[float, float]:
+    wide, tall = np.ptp(fitted.field(n).points, axis=0)
+    height = min(max(PANEL_IN * float(tall / wide), 0.8), 5.0) + MARGIN_IN
+    return (2 * PANEL_IN, count * height) if wide > tall else (count * PANEL_IN, 2 * height)
+
+
+def _curve_size(count: int) -> tuple[float, float]:
+    return 2 * PANEL_IN, CURVE_IN * math.ceil(count / CURVES)
+
+
+def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
+    field, information = fitted.field(n), fitted.information(n)
+    noise, most = fitted.met[n].noise, max(t.max() for t in information.values())
+    factor, unit = fitted.met[n].factor, fitted.met[n].unit
+    counted = f" ({unit})" if unit else ""
+    wide, count = _is_wide(fitted, n), 3 + len(information)
+    shape = (count, 2) if wide else (2, count)
+    axes = figure.subplots(*shape, sharex=True, sharey=True)
+    area = float(np.prod(np.ptp(field.points, axis=0)) / np.ptp(field.points, axis=0)[0] ** 2)
+    size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(area / len(field.points)))
+    for column, name in enumerate(("ux", "uy")):
+        measured, left = factor * field.measured[:, column], factor * field.residual[:, column]
+        shown = [
+            (f"{name} measured{counted}", measured, (measured.min(), measured.max()), "viridis"),
+            (
+                f"{name} fitted{counted}",
+                measured - left,
+                (measured.min(), measured.max()),
+                "viridis",
+            ),
+            (f"{name} residual / noise", left / (factor * noise), (-WITHIN, WITHIN), "RdBu_r"),
+        ]
+        for path, told in information.items():
+            share = told.reshape(2, -1)[column] / most
+            shown.append((f"{name} tells {path}", share, (0.0, 1.0), "magma_r"))
+        own = axes[:, column] if wide else axes[column]
+        for ax, (title, values, limits, colours) in zip(own, shown, strict=True):
+            _scatter(ax, factor * field.points, values, limits, colours, size)
+            ax.set_title(title, fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel(f"x ({unit or LENGTH.lattice})", fontsize=9)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"y ({unit or LENGTH.lattice})", fontsize=9)
+
+
+def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
+    numbers, information = fitted.numbers(n), fitted.information(n)
+    count = 3 + len(information)
+    grid = figure.subplots(math.ceil(count / CURVES), CURVES, squeeze=False)
+    axes = grid.ravel()
+    for ax in axes[count:]:
+        ax.remove()
+    factor, along, what, over = _in_units(fitted, n)
+    measured, predicted, order = (
+        factor * numbers.measured,
+        factor * numbers.fitted,
+        np.argsort(along),
+    )
+    axes[0].plot(along, measured, "o", color="0.7", markersize=4, label="measured")
+    axes[0].plot(along[order], predicted[order], **_line(numbers.joined), label="fitted")
+    axes[0].legend(fontsize=8)
+    axes[1].plot(measured, predicted, ".", markersize=3)
+    axes[1].axline((float(measured[0]),) * 2, slope=1.0, color="0.6", linewidth=0.8)
+    axes[2].plot(along, numbers.residual / fitted.met[n].noise, ".", markersize=3)
+    axes[2].axhline(0.0, color="0.6", linewidth=0.8)
+    titles = [what, "fitted over measured", "residual / noise"]
+    most = max(t.max() for t in information.values())
+    for ax, (path, told) in zip(axes[3:], information.items(), strict=False):
+        ax.plot(along, told / most, ".", markersize=3)
+        titles.append(f"tells {path}")
+    for k, (ax, title) in enumerate(zip(axes, titles, strict=False)):
+        ax.set_title(title, fontsize=9)
+        ax.set_xlabel("measured" if k == 1 else over, fontsize=9)
+        ax.tick_params(labelsize=8)
+
+
+def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
+    """Of tracks or a curve: by what its numbers are multiplied, what they go over, and what both
+    are, in the units of the experiment where it has some."""
+    numbers, met = fitted.numbers(n), fitted.met[n]
+    units = fitted.problem.observations[n].experiment.units
+    if units is None:
+        return 1.0, numbers.along, numbers.what, numbers.over
+    over_time = numbers.over.startswith("time")
+    along = numbers.along if over_time else units.length_mm * numbers.along
+    over = numbers.over if over_time else f"{numbers.over} ({LENGTH.unit})"
+    return met.factor, along, f"{numbers.what} ({met.unit})", over
+
+
+def _line(joined: bool) -> dict[str, Any]:
+    """Of a curve; tracks of many points at one time are not joined."""
+    return (
+        {"color": "C0", "linewidth": 1.2}
+        if joined
+        else {
+            "color": "C0",
+            "marker": "x",
+            "linestyle": "",
+            "markersize": 3,
+        }
+    )
+
+
+def _scatter(
+    ax: Axes, at: Floats, values: Floats, limits: tuple[float, float], colours: str, size: float
+) -> None:
+    low, high = limits
+    style: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": high, "rasterized": True}
+    drawn = ax.scatter(at[:, 0], at[:, 1], s=size**2, c=values, linewidths=0, **style)
+    ax.set_aspect("equal")
+    ax.tick_params(labelsize=8)
+    bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", aspect=30, shrink=0.9)
+    bar.ax.tick_params(labelsize=7)
+    bar.ax.ticklabel_format(scilimits=(-3, 4))
+    bar.ax.xaxis.get_offset_text().set_fontsize(7)

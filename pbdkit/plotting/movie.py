@@ -1,0 +1,281 @@
+"""Movies of a dataset: every recorded step, with the same limits and colours from first to last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.io.atomic_file import NewFile, written
+from pbdkit.io.layout import as_step
+from pbdkit.plotting.data import Extent, Recording, Snapshot, extent_of
+from pbdkit.plotting.style import Look
+from pbdkit.plugin.discovery import one_line, refuse_no_matplotlib, refuse_without
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.animation import FuncAnimation
+
+    from pbdkit.plotting.configuration import Sheet
+
+
+Show = Callable[[str, float], None]
+Frame = NDArray[np.uint8]
+"""(row, column, red green blue)."""
+FORMATS = (".mp4", ".gif")
+WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
+DPI, GIF_COLOURS = 120, 128
+SLOWEST, FASTEST, FASTEST_GIF = 0.1, 240, 50
+"""Frames a second, as players show them."""
+FINER = 0.6
+"""So many times the pixels of the movie, either way, are those of a field, which is then smooth."""
+NEARLY_WHITE = 240
+FRAMES = 60
+"""So many steps a page in a notebook holds at most."""
+
+
+def silent(what: str, share: float) -> None:
+    """Tells nobody how far it is."""
+
+
+def animate(
+    dataset: xarray.Dataset,
+    color: str | None = None,
+    file: str | Path | None = None,
+    *,
+    fps: float = 25.0,
+    every: int = 1,
+    show: Show = silent,
+    replace: bool = True,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = DPI,
+) -> None:
+    """Write a movie of the recorded steps; the scale of colours is that of the whole run.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The result of one run.
+    color : str, optional
+        What is drawn, as in `plot`.
+    file : path
+        MP4 or GIF, as the name ends. The file appears whole or not at all.
+    fps : float
+        Recorded steps a second.
+    every : int
+        Draw each so many recorded steps only, and the last.
+    show : callable
+        Called with what is done and the share that is done.
+    replace : bool
+        Put it in the place of an earlier file, which stands until the movie is whole.
+
+    The other parameters are those of `plot`. Raises ExperimentError as `plot` does, and where what
+    writes movies is missing; StorageError where the file cannot be written.
+    """
+    path = _movie_file(color, file)
+    refuse_no_movie(path)
+    _refuse_speed(path, fps, every)
+    look = Look(
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
+    recording = Recording(dataset, color or "kind")
+    rows = [*range(0, len(recording.steps), every)]
+    rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
+    moving = Moving(recording, rows, look, show)
+    frames = moving.frames(rows, show)
+    with written(path, NewFile, replace=replace) as new:
+        if path.suffix == ".gif":
+            few = moving.frames(rows[:: max(1, len(rows) // 4)])
+            _write_gif(new, np.concatenate([*few]), frames, fps)
+        else:
+            _write_mp4(new, frames, fps)
+
+
+def _refuse_speed(path: Path, fps: float, every: int) -> None:
+    """Raise ExperimentError for a number of steps that no movie shows."""
+    fastest = FASTEST_GIF if path.suffix == ".gif" else FASTEST
+    if not SLOWEST <= fps <= fastest:
+        raise ExperimentError(f"fps: {fps:g} is not between {SLOWEST:g} and {fastest}")
+    if every < 1:
+        raise ExperimentError(f"every: {every} is below 1; 1 shows all recorded steps")
+
+
+def _movie_file(color: str | None, file: str | Path | None) -> Path:
+    """Return the path of the movie. Raises ExperimentError where it stands for the variable."""
+    if file is not None and Path(str(color)).suffix not in FORMATS:
+        return Path(file)
+    if isinstance(color, str | Path) and Path(color).suffix in FORMATS:
+        variable = f"{str(file)!r}, " if file is not None else ""
+        raise ExperimentError(
+            f"animate: '{color}' is a file, and the variable comes first; write "
+            f"animate({variable}file={str(color)!r})"
+        )
+    named = f"{color!r}, " if color is not None else ""
+    raise ExperimentError(
+        f"animate: no file is given; write animate({named}file='movie.mp4'), or in a notebook "
+        f"animation({named.rstrip(', ')})"
+    )
+
+
+def animation(
+    dataset: xarray.Dataset,
+    color: str | None = None,
+    *,
+    filled: bool | None = None,
+    contours: bool = False,
+    bonds: bool | None = None,
+    broken: bool = False,
+    outline: bool = False,
+    vmin: float | None = None,
+    vmax: float | None = None,
+    cmap: str | None = None,
+    figsize: tuple[float, float] | None = None,
+    dpi: int = 80,
+) -> FuncAnimation:
+    """Return a movie as an animation of matplotlib, for notebooks.
+
+    Of longer runs it has 60 steps, evenly chosen. The parameters are those of `plot`.
+    """
+    refuse_no_matplotlib()
+    from matplotlib.animation import FuncAnimation
+
+    look = Look(
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+    )  # fmt: skip
+    recording = Recording(dataset, color or "kind")
+    last = len(recording.steps) - 1
+    rows = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int)).tolist()
+    moving = Moving(recording, rows, look, silent, alone=False)
+    shown = [*recording.snapshots(rows)]
+    return FuncAnimation(
+        moving.sheet.figure, lambda n: moving.put(shown[n]), frames=len(shown), interval=80,
+        blit=False,
+    )  # fmt: skip
+
+
+def refuse_no_movie(path: Path) -> None:
+    """Raises ExperimentError where the name is that of no movie, or nothing here can write it, and
+    StorageError where there is no such folder."""
+    if path.suffix not in FORMATS:
+        raise ExperimentError(f"{path}: a movie ends in {' or '.join(FORMATS)}")
+    writer = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
+    for module, name in ((writer, WRITERS[writer]), ("matplotlib", "matplotlib")):
+        refuse_without(module, "movie", f"movies need {name}")
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no folder {path.parent}")
+
+
+class Moving:
+    """A sheet of one panel whose layers show step after step, over a background drawn once."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        rows: Sequence[int],
+        look: Look,
+        show: Show,
+        *,
+        alone: bool = True,
+    ) -> None:
+        from pbdkit.plotting.configuration import Sheet
+
+        self._recording, self._name = recording, recording.title
+        looked_at = _told(recording.snapshots(rows), len(rows), "the scale of colours", show)
+        extent: Extent = extent_of(recording, looked_at, look)
+        title = self._title(as_step(recording.steps[-1]))
+        self.sheet: Sheet = Sheet([recording], [title], "", extent, look, finer=FINER, alone=alone)
+        (self._panel,) = self.sheet.panels
+        self._heading = self._panel.ax.title
+        if self._heading.get_text() != title:  # it was too long
+            self._name = ""
+
+    def _title(self, step: float) -> str:
+        return f"{self._name}, step {step}".lstrip(", ")
+
+    def put(self, now: Snapshot) -> list[Any]:
+        """Shows a step, and returns what changed."""
+        self._panel.show(now)
+        self._heading.set_text(self._title(now.step))
+        return [*self._panel.artists, self._heading]
+
+    def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:
+        """Each of those steps as pixels, an even number of them across and up."""
+        figure = self.sheet.figure
+        pixels = np.ceil(figure.get_size_inches() * figure.dpi / 2 - 1e-9) * 2
+        figure.set_size_inches(*(pixels / figure.dpi))
+        canvas: Any = figure.canvas
+        moving = [*self._panel.artists, self._heading]
+        for artist in moving:
+            artist.set_animated(True)
+        canvas.draw()
+        background = canvas.copy_from_bbox(figure.bbox)
+        for now in _told(self._recording.snapshots(rows), len(rows), "the movie", show):
+            canvas.restore_region(background)
+            for artist in sorted(self.put(now), key=lambda a: a.get_zorder()):
+                figure.draw_artist(artist)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _told(shown: Iterator[Snapshot], count: int, what: str, show: Show) -> Iterator[Snapshot]:
+    for n, now in enumerate(shown):
+        yield now
+        show(what, (n + 1) / count)
+
+
+def _write_mp4(file: NewFile, frames: Iterator[Frame], fps: float) -> None:
+    """By ffmpeg, in another process, as every player shows it, under the name of the file."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    first = next(frames)
+    height, width, _ = first.shape
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}"]
+    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-preset", "veryfast"]
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *given, "-i", "-", *coded,
+               "-movflags", "+faststart", "-f", "mp4", str(file.disk.name)]  # fmt: skip
+    with TemporaryFile() as said:
+        with Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said) as ffmpeg:
+            assert ffmpeg.stdin is not None
+            try:
+                with suppress(BrokenPipeError), ffmpeg.stdin as pipe:
+                    for frame in chain([first], frames):
+                        pipe.write(frame.tobytes())
+            except BaseException:  # an interrupt, after which `with` would not wait for its end
+                ffmpeg.kill()
+                ffmpeg.wait()
+                raise
+        said.seek(0)
+        fault = one_line(said.read().decode(errors="replace"))
+        if fault or ffmpeg.returncode:
+            file.fail(OSError(0, fault or f"ffmpeg ended with status {ffmpeg.returncode}"))
+
+
+def _write_gif(file: NewFile, few: Frame, frames: Iterator[Frame], fps: float) -> None:
+    """With one palette, that of `few` of them, so that what does not move does not change."""
+    from PIL import Image
+
+    palette = Image.fromarray(few).quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
+    colours = np.reshape(palette.getpalette() or [], (-1, 3))
+    colours[colours.min(axis=1) > NEARLY_WHITE] = 255  # the page stays white
+    palette.putpalette(colours.astype(np.uint8).tobytes())
+    target: Any = file  # all that Pillow needs of one
+    drawn = (Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames)
+    next(drawn).save(
+        target, "GIF", save_all=True, append_images=drawn, duration=round(1000 / fps), loop=0,
+        optimize=False,
+    )  # fmt: skip

@@ -1,0 +1,487 @@
+"""A small writer of SVG: shapes in lattice coordinates, text that is escaped.
+
+Where to and how far motions and forces go, in one vector each, as arrows show it.
+
+A scene before it runs: the body, who leads, what acts on it and what is in its way.
+
+Shapes are drawn on a canvas: the SVG of a notebook, or axes of matplotlib (`scene_axes.py`).
+
+A scene before it runs, on axes of matplotlib, with coordinates in the user's units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from pbdkit.lattice.raster import FOLLOWER, Raster
+from pbdkit.model.boundary_conditions import Load
+from pbdkit.model.motions import Hold, Motion, Newton, Oscillation, Rotation
+from pbdkit.plotting.layout import Legend, Page, Panels, handle
+from pbdkit.plotting.style import Look, figure_of, label, plain
+from pbdkit.plugin.units import LENGTH
+from pbdkit.scene.constants import signed_distance
+from pbdkit.scene.obstacles import CIRCLES, HALF_PLANE, Barrier, Outline
+from pbdkit.scene.scene import Scene
+from pbdkit.scene.selection import spacing
+
+Floats = NDArray[np.floating[Any]]
+HEAD = 7.0
+"""The length of an arrow's head, pixels."""
+
+
+class Svg:
+    """A picture of the coordinates from `low` to `high` within so many pixels, `margin` around
+    them: with it the picture reaches from `self.low` to `self.high`. y goes up. Shapes stand in the
+    order in which they are added."""
+
+    def __init__(
+        self, low: Floats, high: Floats, within: tuple[float, float], margin: float
+    ) -> None:
+        size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
+        self.scale = float(((np.array(within) - 2.0 * margin) / size).min())
+        self.width, self.height = (float(s) for s in size * self.scale + 2.0 * margin)
+        self._origin = np.array([margin - low[0] * self.scale, margin + high[1] * self.scale])
+        self.low: Floats = self._origin * (-1.0, 1.0) / self.scale - (0.0, self.height / self.scale)
+        self.high: Floats = self.low + np.array([self.width, self.height]) / self.scale
+        self._shapes: list[str] = []
+
+    def at(self, places: Floats) -> Floats:
+        """The pixels of places, (..., axis)."""
+        return np.asarray(self._origin + np.asarray(places) * (self.scale, -self.scale))
+
+    def dots(
+        self,
+        places: Floats,
+        size: float,
+        colour: str,
+        *,
+        square: bool = False,
+        opacity: float = 1.0,
+    ) -> None:
+        """Dots of one size, pixels: one path for all, as many elements are slow to show."""
+        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in self.at(places))
+        cap = "square" if square else "round"
+        style = f'stroke="{colour}" stroke-width="{size:.2f}" stroke-linecap="{cap}"'
+        self._add(f'<path d="{path}" {style} stroke-opacity="{opacity:g}"/>' if path else "")
+
+    def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
+        """A line from place to place; `dashes` as SVG writes them."""
+        path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.at(places))
+        dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
+        style = f'fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"'
+        self._add(f'<path d="{path}" {style}{dashed}/>')
+
+    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+        """What lies between closed outlines: an inner one is a hole."""
+        parts = ("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.at(o)) + "Z" for o in outlines)
+        style = f'fill="{fill}" stroke="{edge}" fill-rule="evenodd"'
+        self._add(f'<path d="{"".join(parts)}" {style}/>')
+
+    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+        """An arrow from a place, by so many pixels, y up."""
+        (x, y), (dx, dy) = self.at(tail), (float(way[0]), -float(way[1]))
+        length = math.hypot(dx, dy)
+        if length < 1e-9:
+            return
+        ux, uy = dx / length, dy / length
+        tip, neck = (x + dx, y + dy), max(length - HEAD, 0.0)
+        a, b = (
+            (tip[0] - HEAD * ux + s * 0.5 * HEAD * uy, tip[1] - HEAD * uy - s * 0.5 * HEAD * ux)
+            for s in (1.0, -1.0)
+        )
+        shaft = f"M{x:.1f} {y:.1f}L{x + neck * ux:.1f} {y + neck * uy:.1f}"
+        head = "".join(f"{c}{p:.1f} {q:.1f}" for c, (p, q) in zip("MLL", (tip, a, b), strict=True))
+        self._add(
+            f'<path d="{shaft}" stroke="{colour}" stroke-width="1.6" fill="none"/>'
+            f'<path d="{head}Z" fill="{colour}"/>'
+        )
+
+    def text(self, title: str) -> str:
+        """The whole as an element of HTML, with what it says to those who do not see it."""
+        w, h = f"{self.width:.0f}", f"{self.height:.0f}"
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{w}" height="{h}" '
+            f'viewBox="0 0 {w} {h}" role="img" aria-label="{escape(title)}">'
+            f'<rect width="{w}" height="{h}" fill="#FFFFFF"/>{"".join(self._shapes)}</svg>'
+        )
+
+    def _add(self, shape: str) -> None:
+        self._shapes.append(shape)
+
+
+def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
+    """(particle or 1, axis): the farthest that a motion goes from its start, of those moments at
+    which it changes; of a turn the way of its first step."""
+    if isinstance(motion, Rotation):
+        return np.atleast_2d(motion.offset(1, reference))
+    if isinstance(motion, Oscillation):
+        return np.atleast_2d(motion.amplitude)
+    if isinstance(motion, Newton):
+        return np.atleast_2d(motion.velocity)
+    moments = [n for n in (1, *motion.knots(), steps) if 1 <= n <= steps]
+    ways = [np.atleast_2d(motion.offset(n, reference)) for n in moments]
+    return max(ways, key=lambda way: float(np.hypot(*way.T).max()))
+
+
+def greatest(force: Any) -> float:
+    """A component of a force, or the greatest that its course takes."""
+    values = getattr(force, "values", None)
+    return float(max(values, key=abs)) if values is not None else float(force)
+
+
+def force_of(load: Load) -> Floats:
+    """(axis,): the greatest that a load becomes, in all or of a unit of area."""
+    return np.array([greatest(f) for f in load.force or load.body_force or ()])
+
+
+WITHIN, MARGIN, ARROW, LEAST, APART = (480.0, 400.0), 44.0, 34.0, 14.0, 14.0
+"""Pixels: of the picture, around the body, of the longest arrow and the shortest, between two."""
+BODY, OUTLINE, FRAME_POINT, LEADS, HELD = "#0072B2", "#5A87A8", "#DCCB2E", "#D55E00", "#7A3300"
+ACTS, CUT, STANDS, DRIVEN = "#007A5A", "#C2185B", "#9A9A9A", "#404040"
+TINTS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
+DOTS, TINTED, ARROWS, BEYOND = 3000, 1500, 5, 0.35
+"""Bodies of more particles show their edge alone; so many dots at most of a region, so many arrows
+of a group; by so much of the body's size the picture goes beyond it to show obstacles."""
+Rows = NDArray[np.intp]
+
+
+SceneLegend = tuple[tuple[str, str], ...]
+"""What colours mean: (colour, words)."""
+
+
+class Canvas(Protocol):
+    """What a scene is drawn on: places are in lattice units, sizes and widths in pixels, of which
+    `scale` make a lattice unit; the picture reaches from the corner `low` to `high`."""
+
+    scale: float
+    low: Floats
+    high: Floats
+
+    def dots(
+        self, places: Floats, size: float, colour: str, *, square: bool = ..., opacity: float = ...
+    ) -> None:
+        """Draw dots of one size."""
+
+    def line(self, places: Floats, colour: str, width: float, dashes: str = ...) -> None:
+        """Draw a line from place to place."""
+
+    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+        """Fill what lies between closed outlines: an inner one is a hole."""
+
+    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+        """Draw an arrow from a place, by so many pixels, y up."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The element to be shown, and what its colours mean: (colour, words)."""
+
+    svg: str
+    legend: SceneLegend
+
+
+def picture_of(scene: Scene) -> Picture | None:
+    """Return the picture of a scene in a plane as SVG; None in space."""
+    if scene.axes != 2:
+        return None
+    svg = Svg(*corners(scene), WITHIN, MARGIN)
+    legend = draw_scene(scene, svg)
+    return Picture(svg.text(f"the scene of {scene.experiment.name}"), legend)
+
+
+def draw_scene(scene: Scene, canvas: Canvas) -> SceneLegend:
+    """Draw a scene in a plane, and return what its colours mean. Arrows show where to and how far
+    in proportion to each other, not to the body."""
+    drawing = _Drawing(scene, canvas)
+    drawing.draw()
+    return tuple(drawing.legend)
+
+
+def corners(scene: Scene) -> tuple[Floats, Floats]:
+    """Return the lower left and the upper right corner of what a picture of a scene shows."""
+    shown = _shown(scene)
+    return _with_obstacles(scene.barriers, shown.min(axis=0), shown.max(axis=0))
+
+
+def _is_small(scene: Scene) -> bool:
+    return int(np.count_nonzero(scene.raster.table_kind == FOLLOWER)) <= DOTS
+
+
+def _shown(scene: Scene) -> Floats:
+    """The particles of a small body and its frame, and of a large body alone."""
+    X = scene.raster.reference()
+    return X if _is_small(scene) else X[scene.raster.table_kind == FOLLOWER]
+
+
+class _Drawing:
+    """One picture in the making."""
+
+    def __init__(self, scene: Scene, canvas: Canvas) -> None:
+        self.scene, self.canvas, self.legend = scene, canvas, list[tuple[str, str]]()
+        self.X = scene.raster.reference()
+        self.body = scene.raster.table_kind == FOLLOWER
+        self.few, shown = _is_small(scene), _shown(scene)
+        self.middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        self.dot = min(max(0.5 * spacing(scene.raster) * canvas.scale, 1.2), 7.0)
+
+    def draw(self) -> None:
+        """From what lies below to what must be seen."""
+        self._regions()
+        self._obstacles()
+        if self.few:
+            self._tell(self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_POINT, "frame")
+        shown = self.body if self.few else edge_of(self.scene.raster)
+        colour, said = (BODY, "body") if self.few else (OUTLINE, "edge of the body")
+        self._tell(self.canvas.dots, self.X[shown], self.dot, colour, said)
+        self._cuts()
+        self._leaders()
+        self._loads()
+
+    def _tell(self, draw: Any, places: Floats, size: float, colour: str, said: str) -> None:
+        if len(places):
+            draw(places, size, colour)
+            self._note(colour, said)
+
+    def _note(self, colour: str, said: str) -> None:
+        if (colour, said) not in self.legend:
+            self.legend.append((colour, said))
+
+    def _regions(self) -> None:
+        cell = self.scene.raster.lattice.cell()
+        at = self.X[self.body]
+        for n, (name, shape) in enumerate(self.scene.experiment.regions.items()):
+            inside = at[signed_distance(shape, cell, *at.T) <= 0.0]
+            step = 1 + len(inside) // TINTED
+            size = spacing(self.scene.raster) * self.canvas.scale * math.sqrt(step)
+            colour = TINTS[n % len(TINTS)]
+            self.canvas.dots(inside[::step], size, colour, square=True, opacity=0.45)
+            self._note(colour, f"region {name}")
+
+    def _obstacles(self) -> None:
+        for barrier in self.scene.barriers:
+            self.canvas.filled(
+                _outlines(barrier.start, self.canvas.low, self.canvas.high), "#E3E3E3", STANDS
+            )
+            self._note(STANDS, "obstacle")
+
+    def _cuts(self) -> None:
+        experiment = self.scene.experiment
+        for crack in getattr(experiment.fracture, "cracks", ()):
+            self.canvas.line(np.array(crack), CUT, 2.2)
+            self._note(CUT, "crack")
+        for cut in experiment.cuts:
+            self.canvas.line(np.array(cut.segment), CUT, 2.2, "5 4" if cut.at else "")
+            self._note(CUT, f"cut at step {cut.at}" if cut.at else "cut")
+
+    @property
+    def _longest(self) -> float:
+        """The longest way of a motion."""
+        driven = self.scene.driven
+        ways = [extreme(d.group.motion, d.reference, self.scene.experiment.steps) for d in driven]
+        return max((float(np.hypot(*way.T).max()) for way in ways), default=0.0)
+
+    def _leaders(self) -> None:
+        longest = self._longest
+        for barrier in self.scene.barriers:
+            way = extreme(barrier.group.motion, barrier.reference, self.scene.experiment.steps)
+            ring = np.concatenate(_outlines(barrier.start, self.canvas.low, self.canvas.high))
+            nearest = ring[np.argmin(np.hypot(*(ring - self.middle).T))]
+            self._arrows(nearest[None], way.mean(axis=0, keepdims=True), longest, DRIVEN)
+        for leading in self.scene.leading:
+            motion, held = leading.group.motion, isinstance(leading.group.motion, Hold)
+            colour = HELD if held else LEADS
+            said = "mass" if isinstance(motion, Newton) else "held" if held else "led"
+            if leading.group.axes:
+                said += f" along {' and '.join(leading.group.axes)} only"
+            self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=held)
+            self._note(colour, said)
+            ways = np.zeros((len(leading.rows), 2)) + extreme(
+                motion, leading.reference, self.scene.experiment.steps
+            )
+            free = [axis for axis in range(2) if axis not in leading.axes]
+            ways[:, free] = 0.0
+            self._arrows(leading.reference, ways, longest, colour)
+            if isinstance(motion, Newton):
+                force = np.array([greatest(f) for f in motion.force])
+                self._arrows(leading.reference, force + 0.0 * ways, float(np.hypot(*force)), ACTS)
+
+    def _loads(self) -> None:
+        each = self.scene.loads.each if self.scene.loads else ()
+        forces = [(loading, force_of(loading.load)) for loading in each]
+        longest = max((float(np.hypot(*force)) for _, force in forces), default=0.0)
+        for loading, force in forces:
+            at = self.X[loading.rows]
+            at = at.mean(axis=0, keepdims=True) if loading.load.body_force else at
+            self._arrows(at, np.tile(force, (len(at), 1)), longest, ACTS)
+            self._note(ACTS, "body force" if loading.load.body_force else "force")
+
+    def _arrows(self, at: Floats, ways: Floats, longest: float, colour: str) -> None:
+        """At some of the places, from them outwards or, into the body, towards them."""
+        extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
+        count = min(max(int(extent / APART), 1), ARROWS)
+        ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
+        some = np.unique(ends.round().astype(int))
+        for place, way in zip(at[some], ways[some], strict=True):
+            pixels = _pixels(way, longest)
+            inwards = float((self.middle - place) @ way) > 1e-9 * float(np.hypot(*way))
+            tail = place - pixels / self.canvas.scale if inwards else place
+            self.canvas.arrow(tail, pixels, colour)
+
+
+def _pixels(way: Floats, longest: float) -> Floats:
+    """An arrow for a way, the longest of all ARROW pixels long; none for none."""
+    length = float(np.hypot(*way))
+    if length <= 1e-12 * longest or longest == 0.0:
+        return np.zeros(2)
+    return np.asarray(way / length * max(ARROW * length / longest, LEAST))
+
+
+def edge_of(raster: Raster) -> Rows:
+    """The rows of the body's particles that have not all four beside them, of their sublattice."""
+    places = []
+    for kinds in raster.kind == FOLLOWER:
+        around = np.pad(kinds, 1)
+        inner = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
+        places.append(kinds & ~inner)
+    found = np.nonzero(np.stack(places))
+    rows = raster.rows_at(found[0], *found[1:])
+    return np.asarray(rows)
+
+
+def _with_obstacles(
+    barriers: Iterable[Barrier], low: Floats, high: Floats
+) -> tuple[Floats, Floats]:
+    """The corners of what is to be seen with obstacles, as far as they are near."""
+    room = BEYOND * float((high - low).max())
+    for barrier in barriers:
+        box = barrier.start.box
+        low = np.minimum(low, np.maximum(box[:2], low - room))
+        high = np.maximum(high, np.minimum(box[2:], high + room))
+    return low, high
+
+
+def _outlines(outline: Outline, low: Floats, high: Floats) -> list[Floats]:
+    """Closed lines around an obstacle, of a half-plane as far as the picture goes."""
+    if outline.kind == HALF_PLANE:
+        point, normal = outline.points[0], outline.points[1] - outline.points[0]
+        along, far = np.array([-normal[1], normal[0]]), 2.0 * float(np.hypot(*(high - low)))
+        point = point + along * float(((low + high) / 2 - point) @ along)
+        ends = [point - far * along, point + far * along]
+        return [np.array([*ends, ends[1] - far * normal, ends[0] - far * normal])]
+    if outline.kind == CIRCLES:
+        turn = np.linspace(0.0, 2.0 * math.pi, 181)
+        round_ = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        radii = [r for r in (outline.outer, outline.inner) if r > 0.0]
+        return [outline.points[0] + r * round_ for r in radii]
+    return [outline.points]
+
+
+POINTS = 0.75
+"""Points a pixel: 96 pixels are an inch."""
+
+
+class AxesCanvas:
+    """Axes as a canvas: their coordinates are `unit` times lattice units, their limits stay. Shapes
+    stand in the order in which they are added."""
+
+    def __init__(self, ax: Axes, unit: float) -> None:
+        self._ax, self._unit, self._order = ax, unit, 1
+        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        self.low: Floats = np.array([left, bottom]) / unit
+        self.high: Floats = np.array([right, top]) / unit
+        inches = ax.get_window_extent().width / figure_of(ax).dpi
+        self.scale = 72 * inches / POINTS / float(self.high[0] - self.low[0])
+
+    def dots(
+        self,
+        places: Floats,
+        size: float,
+        colour: str,
+        *,
+        square: bool = False,
+        opacity: float = 1.0,
+    ) -> None:
+        """Draw dots of one size."""
+        style: dict[str, Any] = {"ls": "", "marker": "s" if square else "o", "mew": 0.0}
+        self._plot(places, color=colour, ms=POINTS * size, alpha=opacity, **style)
+
+    def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
+        """Draw a line from place to place; `dashes` as SVG writes them."""
+        lengths = [float(part) / width for part in dashes.split()]
+        style: Any = (0.0, lengths) if lengths else "-"
+        self._plot(places, color=colour, lw=POINTS * width, ls=style)
+
+    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+        """Fill what lies between closed outlines: an inner one is a hole."""
+        turned = [line[:: 1 if n == 0 else -1] for n, line in enumerate(outlines)]
+        path = Path.make_compound_path(
+            *(Path(self._unit * o, closed=False) for o in map(_closed, turned))
+        )
+        self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
+
+    def arrow(self, tail: Floats, way: Floats, colour: str) -> None:
+        """Draw an arrow from a place, by so many pixels, y up."""
+        if not np.any(way):
+            return
+        tip = self._unit * (np.asarray(tail) + np.asarray(way) / self.scale)
+        style = {"arrowstyle": "-|>,head_width=0.2,head_length=0.4", "color": colour}
+        more: dict[str, Any] = {"shrinkA": 0.0, "shrinkB": 0.0, "lw": 1.6 * POINTS}
+        ends = (*tip,), (*(self._unit * np.asarray(tail)),)
+        self._ax.annotate("", *ends, arrowprops=style | more, zorder=self._next)
+
+    def _plot(self, places: Floats, **style: Any) -> None:
+        x, y = self._unit * np.asarray(places).reshape(-1, 2).T
+        self._ax.plot(x, y, scalex=False, scaley=False, zorder=self._next, **style)
+
+    @property
+    def _next(self) -> float:
+        """The place of the next shape over those before."""
+        self._order += 1
+        return 1.0 + 1e-3 * self._order
+
+
+def _closed(outline: Floats) -> Floats:
+    return np.concatenate([outline, outline[:1]])
+
+
+def draw_on_axes(scene: Scene, look: Look, ax: Axes | None) -> Axes:
+    """Draw a scene in a plane on axes, or, without, in a new figure."""
+    units = scene.experiment.units
+    unit, words = (units.scale(LENGTH), LENGTH.unit) if units else (1.0, LENGTH.lattice)
+    low, high = corners(scene)
+    size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
+    margin = MARGIN / ((np.array(WITHIN) - 2.0 * MARGIN) / size).min()
+    (left, bottom), (right, top) = unit * (low - margin), unit * (high + margin)
+    title, labels = plain(scene.experiment.name), (label("x", words), label("y", words))
+    if ax is not None:
+        ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=title)
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+        meanings = draw_scene(scene, AxesCanvas(ax, unit))
+        ax.legend(handles=_handles(meanings), fontsize="small")
+        return ax
+    page = Page(
+        Panels((left, right, bottom, top), [title], "", labels), look.dpi, look.figsize, alone=True
+    )
+    page.arrange(None, None)
+    ax = page.axes[0]
+    meanings = draw_scene(scene, AxesCanvas(ax, unit))
+    page.arrange(None, Legend(page.figure, _handles(meanings)))
+    return ax
+
+
+def _handles(meanings: SceneLegend) -> list[Any]:
+    """A dot with its words for each colour."""
+    named: dict[str, list[str]] = {}
+    for colour, words in meanings:
+        named.setdefault(colour, []).append(words)
+    return [handle(", ".join(words), colour) for colour, words in named.items()]

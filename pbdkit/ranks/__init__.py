@@ -1,1 +1,0 @@
-"""One lattice cut into parts, each with a process that steps it or finds its equilibrium."""

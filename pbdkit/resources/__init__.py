@@ -1,1 +1,0 @@
-"""The memory of the machine, and what files from elsewhere may take of it."""

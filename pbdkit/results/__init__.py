@@ -1,1 +1,0 @@
-"""From the states of a run to its dataset: recorded, in memory or in a file, and shown."""

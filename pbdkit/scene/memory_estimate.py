@@ -1,0 +1,248 @@
+"""What the linear systems of an equilibrium take, before anything of them is allocated.
+
+All measured as the peak of a fresh process above that of its imports, over sheets of 2500 to a
+million particles: within 15 % of these, for compact bodies that leaders hold.
+
+How large a scene is, before anything of it is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+
+from pbdkit.errors import ExperimentError
+from pbdkit.lattice.neighbourhood import Neighbourhood
+from pbdkit.lattice.raster import ALONE, Others
+from pbdkit.memory import machine_memory
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
+from pbdkit.plugin.lattice import Index
+from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.units import LENGTH
+from pbdkit.scene.constants import bond_numbers, particle_numbers
+
+LARGEST_DIRECT, LARGEST_ANEW = 3_000, 20_000
+"""Particles up to which `auto` takes a direct solver, and where systems are set up again and again:
+by differences of moves, which are compiled beyond, or at each change of a bond. What works on
+stencils is compiled once a machine."""
+
+KERNELS = 48 * 2**20
+"""Bytes of the compiled functions of grids."""
+GRIDS, OWN_STENCILS = 160, 2300
+"""Bytes a particle of grids where most particles share a stencil, and where each has its own, as
+with a rule that is not linear."""
+UNCOUPLED, UNCOUPLED_EACH, COUPLED_EACH = 900, 112, 800
+"""Bytes a particle of a matrix and what solves it: of rules that leave x and y apart, and more of
+them a neighbour; of calibrated rules a neighbour."""
+TWO = 2
+"""Matrices at a time where the rule is not linear."""
+
+
+def equilibrium_size(
+    experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
+) -> int:
+    """Bytes of the systems of an equilibrium, on grids where these serve."""
+    linear = experiment.rule.linear and not experiment.obstacles
+    if grids and _on_grids(experiment, neighbourhood, particles):
+        return KERNELS + particles * (GRIDS if linear else OWN_STENCILS)
+    each = len(neighbourhood.slots[0])
+    if material_of(experiment.rule) is None:
+        bytes_each = UNCOUPLED + each * UNCOUPLED_EACH
+    else:
+        bytes_each = each * COUPLED_EACH
+    return particles * bytes_each * (1 if linear else TWO)
+
+
+def asks_for_grids(experiment: Experiment, method: str, particles: int) -> bool:
+    """Whether stencils serve best, where they serve."""
+    once = experiment.rule.linear and not experiment.fracture.can_break
+    largest = LARGEST_DIRECT if once else LARGEST_ANEW
+    return method == "multigrid" or (method == "auto" and particles > largest)
+
+
+def _on_grids(experiment: Experiment, neighbourhood: Neighbourhood, particles: int) -> bool:
+    """Whether the lattice's stencils serve."""
+    method, cell = experiment.solver.sought.method, neighbourhood.cell
+    if not (asks_for_grids(experiment, method, particles) and find_spec("numba")) or isinstance(
+        experiment.rule, AppliesTwice
+    ):
+        return False
+    if experiment.obstacles:
+        return False
+    if experiment.neighbours.nearness() or len(cell.primitive) != 2:
+        return False
+    slots = neighbourhood.every
+    steps = [cell.offset(slot.source, slot.target, slot.cell).primitive for slot in slots]
+    alike = abs(np.linalg.det(cell.primitive)) == len(cell.sites)
+    return bool(alike and np.abs(steps).max() <= 1)
+
+
+MIB = 2**20
+LEAST = 6 * MIB
+"""What any scene takes, however small: tables are made in chunks."""
+
+WORKSPACE, BONDS, CELLS, FREE_EDGES, INNER = 20, 80, 110, 60, 130
+"""Bytes a particle, measured as the peak of the process over sheets of 90 000 to 500 000: making
+the tables besides what stays; each bond plane, in the table of bonds and the making of it; shares
+of cells; a calibrated rule under a frame with points; a rule on the moves of another."""
+
+LOADS, MATERIALS = 60, 250
+"""The same where loads act on everybody, and where cells are of several materials."""
+
+GRADIENT, FORCES, TABLES = 250, 160, 40
+"""The same for diagnostics, the first that applies: the displacement gradient, forces, tables."""
+
+CHUNK_BYTES = 2**20
+"""About a chunk of a file: several entries of a column where they are small, a part of one where
+they are large. Columns take whole chunks. Reading the history of a particle touches one chunk a
+batch, reading a snapshot little more than itself."""
+
+OPEN_CHUNK = 1024
+"""Entries a chunk along a dimension whose length is known at the end only."""
+
+FRAMEWORK, VARIABLE = 40_000, 1500
+"""Bytes of a file besides values: of any, and of each variable that grows or is measured."""
+
+ANEW, ANEW_EACH = 150, 118
+"""The same where neighbours are found anew, and a neighbour."""
+
+
+class TooLargeError(ExperimentError):
+    """For the memory."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Estimates: particles (frame included), bytes of the scene while it runs, bytes of its
+    output. The output is in memory too where a run returns a dataset instead of writing a file."""
+
+    particles: int
+    memory: int
+    output: int
+
+
+def sizes_of(
+    experiment: Experiment, neighbourhood: Neighbourhood, particles: int, *, grids: bool = True
+) -> Sizes:
+    """The sizes of a scene with so many particles; `grids` where its lattice and its leaders let
+    grids find an equilibrium, as far as that is known."""
+    planes = len(neighbourhood.planes) / len(neighbourhood.slots)
+    value = 8 if experiment.stepping.precision == "float64" else 4
+    state: float = 2 * 2 * value + experiment.parts_bonds * planes * (4 + value)
+    state += planes * sum(_bytes_of(n.dtype, value) for n in bond_numbers(experiment))
+    state += sum(_bytes_of(n.dtype, value) for n in particle_numbers(experiment))
+    table: float = 1 + 8 + 2 * 4 + experiment.rule.uses_reference * 16
+    table += experiment.parts_bonds * planes
+    made = _workspace(experiment, len(neighbourhood.slots[0]), planes)
+    memory = math.ceil(particles * (state + table + made))
+    if not experiment.solver.makes_steps:
+        solved = equilibrium_size(experiment, neighbourhood, particles, grids)
+        memory = max(memory, math.ceil(particles * (state + table)) + solved)
+    memory += LEAST
+    output = math.ceil(particles * state) + _output(experiment, particles, planes)
+    return Sizes(particles, memory, output)
+
+
+def _workspace(experiment: Experiment, each: int, planes: float) -> float:
+    """Bytes a particle besides state and table, with `each` neighbours."""
+    rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
+    made = WORKSPACE + experiment.shows_bonds * planes * BONDS
+    made += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)
+    made += MATERIALS * bool(rule.varying and rule.uses_cells) + 8 * len(rule.varying)
+    made += 8 * planes * len(experiment.fracture.varying)
+    made += CELLS if frame.weighs_cells else rule.uses_cells * FREE_EDGES
+    tables = [d for d in diagnostics if any("particle" in v.dims for v in d.variables())]
+    if any("cells" in d.needs for d in tables):
+        made += GRADIENT
+    elif any("forces" in d.needs for d in diagnostics):
+        made += FORCES
+    elif tables:
+        made += TABLES
+    if experiment.neighbours.nearness():
+        made += ANEW + each * ANEW_EACH
+    return made
+
+
+def _output(experiment: Experiment, particles: int, planes: float) -> int:
+    """Bytes of the dataset without its final state, with `planes` bonds a particle, all of which
+    may break."""
+    fracture, rule = experiment.fracture, experiment.rule
+    recorded = np.dtype(experiment.record.dtype).itemsize
+    records = experiment.record_count
+    steps = experiment.steps + 1 if experiment.solver.makes_steps else records
+    each_bond = 4 + 2 * 4 + 1 + 12 * experiment.parts_bonds
+    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 2
+    once += experiment.shows_bonds * planes * each_bond
+    growing = [(records, particles * size) for size in (2.0 * recorded, 1.0)] + [(records, 8.0)]
+    of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))
+    of_particles = (particle_numbers(experiment), 1, isinstance(rule, RenewsParticles))
+    for numbers, owners, renews in (of_bonds, of_particles):
+        for number in (n for n in numbers if n.recorded):
+            if renews and number.changes:
+                entry = particles * owners * _bytes_of(number.dtype, recorded)
+                growing.append((records, entry))
+            else:
+                once += owners * _bytes_of(number.dtype, 8)
+    for diagnostic in experiment.diagnostics:
+        entries = _bytes_an_entry(diagnostic, particles, recorded, in_mm=bool(experiment.units))
+        count = steps if diagnostic.every_step else records
+        growing += [(1 if diagnostic.at_end else count, entry) for entry in entries]
+    if any(d.every_step for d in experiment.diagnostics):
+        growing.append((steps, 8.0))
+    values = sum(_in_whole_chunks(*column) for column in growing) + particles * once
+    return math.ceil(values) + FRAMEWORK + len(growing) * VARIABLE
+
+
+def _in_whole_chunks(count: int, entry: float) -> float:
+    """The bytes of a column of the file with so many entries of so many bytes."""
+    batch = max(1, min(int(CHUNK_BYTES // max(entry, 1.0)), count))
+    return math.ceil(count / batch) * batch * entry
+
+
+def refuse_too_large(
+    experiment: Experiment,
+    neighbourhood: Neighbourhood,
+    window: Index,
+    layers: int,
+    others: Others = ALONE,
+) -> None:
+    """Raises ExperimentError where the scene, or the parts of it that processes of this machine
+    have, cannot fit into its memory, if the body fills its window of site indices; with Python's
+    integers, as windows can be vast."""
+    cell = neighbourhood.cell
+    share = len(cell.sites) / math.prod(cell.period)
+    particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
+    needed = sizes_of(experiment, neighbourhood, math.ceil(particles / others.size)).memory
+    available = machine_memory(others.on_machine)
+    if needed > available:
+        each, fewer = "", "make it smaller"
+        if others.size > 1:
+            each, fewer = " in each process", "make it smaller, or start more on other machines"
+        raise TooLargeError(
+            f"{particles:.3g} particles need about {needed / 2**30:.3g} GiB{each}, and "
+            f"{available / 2**30:.3g} may be used on this machine; {fewer}",
+            ("body",),
+        )
+
+
+def _bytes_of(dtype: str, value: int) -> int:
+    """Of one number, where numbers that are not whole take `value`."""
+    return value if dtype == "f8" else np.dtype(dtype).itemsize
+
+
+def _bytes_an_entry(
+    diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
+) -> list[float]:
+    """Of each variable in the file; with `in_mm` lengths stand there twice."""
+    sizes = {"particle": particles, "axis": 2, "principal": 2}
+    sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
+    sizes |= {diagnostic.own_dimension: OPEN_CHUNK}
+    return [
+        float(math.prod(sizes.get(dim, 1) for dim in v.dims) * _bytes_of(v.dtype, recorded))
+        for v in diagnostic.variables()
+        for _ in range(1 + (in_mm and v.units == LENGTH.lattice))
+    ]

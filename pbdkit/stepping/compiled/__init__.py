@@ -1,1 +1,0 @@
-"""The compiled engine: the same elementwise functions, inlined into generated kernels (numba)."""

@@ -1,0 +1,569 @@
+"""Kernels for a GPU, written from the same elementwise functions and in the same words.
+
+Writes what one thread of a GPU does with places of the rasters and of bonds: the same lines that
+rows are swept with, on flat arrays.
+
+Every place has a group: 0 where nobody follows, then a number for each sublattice and kind of row
+whose particles have all their neighbours (`rows.py`), then one for each sublattice where something
+may be missing (`slot_loop.py`).
+
+The arrays that kernels for a GPU are given, by name: planes flat, tables as they are.
+
+Writes the source of a scene's kernel for a GPU: many steps a launch.
+
+The order within a step is that of `stepping/numpy_engine.py`. Between its parts all threads wait
+for each other, at places that are few: what a part writes, none reads before the next.
+
+What a scene comes to on a GPU: the source of its kernel, and the arrays that it begins with.
+
+Kernels compiled for a GPU, by numba-cuda (written against 0.30; see `_uncontracted`).
+
+The GPU engine: the state stays on the device, and is fetched at the end of a call.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from types import ModuleType
+from typing import Any
+from warnings import catch_warnings, simplefilter
+
+import numpy as np
+from numba import cuda
+from numba.core.errors import NumbaPerformanceWarning
+from numpy.typing import NDArray
+
+from pbdkit.errors import PbdkitError
+from pbdkit.lattice.neighbourhood import bonds_in, plane_block
+from pbdkit.lattice.raster import slot_step
+from pbdkit.plugin import Slot
+from pbdkit.plugin.discovery import blaming
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.leaders import Led, prescribe, steady_steps
+from pbdkit.stepping.numba_engine.arrays import (
+    Arrays,
+    bits_for,
+    changing_arrays,
+    constant_arrays,
+    kinds_of,
+    lost_bits,
+    state_arrays,
+)
+from pbdkit.stepping.numba_engine.boundary import (
+    foreseen,
+    leading_arrays,
+    write_frame,
+    write_leading,
+)
+from pbdkit.stepping.numba_engine.cache import with_helpers_ready, words
+from pbdkit.stepping.numba_engine.emitter import module_text
+from pbdkit.stepping.numba_engine.plan import Function, Level, Plan, blamed, functions_of, levels_of
+from pbdkit.stepping.numba_engine.sweeps import (
+    GENERAL,
+    PLAIN,
+    WITH_CELLS,
+    Words,
+    judging,
+    marking_lines,
+    parameters,
+    torn_marks,
+    write_events,
+    write_one,
+    write_whole,
+)
+from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.state import State, cut_bonds, unmoved_state
+
+THREAD = ("me", "threads")
+"""What functions are given: the number of a thread, and of how many."""
+Whole = Sequence[tuple[int, int]]
+"""The sublattice and kind of the groups that have all their neighbours."""
+
+
+def find_groups(plan: Plan) -> tuple[NDArray[Any], Whole]:
+    """The group of each place of the rasters, and which groups come first."""
+    raster, whole = plan.scene.raster, list[tuple[int, int]]()
+    groups = np.zeros(raster.shape, np.int64)
+    blocks = [raster.body_block(s) for s in range(raster.shape[0])]
+    for s, block in enumerate(blocks):
+        if block:
+            kinds = kinds_of(plan.scene, block, plan.long)
+            block.of(groups)[kinds == GENERAL] = -1 - s
+            for kind in (PLAIN, WITH_CELLS):
+                if (kinds == kind).any():
+                    whole.append((s, kind))
+                    block.of(groups)[kinds == kind] = len(whole)
+    np.copyto(groups, len(whole) - groups, where=groups < 0)
+    return groups.astype(np.min_scalar_type(int(groups.max()))), whole
+
+
+def breakable_bonds(plan: Plan) -> NDArray[np.uint8]:
+    """1 where a bond is that may break, as planes of bonds lie."""
+    planes, shape = plan.scene.neighbourhood.planes, plan.scene.raster.shape
+    found = np.zeros((len(planes), *shape[1:]), np.uint8)
+    for n, plane in enumerate(planes):
+        if block := plane_block(plan.scene.raster, plane, inside=plan.softens_cells):
+            too = plan.model.breaks_frame_bonds()
+            block.within(found[n])[...] = bonds_in(plan.scene.raster, block, plane, too)
+    return found
+
+
+def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None) -> Function:
+    """The function by which a thread moves its particles, one after the other."""
+    out = Function(plan.shared, f"sweep{level.number}", *THREAD)
+    out.add(0, *parameters(plan, level), "base = 0", *_aliases(plan, level))
+    for s, kind in whole:
+        for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
+            out.add(0, *_steps(plan, kind, s, k, slot))
+    out.add(0, f"for j in {plan.over('flat_groups.size')}:", "    group = flat_groups[j]")
+    if level.scene.experiment.rule.uses_reference:
+        out.add(1, *_cells(plan))
+    out.depth = 1
+    if plan.tears:  # marked particles are taken as those of which something may be missing
+        for n, (s, _) in enumerate(whole, 1):
+            out.add(0, f"if group == {n} and flat_torn[j]:", f"    group = {len(whole) + 1 + s}")
+    for n, (s, kind) in enumerate(whole, 1):
+        slots = plan.scene.neighbourhood.slots[s]
+        words = [_words(plan, level, kind, s, k) for k in range(len(slots))]
+        out.add(0, f"if group == {n}:", "    changed = 0")
+        write_whole(out, plan, level, s, words, "flat_lost[j]")
+        if events:
+            out.add(1, "if changed:", "    " + events.call(str(s), "j", "1"))
+    out.add(0, f"if group > {len(whole)}:", f"    s, changed = group - {len(whole) + 1}, 0")
+    write_one(out, plan, level)
+    if events:
+        out.add(1, "if changed:", "    " + events.call("s", "j", "1"))
+    return out
+
+
+def write_bonds(plan: Plan) -> Function:
+    """The function by which a thread renews its bonds and breaks them, plane after plane."""
+    out = Function(plan.shared, "judge_bonds", *THREAD)
+    out.add(0, parameters(plan, plan.levels[-1])[-1])
+    out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
+    out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
+    kept = {"since": "broken", "ways": "lengths", "may": "breakable"}
+    kept |= {f"b{m}": f"bond{m}" for m in range(plan.bonds)}
+    kept |= {f"x{m}": f"limit{m}" for m in range(plan.limits)}
+    out.add(1, *(f"{name} = flat_{of}[n * cells:(n + 1) * cells]" for name, of in kept.items()))
+    out.add(1, f"for j in {plan.over('cells')}:", "    if may[j] and since[j] < 0:")
+    out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
+    out.add(3, *judging(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
+    out.add(3, *marking_lines(plan, "n * cells + j", "here"))
+    return out
+
+
+def _aliases(plan: Plan, level: Level) -> list[str]:
+    """The names by which lines know the rows of a particle, for the whole arrays."""
+    n = level.number
+    rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
+    if n:
+        rows["z@"] = f"{level.source}_@"
+    if plan.is_loaded(level):
+        rows["g@"] = "load_@"
+    lines = [line for row, of in rows.items() for line in plan.each(f"{row} = flat_{of}")]
+    lines += [f"a{m} = w{m} = flat_own{m}" for m in range(len(level.seen.own))]
+    return lines + [f"g{m} = flat_field{m}" for m in range(level.fields)]
+
+
+def _cells(plan: Plan) -> list[str]:
+    """The cell indices of place j, the last one as `j + j0`."""
+    lines, within = ["j0 = j % extent[-1] - j"], "j // extent[-1]"
+    for axis, name in reversed(list(enumerate(plan.lead, 1))):
+        lines.append(f"{name} = {within} % extent[{axis}]")
+        within += f" // extent[{axis}]"
+    return lines
+
+
+def _steps(plan: Plan, kind: int, s: int, k: int, slot: Slot) -> list[str]:
+    """The way in flat arrays to a neighbour, to the home of its bond and to the cells beside it."""
+    lines = [f"w{s}_{k} = away[{s}, {k}]"]
+    if plan.bonds or plan.limits or plan.bonds_first:
+        lines.append(f"v{s}_{k} = bonds_away[{s}, {k}]")
+    if kind == WITH_CELLS:
+        lines += [f"q{s}_{k}_{side} = cells_away[{s}, {k}, {side}]" for side in (0, 1)]
+    return lines
+
+
+def _words(plan: Plan, level: Level, kind: int, s: int, k: int) -> Words:
+    there, home = f"j + w{s}_{k}", f"j + v{s}_{k}"
+    shares = [f"flat_share[j + q{s}_{k}_{side}]" for side in (0, 1)] if kind == WITH_CELLS else []
+    return Words(
+        f"flat_{level.source}_@[{there}]",
+        [f"flat_{array}[{there}]" for array in plan.shown],
+        shares,
+        f"flat_bond{{n}}[{home}]",
+        f"flat_limit{{n}}[{home}]",
+        f"flat_broken[{home}]",
+    )
+
+
+PLANES = re.compile(
+    r"kind|share|body|ratios|mixed|broken|lengths|lost|torn|groups|breakable"
+    r"|(u|v|z\d+|load)_[xyz]|(bond|own|was|field|limit)\d+"
+)
+"""Names of arrays that have a value for every place."""
+
+
+def steady_arrays(plan: Plan) -> tuple[Arrays, Whole]:
+    """What does not change from step to step, and which groups of places have all neighbours."""
+    shape, planes = plan.scene.raster.shape, plan.scene.neighbourhood.planes
+    groups, whole = find_groups(plan)
+    found = constant_arrays(plan) | {"groups": groups, "extent": np.array(shape, np.int64)}
+    found["end_steps"] = np.array([slot_step(shape, plane.slot) for plane in planes], np.int64)
+    if plan.bonds_first:
+        found["breakable"] = breakable_bonds(plan)
+    return found, whole
+
+
+def flattened(arrays: Arrays) -> Arrays:
+    """The same as kernels know them; what they write into planes is written into these."""
+    return {
+        f"flat_{name}" if PLANES.fullmatch(name) else name: (
+            array.reshape(-1) if PLANES.fullmatch(name) else array
+        )
+        for name, array in arrays.items()
+    }
+
+
+def without_doubles(led: Led) -> Led:
+    """Every leader once, where the last group puts it: threads place them all at once."""
+    found: Led = []
+    later = np.empty(0, np.intp)
+    for each in reversed(led):
+        fresh = ~np.isin(each.place, later)
+        found.insert(0, each._replace(place=each.place[fresh], u=each.u[:, fresh]))
+        later = np.concatenate([later, each.place])
+    return found
+
+
+def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]:
+    """The source of a module with ``run(step, count, ...)``, which takes the scene `count` steps
+    further, and the names of the arrays that follow these two. A block that is `alone` waits for
+    its own threads only, which takes much less time."""
+    events = write_events(plan) if plan.judged else None
+    judge = write_bonds(plan) if plan.bonds_first else None
+    sweeps = [write_sweep(plan, level, whole, events) for level in plan.levels]
+    functions = [function for function in (events, judge, *sweeps) if function]
+    run = Function(plan.shared, "run", "step", "count")
+    run.add(0, "me, threads = cuda.grid(1), cuda.gridsize(1)")
+    wait = "cuda.syncthreads()" if alone else "everyone.sync()"
+    if not alone:
+        run.add(0, "everyone = cuda.cg.this_grid()")
+    run.add(0, "for made in range(count):", "    step += 1")
+    _write_step(run, plan, judge, sweeps, wait)
+    head = ["@kernel", f"def run({', '.join([*run.own, *run.used])}):"]
+    return module_text(plan, functions, head, run), run.used
+
+
+def _write_step(
+    out: Function, plan: Plan, judge: Function | None, sweeps: Iterable[Function], wait: str
+) -> None:
+    leading = "led_kept[#, e] = flat_u_@[led[e]]", "flat_u_@[led[e]] = held[#, e]"
+    write_leading(out, plan, *leading)
+    for m in plan.kept:
+        out.add(1, f"for e in {plan.over(f'flat_own{m}.size')}:")
+        out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
+    out.add(1, wait)
+    if judge:
+        out.add(1, judge.call(*THREAD), wait)
+    for n, sweep in enumerate(sweeps):
+        if n and plan.scene.frame:
+            write_frame(out, plan, f"flat_z{n - 1}", f"flat_z{n - 1}")
+            out.add(1, wait)
+        out.add(1, sweep.call(*THREAD), wait)
+    after = "flat_v_@[led[e]] = held[#, e]", "flat_u_@[led[e]] = led_kept[#, e]"
+    write_leading(out, plan, *after)
+    if frame := plan.scene.frame:
+        out.add(1, wait)
+        write_frame(out, plan, "flat_u" if frame.map.lag else "flat_v", "flat_v")
+        out.add(1, wait)
+    u, v = (", ".join(plan.each(f"flat_{name}_@")) for name in "uv")
+    out.add(1, f"{u}, {v} = {v}, {u}")
+
+
+ALONE = 4096
+"""Places up to which one block makes all steps, whose threads wait for each other in no time
+(estimated, not measured)."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """`names` are those of the arrays that the kernel takes, and `alone` whether it is for one
+    block."""
+
+    plan: Plan
+    source: str
+    names: list[str]
+    arrays: Arrays
+    alone: bool
+
+
+def program_of(scene: Scene) -> Program:
+    """The kernel that steps a scene, not yet compiled."""
+    plan = Plan(scene, levels_of(scene), parallel=False, gpu=True)
+    steady, whole = steady_arrays(plan)
+    start = unmoved_state(scene, scene.raster.shape[1:])
+    inner = [name for n in range(len(plan.levels) - 1) for name in plan.each(f"z{n}_@")]
+    arrays = {name: np.zeros(scene.raster.shape, start.u.dtype) for name in inner}
+    arrays |= {f"was{m}": np.zeros_like(start.particle_values[m]) for m in plan.kept}
+    if plan.judged:
+        arrays["lost"] = np.zeros(scene.raster.shape, bits_for(scene))
+    if plan.tears:
+        arrays["torn"] = np.zeros(scene.raster.shape, np.uint8)
+    if scene.loads:
+        arrays |= dict.fromkeys(plan.each("load_@"), np.zeros(scene.raster.shape, start.u.dtype))
+    found = flattened(steady | arrays) | changing_planes(plan, start)
+    found |= leading_arrays(plan, [[]], {}, start.u.dtype)
+    alone = scene.raster.kind.size <= ALONE
+    source, names = write_kernel(replace(plan, shared=("step", *found)), whole, alone)
+    return Program(plan, source, names, {name: found[name] for name in names}, alone)
+
+
+def changing_planes(plan: Plan, state: State) -> Arrays:
+    """What steps change of a state, where its arrays are."""
+    held = state_arrays(plan, state.u, state.previous, state)
+    return flattened({name: array for name, array in held.items() if array is not None})
+
+
+DeviceFunction = Callable[..., Any]
+UNROUNDED = re.compile(r"\b(add|sub|mul)\.f(32|64)\b")
+"""What the driver may still contract, in the text of a kernel."""
+
+
+def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: int) -> Any:
+    """The function `run` of a kernel with this source, compiled when it is first launched; for
+    blocks of so many threads at most."""
+    scope = vars(ModuleType("kernel"))
+    scope |= words(_on_device) | {name: _on_device(of) for name, of in functions.items()}
+    # Linked at once: what links later would contract after all.
+    options = {} if is_simulated() else {"lto": False, "launch_bounds": threads}
+    scope.update(cuda=cuda, part=_on_device, kernel=cuda.jit(**options))
+    exec(compile(source, "<kernel>", "exec"), scope)
+    return scope["run"]
+
+
+def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> str:
+    """The kernel as a text of PTX for arguments of these types, on devices of a compute capability.
+
+    Raises PbdkitError where products and sums could be contracted.
+    """
+    with _uncontracted():
+        text, _ = cuda.compile(run.py_func, arguments, device=False, abi="numba", cc=device)
+    return _checked(str(text))
+
+
+def first_launch(run: Any, arguments: tuple[Any, ...]) -> None:
+    """One launch on one thread, which compiles the kernel. Raises PbdkitError where products and
+    sums could be contracted."""
+    with _uncontracted():
+        launcher(run, 1, 1)(*arguments)
+    if not is_simulated():
+        for text in run.inspect_asm().values():
+            _checked(text)
+
+
+def launcher(run: Any, blocks: int, threads: int) -> Any:
+    """What launches a kernel. That few blocks use little of a GPU is no news."""
+    with catch_warnings():
+        simplefilter("ignore", NumbaPerformanceWarning)
+        return run[blocks, threads]
+
+
+def most_blocks(run: Any, threads: int) -> int:
+    """How many blocks of so many threads are on the device at once."""
+    (kernel,) = run.overloads.values()
+    return int(kernel.max_cooperative_grid_blocks(threads))
+
+
+def is_simulated() -> bool:
+    """Whether numba runs kernels in Python: NUMBA_ENABLE_CUDASIM."""
+    return bool(cuda.config.ENABLE_CUDASIM)
+
+
+def _on_device(function: DeviceFunction) -> Any:
+    """A function that kernels call, made part of them."""
+    if is_simulated():
+        return function
+    _complete_ufuncs()
+    return cuda.jit(device=True, forceinline=True)(with_helpers_ready(function))
+
+
+@contextmanager
+def _uncontracted() -> Iterator[None]:
+    """While this lasts kernels are compiled so that a product and a sum are rounded each, as numpy
+    rounds them: libNVVM's option fma=0, which numba-cuda 0.30 has no switch for. Whether it has
+    been heard the text of the kernel tells."""
+    if is_simulated():
+        yield
+        return
+    from numba.cuda.cudadrv import nvvm
+
+    plain = nvvm.compile_ir
+    nvvm.compile_ir = partial(plain, fma=0)
+    try:
+        yield
+    finally:
+        nvvm.compile_ir = plain
+
+
+def _checked(text: str) -> str:
+    if UNROUNDED.search(text):
+        raise PbdkitError(
+            "this version of numba-cuda contracts products and sums, whatever it is told: results "
+            "would not be those of the other engines; take numba-cuda 0.30, or `engine: auto`"
+        )
+    return text
+
+
+@cache
+def _complete_ufuncs() -> None:
+    """Functions of numpy that numba-cuda 0.30 does not know in kernels, as `np.sqrt`: as the
+    device's library has them, else as numba has them elsewhere."""
+    from numba.cuda import mathimpl, ufuncs
+    from numba.cuda.np import ufunc_db
+
+    known = ufuncs.ufunc_db()
+    missing = [function for function in ufunc_db.get_ufuncs() if function not in known]
+    library = {of.__name__: of for *_, of in mathimpl.unarys}
+    for function in missing:
+        known[function] = ufunc_db.get_ufunc_info(function)
+        if of := library.get(function.__name__):
+            lower = partial(_lowered, mathimpl.get_unary_impl_for_fn_and_ty, of)
+            known[function] = {"f->f": lower, "d->d": lower}
+
+
+def _lowered(
+    find: DeviceFunction, of: DeviceFunction, context: Any, builder: Any, sign: Any, own: Any
+) -> Any:
+    """The call of a function of the device's library, as numba asks for it."""
+    return find(of, sign.args[0])(context, builder, sign, own)
+
+
+THREADS, MOST_THREADS, SIMULATED_THREADS = 256, 1024, 8
+"""Of a block where there are several, of one that is alone, and of the simulator."""
+
+
+class GpuStepper(Engine):
+    """Steps a scene with a kernel made for it, on the first GPU that there is.
+
+    What a state holds is sent there where it does not come from here, and is fetched at the end of
+    a call. Everything is looked at in every step.
+    """
+
+    name = "gpu"
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = self._numbered = scene
+        self._last: State | None = None
+        self._load_changes = -math.inf
+        """The step at which other loads act than those that were sent."""
+        program = program_of(scene)
+        self._plan, self._names = program.plan, program.names
+        self._device: Arrays = {}
+        self._send(program.arrays)
+        with blamed(self._plan.levels):
+            threads = MOST_THREADS if program.alone else THREADS
+            functions = functions_of(self._plan.levels)
+            self._run = make_kernel(program.source, functions, threads)
+            # No step is made, so that what does not compile is known before the first.
+            first_launch(self._run, self._given(0, 0))
+        self._launch = launcher(self._run, *self._blocks(program.alone))
+
+    def advance(self, state: State, steps: int = 1) -> State:
+        """As many steps a launch as it is known beforehand where the leaders are."""
+        if state is not self._last:
+            self._begin(state)
+        end = state.step + steps
+        while state.step < end:
+            state = self._some_steps(state, end)
+        self._fetch(state)
+        self._last = state
+        return state
+
+    def renewed(self, state: State, rows: slice) -> None:
+        """The device gets the state anew."""
+        self._last = None
+
+    def _blocks(self, alone: bool) -> tuple[int, int]:
+        """How many blocks of how many threads take part."""
+        size = self._scene.raster.kind.size
+        if is_simulated():
+            return 1, SIMULATED_THREADS
+        if alone:
+            return 1, min(MOST_THREADS, -(-size // 32) * 32)
+        return min(most_blocks(self._run, THREADS), -(-size // THREADS)), THREADS
+
+    def _begin(self, state: State) -> None:
+        """Sends all that steps change, from a state that did not come from here."""
+        self._load_changes = -math.inf
+        held = changing_planes(self._plan, state)
+        if self._plan.judged:
+            held |= flattened({"lost": lost_bits(self._scene, state)})
+        if self._plan.tears:
+            held |= flattened({"torn": torn_marks(self._scene, state)})
+        self._send(held)
+
+    def _fetch(self, state: State) -> None:
+        """Writes what steps have changed over the arrays of a state."""
+        for name, array in changing_planes(self._plan, state).items():
+            if name in self._device:
+                self._device[name].copy_to_host(array)
+
+    def _some_steps(self, state: State, end: int) -> State:
+        scene, step = self._scene, state.step + 1
+        is_cut = any(cut.at == step for cut in scene.experiment.cuts)
+        begins = any(
+            begun is None and leading.group.leads(step)
+            for leading, begun in zip(scene.leading, state.starts, strict=True)
+        )
+        if is_cut or begins:  # where bodies and bonds are is needed here
+            self._fetch(state)
+        if cut_bonds(scene, state.broken_step, step):
+            self._begin(state)
+        self._renumber(scene.at(step))
+        led, starts = prescribe(scene, state, step)
+        steady, ways = steady_steps(scene, step, end - state.step), [led]
+        if steady == 1:
+            ways += foreseen(scene, replace(state, starts=starts), led, end)
+        self._send(self._leading(ways, state) | flattened(self._loads(step, state)))
+        count = max(steady, len(ways))
+        with blaming(scene.experiment.rule, f"at step {step}"):
+            self._launch(*self._given(state.step, count))
+        if count % 2:
+            for u, v in zip(*(self._plan.each(f"flat_{side}_@") for side in "uv"), strict=True):
+                self._device[u], self._device[v] = self._device[v], self._device[u]
+        return replace(state, step=state.step + count, starts=starts)
+
+    def _renumber(self, scene: Scene) -> None:
+        if scene is not self._numbered:
+            self._send(changing_arrays(self._plan.renumbered(scene)))
+            self._numbered = scene
+
+    def _leading(self, ways: list[Led], state: State) -> Arrays:
+        if self._scene.leaders_overlap:
+            ways = [without_doubles(way) for way in ways]
+        return leading_arrays(self._plan, ways, {}, state.u.dtype)
+
+    def _loads(self, step: int, state: State) -> Arrays:
+        """What acts in a step, where it is not there already."""
+        loads = self._scene.loads
+        if loads is None or step < self._load_changes:
+            return {}
+        self._load_changes = loads.next_change(step)
+        load = loads.at(step, state.u.dtype)
+        return dict(zip(self._plan.each("load_@"), load, strict=True))
+
+    def _send(self, arrays: Arrays) -> None:
+        """Those that the kernel takes."""
+        self._device |= {
+            name: cuda.to_device(array) for name, array in arrays.items() if name in self._names
+        }
+
+    def _given(self, step: int, count: int) -> tuple[Any, ...]:
+        return step, count, *(self._device[name] for name in self._names)

@@ -1,0 +1,887 @@
+"""Writes how kernels find the damage of the cells around a particle, and which particles have any.
+
+Few particles have any. A plane of marks records which: the sweep moves all others as if no bond
+could break, and then computes the marked ones in short chunks. A mark stays, and is set too early
+rather than too late: without damage both ways give the same numbers.
+
+Writes what every kind of row does alike: the words of a neighbour, and a particle's target.
+
+Writes what looks at bonds where they are kept: the pass that renews and breaks them before the
+sweeps, and what notes those that a sweep has broken.
+
+Writes what is done in a row of particles that have all their neighbours, slot by slot: rest
+offsets, steps and weights are literals, so that what cancels at rest folds away.
+
+Writes what is done with any particles, in a loop over their slots: neighbours may be missing,
+cells cut, and there may be thousands of slots.
+
+Mostly particle after particle, since what is not like the middle of a body are its edges. Where
+there are too many slots to write out it is everything, and all particles of a row take in one slot
+after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.lattice.cells import CellBond
+from pbdkit.lattice.raster import EMPTY, FOLLOWER, Block, slot_step
+from pbdkit.plugin import RenewsBonds, RenewsParticles, Slot, Softens, SoftensCells, Stiffness
+from pbdkit.scene.constants import Home, bond_numbers
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.cell_stress import CellStresses
+from pbdkit.stepping.numba_engine.plan import Function, Level, Plan, listed, values
+from pbdkit.stepping.state import State
+
+CHUNK = 64
+"""Particles of a row among which one that is marked makes all be computed as torn."""
+Marks = NDArray[np.uint8]
+
+
+def damage_word(plan: Plan, broken: str, n: str, bond: str, limit: str, side: int = 0) -> str:
+    """The share of its pull that a bond of plane n has lost in the cell on a side of it, from the
+    words for the step at which it broke and, with `{n}` for their numbers, for what is remembered
+    of it and its limits."""
+    softened = plan.number(0.0)
+    if plan.softens_cells:
+        softened = bond.format(n=_numbers_of_damage(plan)[side])
+    if isinstance(plan.model, Softens):
+        homes = {Home.SLOT: f"end_limits[{n}, {{n}}]", Home.BOND: bond, Home.FIXED_BOND: limit}
+        c = f"Constants({values(plan.levels[-1].seen.bond, homes)})"
+        ahead, nothing = (plan.literal([x, *[0.0] * (len(plan.axes) - 1)]) for x in (1.0, 0.0))
+        r = plan.vector(f"end_rests[{n}, #]")
+        softened = f"{plan.number(1.0)} - seen({ahead}, {nothing}, {r}, {c}, q).x"
+    return f"({plan.number(1.0)} if {broken} >= 0 else {softened})"
+
+
+def _numbers_of_damage(plan: Plan) -> list[int]:
+    """Which of the numbers that are remembered of a bond are its damage on its left and right."""
+    names = [number.name for number in bond_numbers(plan.scene.experiment)]
+    return [names.index(f"damage_{side}") for side in ("left", "right")]
+
+
+def _raised(name: str, other: str) -> str:
+    """The larger of two as a choice, which vectorises: `max` does not."""
+    return f"{name} = {name} if {name} > {other} else {other}"
+
+
+def _damage_at(plan: Plan, home: str, n: str, side: int = 0) -> str:
+    """The same of the bond at a flat place."""
+    words = f"flat_bond{{n}}[{home}]", f"flat_limit{{n}}[{home}]"
+    return damage_word(plan, f"flat_broken[{home}]", n, *words, side)
+
+
+def _chosen(plan: Plan, home: str, n: str, on_right: str) -> str:
+    """That of a bond on the side that a word tells."""
+    one, other = (_damage_at(plan, home, n, side) for side in (0, 1))
+    return f"({other} if {on_right} else {one})" if plan.softens_cells else one
+
+
+def damage_lines(plan: Plan) -> list[str]:
+    """The damage of the cells around the particle at the flat place at_j of sublattice s."""
+    cells, bonds = _table_shape(plan.scene)
+    lines = []
+    for cell in range(cells):
+        for b in range(bonds):
+            lines.append(f"home = at_j + cell_bonds[s, {cell}, {b}]")
+            at = f"[s, {cell}, {b}]"
+            own = _chosen(plan, "home", f"cell_planes{at}", f"cell_sides{at}")
+            lines += [f"own = {own}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {own}"]
+    return [*lines, f"around = ({', '.join(f'm{cell}' for cell in range(cells))},)"]
+
+
+def torn_at_slot(plan: Plan) -> list[str]:
+    """The damage t beside slot k of that particle."""
+    sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
+    plane = "slot_planes[s, k]"
+    own = [f"own = {_damage_at(plan, 'home', plane)}", "other = own"]
+    if plan.softens_cells:
+        one, other = (_damage_at(plan, "home", plane, side) for side in (0, 1))
+        own = [f"own, other = {one}, {other}", "if signs[s, k] < 0:", "    own, other = other, own"]
+    return ["home = at_j + bonds_away[s, k]", *own, f"t = Torn({', '.join(sides)}, own, other)"]
+
+
+class RowDamage:
+    """The damage of the cells and bonds around the particles of a row of sublattice s that have all
+    their neighbours, from j0 to j1. `lines` compute it, kind by kind in loops of their own: one
+    loop with as many arrays would not vectorise."""
+
+    def __init__(self, plan: Plan, s: int) -> None:
+        self._around = plan.scene.neighbourhood.cells_around[s]
+        self._home = plan.scene.neighbourhood.home
+        self._number: dict[tuple[int, Slot | None, int], int] = {}
+        self._sides = (0, 1) if plan.softens_cells else (0,)
+        rows, loops = list[str](), list[str]()
+        for cell in self._around.cells:
+            for bond in cell:
+                self._add(plan, bond, rows, loops)
+        count, cells = len(self._number), self._around.cells
+        loops.append("for j in range(j1 - j0):")
+        for n, cell in enumerate(cells):
+            first, *others = (
+                self._number[bond.plane, bond.home, self._side(bond.side)] for bond in cell
+            )
+            loops.append(f"    m = damage[{first}, j]")
+            loops += [f"    {_raised('m', f'damage[{other}, j]')}" for other in others]
+            loops.append(f"    damage[{count + n}, j] = m")
+        made = f"damage = np.empty(({count + len(cells)}, j1 - j0), {plan.real})"
+        self.lines = [made, *rows, *loops]
+
+    def _side(self, side: int) -> int:
+        """The side by which damage is known: one for both where they are alike."""
+        return side if len(self._sides) == 2 else 0
+
+    def _add(self, plan: Plan, bond: CellBond, rows: list[str], loops: list[str]) -> None:
+        if (bond.plane, bond.home, 0) in self._number:
+            return
+        n = len(self._number)
+        step = bond.home.cell if bond.home else None
+        arrays = {f"y{n}": "broken"}
+        if isinstance(plan.model, (Softens, SoftensCells)):
+            arrays |= {f"y{n}_b{m}": f"bond{m}" for m in range(plan.bonds)}
+            arrays |= {f"y{n}_x{m}": f"limit{m}" for m in range(plan.limits)}
+        rows += [f"{name} = {plan.row(of, bond.plane, step)}" for name, of in arrays.items()]
+        words = f"y{n}[j]", str(bond.plane), f"y{n}_b{{n}}[j]", f"y{n}_x{{n}}[j]"
+        for side in self._sides:
+            m = self._number[bond.plane, bond.home, side] = len(self._number)
+            loops.append("for j in range(j1 - j0):")
+            loops.append(f"    damage[{m}, j] = {damage_word(plan, *words, side)}")
+
+    def beside(self, slot: Slot) -> str:
+        """The damage t beside a slot of the particle j of the row."""
+        plane, at_this_end = self._home[slot]
+        ends = (0, 1) if at_this_end else (1, 0)
+        home = None if at_this_end else slot
+        own = (self._number[plane, home, self._side(side)] for side in ends)
+        sides = (len(self._number) + cell for cell in self._around.beside[slot])
+        return f"t = Torn({', '.join(f'damage[{n}, j]' for n in (*sides, *own))})"
+
+
+def marking_lines(plan: Plan, home: str, there: str) -> list[str]:
+    """Marks the particles around a bond of plane n that has any damage: its flat place among the
+    bonds, and that of its home among the particles."""
+    if not plan.tears:
+        return []
+    words = (_damage_at(plan, home, "n", side) for side in range(1 + plan.softens_cells))
+    return [
+        f"if {' or '.join(f'{word} > {plan.number(0.0)}' for word in words)}:",
+        "    for e in range(mark_steps.shape[1]):",
+        f"        flat_torn[{there} + mark_steps[n, e]] = 1",
+    ]
+
+
+def stress_lines(plan: Plan, home: str) -> list[str]:
+    """The stress of the cells to the `left` and `right` of a bond of plane n whose end where it is
+    kept has this flat place."""
+    corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
+    count = len(Stiffness._fields)
+    known = [f"cell_ratios[{m}]" for m in range(count)]
+    lines = list[str]()
+    for side, name in enumerate(("left", "right")):
+        lines.append(f"cell = {home} + body_steps[n, {side}]")
+        if plan.mixed:
+            known = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
+        lines.append(f"origin = {home} + corner_steps[n, {side}, 0]")
+        for k in range(1, corners):
+            lines.append(f"corner = {home} + corner_steps[n, {side}, {k}]")
+            lines += plan.each(f"e{k}_@ = flat_u_@[corner] - flat_u_@[origin]")
+        for a in plan.axes:
+            for b, axis in enumerate(plan.axes):
+                rates = ((k, f"corner_rates[n, {side}, {k - 1}, {b}]") for k in range(1, corners))
+                terms = (f"e{k}_{a} * {rate}" for k, rate in rates)
+                lines.append(f"g_{a}{axis} = {' + '.join(terms)}")
+        ratios = f"Stiffness({', '.join(known)})"
+        lines.append(f"xx, yy, xy = stress(g_xx, g_xy, g_yx, g_yy, {ratios})")
+        lines.append(f"{name} = CellStress(xx, yy, xy, flat_body[cell])")
+    return lines
+
+
+def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
+    """The tables that these lines read: by plane and side the ways from a bond's home to the
+    corners of the cell, their rates, and the way to its share, with these."""
+    assert scene.cells is not None
+    stresses, shape = CellStresses(scene), scene.raster.shape
+    steps, rates, shares = [], [], []
+    for plane in scene.neighbourhood.planes:
+        beside = stresses.beside(plane.slot)
+        steps.append(
+            [[one.way(corner, plane.slot, shape) for corner in one.corners] for one in beside]
+        )
+        rates.append([one.rates for one in beside])
+        shares.append(
+            [
+                one.side.kind * math.prod(shape)
+                + (slot_step(shape, one.side.first) if one.side.first else 0)
+                for one in beside
+            ]
+        )
+    return {
+        "corner_steps": np.array(steps, np.int64),
+        "corner_rates": np.array(rates, real),
+        "body_steps": np.array(shares, np.int64),
+        "body": np.array(scene.cells.share, real),
+    }
+
+
+def tearing_arrays(scene: Scene) -> dict[str, Any]:
+    """The tables that these functions read: by sublattice and cell around a particle the way to
+    each bond, its plane, and the side of it on which the cell lies; by sublattice and slot the
+    plane of its bond and the cells beside it; by plane the ways to the particles around a bond."""
+    around = scene.neighbourhood
+    cells, bonds = _table_shape(scene)
+    most, sublattices = max(map(len, around.slots)), len(around.slots)
+    ways, planes, side = np.zeros((3, sublattices, cells, bonds), np.int64)
+    slot_planes = np.zeros((sublattices, most), np.int64)
+    slot_cells = np.zeros((sublattices, most, 2), np.int64)
+    for s, of in enumerate(around.cells_around):
+        for n in range(cells):
+            own = of.cells[min(n, len(of.cells) - 1)]
+            for b in range(bonds):
+                bond = own[min(b, len(own) - 1)]
+                ways[s, n, b], planes[s, n, b] = _way(scene, s, bond), bond.plane
+                side[s, n, b] = bond.side
+        for k, slot in enumerate(around.slots[s]):
+            slot_planes[s, k], slot_cells[s, k] = around.home[slot][0], of.beside[slot]
+    return {
+        "cell_bonds": ways,
+        "cell_planes": planes,
+        "cell_sides": side,
+        "slot_planes": slot_planes,
+        "slot_cells": slot_cells,
+        "mark_steps": _mark_steps(scene),
+    }
+
+
+def _table_shape(scene: Scene) -> tuple[int, int]:
+    """The most cells around a particle, and the most bonds of one."""
+    around = scene.neighbourhood.cells_around
+    return (
+        max(len(of.cells) for of in around),
+        max(len(cell) for of in around for cell in of.cells),
+    )
+
+
+def _way(scene: Scene, s: int, bond: CellBond) -> int:
+    """From the flat place of a particle of sublattice s to that of a bond."""
+    shape, home = scene.raster.shape, bond.home
+    step, sublattice = (slot_step(shape, home), home.target) if home else (0, s)
+    return step + (bond.plane - sublattice) * math.prod(shape[1:])
+
+
+def _mark_steps(scene: Scene) -> NDArray[np.int64]:
+    """(plane, step): from the flat place of a bond's home to those of all corners of the cells
+    beside it; some twice, so that all planes have as many."""
+    around, shape = scene.neighbourhood, scene.raster.shape
+    found = []
+    for plane in around.planes:
+        home = around.cells_around[plane.slot.source]
+        ends: set[Slot | None] = {None}
+        for cell in {*home.beside[plane.slot]}:
+            ends |= {slot for slot, beside in home.beside.items() if cell in beside}
+        found.append(sorted(slot_step(shape, slot) if slot else 0 for slot in ends))
+    most = max(map(len, found))
+    return np.array([steps + steps[:1] * (most - len(steps)) for steps in found], np.int64)
+
+
+def torn_marks(scene: Scene, state: State) -> Marks:
+    """1 at particles around which a bond is broken or softened."""
+    marks = np.zeros(scene.raster.shape, np.uint8)
+    renew_torn_marks(marks, scene, state, slice(0, marks.shape[1]))
+    return marks
+
+
+def renew_torn_marks(marks: Marks, scene: Scene, state: State, rows: slice) -> None:
+    """Writes those of the particles that have bonds in some rows of cells around them."""
+    assert state.broken_step is not None
+    around, (height, *across) = scene.neighbourhood, scene.raster.shape[1:]
+    margin, *beside = around.reach_in_cells  # beyond it nobody is
+    first, last = max(rows.start - margin, margin), min(rows.stop + margin, height - margin)
+    stop = tuple(size - n for size, n in zip(across, beside, strict=True))
+    softened = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
+    for s, of in enumerate(around.cells_around):
+        block = Block(s, (first, *beside), (max(first, last), *stop))
+        found = np.zeros(block.of(marks).shape, bool)
+        for bond in {bond for cell in of.cells for bond in cell}:
+            home = block.seen_through(bond.home) if bond.home else block
+            found |= home.within(state.broken_step[bond.plane]) >= 0
+            if softened:
+                for value, initial in _changed(scene, state):
+                    found |= home.within(value[bond.plane]) != initial
+        block.of(marks)[...] = found
+
+
+def _changed(scene: Scene, state: State) -> list[tuple[NDArray[Any], Any]]:
+    """The numbers that are remembered of bonds and change, with where they start."""
+    numbers = zip(bond_numbers(scene.experiment), state.bond_values, strict=True)
+    return [(value, number.initial) for number, value in numbers if number.changes]
+
+
+RUNS = ("first_run", "last_run", "first_row", "last_row")
+"""What functions of rows are given: some runs, and the rows of the first axis to keep to."""
+
+
+def parameters(plan: Plan, level: Level) -> list[str]:
+    """p of the rule, and of the fracture model, whose numbers are literals: they decide what is to
+    be computed at all."""
+    rule = [] if level.fields else [_rule(level)]
+    literal = listed(map(plan.number, plan.scene.constants.fracture))
+    return [*rule, f"q = Fracture({literal})"] if plan.model else rule
+
+
+def _rule(level: Level) -> str:
+    """p of the rule at a particle."""
+    n = level.number
+    homes = {Home.SCENE: f"rule{n}[{{n}}]", Home.FIXED_PARTICLE: "g{n}[j]"}
+    return f"p = Rule{n}({values(level.seen.rule, homes)})"
+
+
+def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
+    """The loop over the rows of some runs, as far as motion has come, with the rows of what stands
+    at the particles themselves and of where their moves go; what comes after stands in it."""
+    out.add(0, *parameters(plan, level), "for n in range(first_run, last_run):")
+    *lead, name = plan.lead
+    a = len(lead)
+    out.add(1, *(f"{outer} = runs[n, {m}]" for m, outer in enumerate(lead)))
+    out.add(1, f"j0 = max(runs[n, {a + 2}], box[{2 * a + 2}])")
+    out.add(1, f"j1 = min(runs[n, {a + 3}], box[{2 * a + 3}])", "if j0 >= j1:", "    continue")
+    low, high = (f"box[{2 * a}]", f"box[{2 * a + 1}]") if a else ("first_row", "last_row")
+    out.add(1, f"for {name} in range(max(runs[n, {a}], {low}), min(runs[n, {a + 1}], {high})):")
+    out.depth += 2
+    write_rows(out, plan, level, s)
+
+
+def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
+    """The rows of what stands at the particles of a row from j0 to j1, and of where their moves
+    go."""
+    n = level.number
+    rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
+    if n:
+        rows["z@"] = f"{level.source}_@"
+    if plan.is_loaded(level):
+        rows["g@"] = "load_@"
+    for row, of in rows.items():
+        out.add(0, *plan.each(f"{row} = {plan.row(of, s)}"))
+    for m in range(len(level.seen.own)):
+        before, after = (plan.row(array, s) for array in (plan.read[m], f"own{m}"))
+        out.add(0, f"a{m}, w{m} = {before}, {after}")
+    out.add(0, *(f"g{m} = {plan.row(f'field{m}', s)}" for m in range(level.fields)))
+
+
+def displacements(plan: Plan, level: Level) -> list[str]:
+    """u of the particle, and z, which the rule sees, on later levels; p where it differs."""
+    u, z = (f"{name} = {plan.vector(f'{row}@[j]')}" for name, row in ("uh", "zz"))
+    return [u, *([z] if level.number else []), *([_rule(level)] if level.fields else [])]
+
+
+def difference(plan: Plan, level: Level, there: str) -> str:
+    """d to the neighbour whose components have this pattern."""
+    return f"d = {plan.vector(f'{there} - {level.source[0]}.@')}"
+
+
+def bond_lines(plan: Plan, k: object, r: str, c: str, breaks: str, since: str) -> list[str]:
+    """d as the rule sees it at slot k: softened, or that of the fictitious point where the bond
+    `breaks` or is lost `since` a step."""
+    if plan.model is None or plan.tears:
+        return []
+    lines = [f"is_lost = {since} >= 0"]
+    if plan.judged:
+        lines = [
+            f"breaks_now = 1 if {breaks} else 0",
+            f"is_lost = ((bits >> {k}) & 1) | breaks_now",
+            f"now = now | (is_lost << {k})",
+        ]
+    lines.append(f"f = fictitious(u, {r}, q)")
+    if isinstance(plan.model, Softens):
+        lines.append(f"d = seen(d, f, {r}, {c}, q)")
+    return [*lines, f"d = {plan.vector('f.@ if is_lost else d.@')}"]
+
+
+def contributions(
+    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str] = (), torn: bool = False
+) -> str:
+    """What a neighbour contributes, by name; `there` is what is remembered of it, where the rule
+    sees that; with the damage t beside the bond where cells are `torn`."""
+    return _gathered(plan, level, r, weights, there, "c", torn)
+
+
+def more_contributions(
+    plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
+) -> list[str]:
+    """What cells of a stiffness of their own add to it, with these weights."""
+    lines = list[str]()
+    for w in weights:
+        lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
+        lines += [f"c{n} = c{n} + {plan.rounded(f'e{n}')}" for n in range(len(level.totals))]
+    return lines
+
+
+def _gathered(
+    plan: Plan, level: Level, r: str, weights: str, there: Iterable[str], into: str, torn: bool
+) -> str:
+    n = level.number
+    names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
+    given = ["d", r, f"Weights{n}({weights})", *(["t"] if torn else []), "p"]
+    if plan.shares:
+        given += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
+    return f"{names}, = {'torn' if torn else 'gather'}{n}({', '.join(given)})"
+
+
+def _own(level: Level) -> str:
+    """What is remembered of the particle."""
+    return values(level.seen.own, {Home.PARTICLE: "a{n}[j]"})
+
+
+def target_lines(
+    plan: Plan,
+    level: Level,
+    local: Sequence[str],
+    totals: list[str],
+    movable: str = "",
+    otherwise: str = "u.@",
+) -> list[str]:
+    """Where the particle goes, and what it remembers, where it is `movable` (everywhere), and what
+    stands there `otherwise`. `local` are the components of X from site (0, 0)."""
+    n, solver = level.number, plan.scene.experiment.stepping
+    sums = _pattern(level, totals, "Vector")
+    lines = list[str]()
+    X = centred = plan.literal([0.0] * len(plan.axes))
+    if level.scene.experiment.rule.uses_reference:
+        lines = [f"X{c} = {value}" for c, value in zip(plan.axes, local, strict=True)]
+        X = _shifted(plan, "+", plan.scene.raster.lattice.origin)
+        centred = _shifted(plan, "-", plan.scene.middle)
+    lines.append(f"here = Here({level.source[0]}, {X}, {centred}, Own{n}({_own(level)}))")
+    total = f"({sums},)"
+    if plan.is_loaded(level):
+        total = f"loaded{n}({total}, {plan.vector('g@[j]')}, p)"
+    lines.append(f"move = apply{n}({total}, here, p)")
+    changing: list[int] = []
+    if isinstance(level.scene.experiment.rule, RenewsParticles):
+        changing = [m for m, number in enumerate(level.seen.own) if number.changes]
+        lines.append(f"new = remember{n}(({sums},), here, p)")
+    if level is not plan.levels[-1]:
+        lines += plan.each(f"o@[j] = {_chosen_target('move.@', movable, plan.number(0.0))}")
+    else:
+        plain = solver.relaxation == 1.0 and "relaxation" not in solver.courses
+        relaxed = "move.@" if plain else "solver[0] * move.@"
+        swung = "new_@ = new_@ + solver[1] * (u.@ - o@[j])"
+        swing = [swung] if solver.memory != 0.0 else []
+        if "memory" in solver.courses:
+            swing = [f"{swung} if solver[1] != 0.0 else new_@"]
+        out = f"o@[j] = {_chosen_target('new_@', movable, otherwise)}"
+        for pattern in (f"new_@ = u.@ + {relaxed}", *swing, out):
+            lines += plan.each(pattern)
+    return lines + [
+        f"w{n}[j] = {_chosen_target(f'new[{m}]', movable, f'a{n}[j]')}"
+        for m, n in enumerate(changing)
+    ]
+
+
+def _shifted(plan: Plan, sign: str, by: Iterable[float]) -> str:
+    parts = (f"X{c} {sign} {plan.number(v)}" for c, v in zip(plan.axes, by, strict=True))
+    return f"Vector({', '.join(parts)})"
+
+
+def _chosen_target(value: str, where: str, otherwise: str) -> str:
+    return f"{value} if {where} else {otherwise}" if where else value
+
+
+def local_places(plan: Plan, s: str) -> list[str]:
+    """X from site (0, 0), in the order of operations of the rasters."""
+    index = [f"{name} + first[{n}]" for n, name in enumerate((*plan.lead, "j + j0"))]
+    places = []
+    for n, along in enumerate(zip(*plan.scene.raster.lattice.cell().vectors, strict=True)):
+        terms = [f"({at}) * {float(v)!r}" for at, v in zip(index, along, strict=True)]
+        places.append(f"at[{s}, {n}] + ({' + '.join(terms)})")
+    return places
+
+
+def _pattern(level: Level, names: list[str], kind: str) -> str:
+    """Names of components, those of a vector together."""
+    found, rest = [], iter(names)
+    for size in level.parts:
+        own = list(islice(rest, size))
+        found.append(own[0] if size == 1 else f"{kind}({', '.join(own)})")
+    return ", ".join(found)
+
+
+def write_bond_pass(plan: Plan) -> Function:
+    """The function that renews the bonds of some rows and columns, and breaks them."""
+    rows, columns = ("first_row", "last_row"), ("first_column", "last_column")
+    out = Function(plan.shared, "judge_bonds", *rows, *columns)
+    axes = range(len(plan.axes))
+    low, high = ([f"end_blocks[n, {2 * a + b}]" for a in axes] for b in (0, 1))
+    out.add(0, parameters(plan, plan.levels[-1])[-1], "for n in range(len(ends)):")
+    out.add(1, f"r = {plan.vector('end_rests[n, #]')}")
+    out.add(1, f"for i in range(max({low[0]}, first_row), min({high[0]}, last_row)):")
+    for depth, name in enumerate(plan.lead[1:], 2):
+        out.add(depth, f"for {name} in range({low[depth - 1]}, {high[depth - 1]}):")
+    out.depth = len(plan.axes)
+    step = [f"ends[n, {a + 2}]" for a in axes]
+    out.add(0, f"j0, j1 = max({low[-1]}, first_column), min({high[-1]}, last_column)")
+    out.add(0, "if j0 >= j1:", "    continue")
+    out.add(0, *plan.each(f"h@ = {plan.row('u_@', 'ends[n, 0]')}"))
+    out.add(0, *plan.each(f"n@ = {plan.row('u_@', 'ends[n, 1]', step)}"))
+    out.add(0, f"one = {plan.row('kind', 'ends[n, 0]')}")
+    out.add(0, f"other = {plan.row('kind', 'ends[n, 1]', step)}")
+    out.add(0, f"since = {plan.row('broken', 'n')}", f"ways = {plan.row('lengths', 'n')}")
+    out.add(0, *(f"b{m} = {plan.row(f'bond{m}', 'n')}" for m in range(plan.bonds)))
+    out.add(0, *(f"x{m} = {plan.row(f'limit{m}', 'n')}" for m in range(plan.limits)))
+    if plan.tears:
+        out.add(0, f"bond_base, base = {plan.flat('n')}, {plan.flat('ends[n, 0]')}")
+    _write_judging(out, plan)
+    return out
+
+
+class Judging(NamedTuple):
+    """What is done with the bond j of plane n: the lines that look at it, whether it breaks and
+    whether what it remembers differs then, and the lines that write both."""
+
+    look: list[str]
+    breaks: str
+    differ: str
+    write: list[str]
+
+
+def judging(plan: Plan, d: str, home: str) -> Judging:
+    """For a bond whose d has this pattern, and whose end where it is kept has this flat place."""
+    numbers = plan.levels[-1].seen.bond
+    homes = {Home.SLOT: "end_limits[n, {n}]", Home.BOND: "b{n}[j]", Home.FIXED_BOND: "x{n}[j]"}
+    c = values(numbers, homes)
+    look = [f"d = {plan.vector(d)}"]
+    kept = [number.changes for number in numbers if number.home is Home.BOND]
+    renews = isinstance(plan.model, RenewsBonds)
+    changing = [m for m, changes in enumerate(kept) if changes and renews]
+    if changing:
+        cells = ""
+        if plan.softens_cells:
+            look += stress_lines(plan, home)
+            cells = ", left, right"
+        look.append(f"new = update(d, r, Constants({c}), q{cells})")
+    for position, m in enumerate(changing):
+        look.append(f"new{m} = new[{position}]")
+        c = c.replace(f"b{m}[j]", f"new{m}")
+    breaks = f"breaks(d, r, Constants({c}), q)"
+    differ = "".join(f" | (new{m} != b{m}[j])" for m in changing)
+    renewed = [f"b{m}[j] = new{m}" for m in changing]
+    broken = [f"if {breaks}:", "    since[j] = step", "    ways[j] = length(r + d)"]
+    return Judging(look, breaks, differ, [*look, *renewed, *broken])
+
+
+def _write_judging(out: Function, plan: Plan) -> None:
+    """One row of bonds."""
+    can = f"((one[j] == {FOLLOWER}) & (other[j] == {FOLLOWER}))"
+    if plan.model.breaks_frame_bonds():
+        can = (
+            f"((one[j] == {FOLLOWER}) & (other[j] != {EMPTY}) | "
+            f"(one[j] != {EMPTY}) & (other[j] == {FOLLOWER}))"
+        )
+    own = judging(plan, "n@[j] - h@[j]", "base + j")
+    # Loops that look, and vectorise; the last one writes, where there is anything to write. What is
+    # far from breaking is told by lengths alone, which takes half the time.
+    out.add(0, "some = 0", "for j in range(j1 - j0):")
+    out.add(1, *own.look, f"some = some | (1 if {own.breaks}{own.differ} else 0)")
+    out.add(0, "if some:", "    some = 0", "    for j in range(j1 - j0):")
+    out.add(2, *own.look, f"fresh = (since[j] < 0) & {can} & ({own.breaks}{own.differ})")
+    out.add(2, "some = some | (1 if fresh else 0)")
+    out.add(0, "if some:", "    for j in range(j1 - j0):")
+    write = [*own.write, *marking_lines(plan, "bond_base + j", "base + j")]
+    out.add(2, f"if (since[j] < 0) & {can}:", *("    " + line for line in write))
+
+
+def write_events(plan: Plan) -> Function:
+    """The function that notes step and length of the bonds in a row that the sweep has just broken,
+    as their home end sees them; `base` is the row's first place."""
+    out = Function(plan.shared, "note_broken", "s", "base", "width")
+    out.add(0, "for here in range(base, base + width):")
+    out.add(1, "bits = int64(flat_lost[here])", "for k in range(counts[s]):")
+    out.add(2, "there, home = here + away[s, k], here + bonds_away[s, k]")
+    # The home end notes it, or this end where that is no particle of the body.
+    out.add(2, f"ours = signs[s, k] > 0 or flat_kind[there] != {FOLLOWER}")
+    out.add(2, "if (bits >> k) & 1 and ours and flat_broken[home] < 0:")
+    out.add(3, "flat_broken[home] = step")
+    d, r = plan.vector("flat_u_@[there] - flat_u_@[here]"), plan.vector("rests[s, k, #]")
+    out.add(3, f"flat_lengths[home] = length(signs[s, k] * {r} + signs[s, k] * {d})")
+    return out
+
+
+NOBODY, GENERAL, PLAIN, WITH_CELLS = range(4)
+"""Kinds of rows: those where no particle follows; where something may be missing; where all
+neighbours are there and cells are whole; where cells are not."""
+
+
+class Words(NamedTuple):
+    """The words for what one neighbour and its bond have: what stands there, with `@` for the axis;
+    what is remembered of it; the shares of the cells beside its slot, none where cells are whole;
+    with `{n}` for their numbers what is remembered of the bond, and its limits; and since when it
+    is broken."""
+
+    there: str
+    shown: Sequence[str]
+    shares: Sequence[str]
+    bond: str
+    limit: str
+    since: str
+
+
+def write_row(
+    plan: Plan, level: Level, s: int, kind: int, events: Function | None
+) -> list[Function]:
+    """The functions that move the particles of such a row, the one to be called last."""
+    out = Function(plan.shared, f"row{level.number}_{s}_{kind}", *RUNS)
+    write_row_loop(out, plan, level, str(s))
+    words = _write_neighbours(out, plan, level, s, kind)
+    if plan.judged:
+        out.add(0, f"gone = {plan.row('lost', s)}", "changed = 0")
+    if plan.tears:
+        out.add(0, f"marks = {plan.row('torn', s)}", "marked = 0")
+    out.add(0, "for j in range(j1 - j0):")
+    write_whole(out, plan, level, s, words, "gone[j]", "marks[j]" if plan.tears else "")
+    if events:
+        out.add(0, "if changed:")
+        out.add(1, events.call(str(s), plan.flat(str(s)), "j1 - j0"))
+    if not plan.tears:
+        return [out]
+    torn = write_torn_row(plan, level, s, kind)
+    out.add(1, "marked = marked | marks[j]")
+    _write_marked(out, torn)
+    return [torn, out]
+
+
+def _write_neighbours(out: Function, plan: Plan, level: Level, s: int, kind: int) -> list[Words]:
+    """The rows of the neighbours of a row, and the words for what each has."""
+    slots = plan.scene.neighbourhood.slots[s]
+    for k, slot in enumerate(slots):
+        there = plan.row(f"{level.source}_@", slot.target, slot.cell)
+        out.add(0, *plan.each(f"n{k}@ = {there}"), *_bond_rows(plan, k, slot))
+        shown = (plan.row(array, slot.target, slot.cell) for array in plan.shown)
+        out.add(0, *(f"e{k}_{m} = {row}" for m, row in enumerate(shown)))
+    shares: dict[str, str] = {}
+    if kind == WITH_CELLS:
+        rows = dict.fromkeys(row for slot in slots for row in _beside(plan, slot))
+        shares = {row: f"s{n}" for n, row in enumerate(rows)}
+    out.add(0, *(f"{name} = {row}" for row, name in shares.items()))
+    words = []
+    for k, slot in enumerate(slots):
+        own = [f"e{k}_{m}[j]" for m in range(len(plan.shown))]
+        beside = [f"{shares[row]}[j]" for row in _beside(plan, slot)] if shares else []
+        bond = f"b{k}_{{n}}[j]", f"x{k}_{{n}}[j]", f"f{k}[j]"
+        words.append(Words(f"n{k}@[j]", own, beside, *bond))
+    return words
+
+
+def write_whole(
+    out: Function,
+    plan: Plan,
+    level: Level,
+    s: int,
+    words: Sequence[Words],
+    lost: str,
+    mark: str = "",
+    damage: RowDamage | None = None,
+) -> None:
+    """The lines, in a loop, for a particle that has all its neighbours, with the words for each and
+    for its `lost` bonds. Where cells can be torn, particles with a `mark` stay as they are, or with
+    the damage around them the others."""
+    out.add(1, *displacements(plan, level))
+    if plan.judged:
+        out.add(1, f"bits = int64({lost})", "now = bits")
+    for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
+        out.add(1, *_slot_lines(plan, level, k, slot, words[k], damage))
+    chosen: tuple[str, ...] = ()
+    if mark:
+        chosen = f"{mark} {'!=' if damage else '=='} 0", "o@[j]"
+    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals, *chosen))
+    if plan.judged:
+        out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
+
+
+def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
+    """The function that moves the marked particles of such a row, from j0 to j1. All that it reads
+    begins at j0, so that its loops vectorise."""
+    out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
+    damage = RowDamage(plan, s)
+    out.add(0, *parameters(plan, level))
+    write_rows(out, plan, level, str(s))
+    words = _write_neighbours(out, plan, level, s, kind)
+    out.add(0, f"marks = {plan.row('torn', s)}", *damage.lines, "for j in range(j1 - j0):")
+    write_whole(out, plan, level, s, words, "", "marks[j]", damage)
+    return out
+
+
+def _write_marked(out: Function, torn: Function) -> None:
+    """A call for each chunk of a row in which particles are marked."""
+    *lead, _, _ = torn.own
+    out.add(0, "if marked:", f"    for begin in range(0, j1 - j0, {CHUNK}):")
+    out.add(2, f"end, marked = min(begin + {CHUNK}, j1 - j0), 0", "for j in range(begin, end):")
+    out.add(3, "marked = marked | marks[j]")
+    out.add(2, "if marked:", "    " + torn.call(*lead, "j0 + begin", "j0 + end"))
+
+
+def _slot_lines(
+    plan: Plan, level: Level, k: int, slot: Slot, words: Words, damage: RowDamage | None
+) -> list[str]:
+    """The contributions of one neighbour."""
+    bond = {
+        Home.SLOT: f"limits[{slot.source}, {k}, {{n}}]",
+        Home.BOND: words.bond,
+        Home.FIXED_BOND: words.limit,
+    }
+    c = f"Constants({values(level.seen.bond, bond)})"
+    # A bond is judged as its home end sees it, so that both ends agree to the last bit.
+    _, at_home = plan.scene.neighbourhood.home[slot]
+    seen = f"d, {plan.literal(slot.rest)}" if at_home else f"-d, {plan.literal(-slot.rest)}"
+    literal = level.scene.constants.weights[slot]._asdict()
+    weights = {name: plan.number(value) for name, value in literal.items()}
+    if words.shares:
+        weights["left"], weights["right"] = words.shares
+    r = plan.literal(slot.rest)
+    return [
+        difference(plan, level, words.there),
+        *bond_lines(plan, k, r, c, f"breaks({seen}, {c}, q)", words.since),
+        *([damage.beside(slot)] if damage else []),
+        contributions(plan, level, r, listed(weights.values()), words.shown, damage is not None),
+        *(
+            f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
+            for n in range(len(level.totals))
+        ),
+    ]
+
+
+def _bond_rows(plan: Plan, k: int, slot: Slot) -> list[str]:
+    """The rows of what is known of the bonds along a slot, where they are kept."""
+    if plan.model is None or plan.tears:
+        return []
+    plane, at_home = plan.scene.neighbourhood.home[slot]
+    rows = {f"b{k}_{n}": f"bond{n}" for n in range(plan.bonds)}
+    rows |= {f"x{k}_{n}": f"limit{n}" for n in range(plan.limits)}
+    if not plan.judged:
+        rows[f"f{k}"] = "broken"
+    step = None if at_home else slot.cell
+    return [f"{name} = {plan.row(array, plane, step)}" for name, array in rows.items()]
+
+
+def _beside(plan: Plan, slot: Slot) -> list[str]:
+    """The rows of shares of the cells on both sides of a slot."""
+    assert plan.scene.cells
+    rows = []
+    for side in plan.scene.cells.tiling.beside[slot]:
+        target, step = (side.first.target, side.first.cell) if side.first else (slot.source, None)
+        rows.append(plan.row("share", f"{side.kind}, {target}", step))
+    return rows
+
+
+def write_general(plan: Plan, level: Level, events: Function | None) -> Function:
+    """The function that moves particles of sublattice s."""
+    out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
+    write_row_loop(out, plan, level, "s")
+    out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
+    if _is_slot_after_slot(plan):
+        _write_slot_after_slot(out, plan, level)
+    else:
+        out.add(0, "changed = 0", "for j in range(width):")
+        write_one(out, plan, level)
+    if events:
+        out.add(0, "if changed:", "    " + events.call("s", "base", "width"))
+    return out
+
+
+def write_one(out: Function, plan: Plan, level: Level) -> None:
+    """The lines, in a loop, for one particle of sublattice s."""
+    # -0.0 + x is x, whatever its sign.
+    out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
+    if plan.judged:
+        out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
+    if plan.tears:
+        out.add(1, *damage_lines(plan))
+    out.add(1, *displacements(plan, level), "for k in range(counts[s]):")
+    _write_slot(out, plan, level, level.totals, "near")
+    out.add(1, f"moves = (flat_kind[at_j] == {FOLLOWER}) & (near > 0)")
+    out.add(1, *target_lines(plan, level, local_places(plan, "s"), level.totals, "moves"))
+    if plan.judged:
+        out.add(1, "changed = changed | (now ^ bits)", "flat_lost[at_j] = now")
+
+
+def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
+    sums = [f"{t}[j]" for t in level.totals]
+    out.add(0, f"t = np.full(({len(sums)}, width), {plan.number(-0.0)})")
+    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(level.totals)))
+    out.add(0, "near = np.zeros(width, np.int64)", f"kinds = {plan.row('kind', 's')}")
+    out.add(0, "for k in range(counts[s]):")
+    _write_slot(out, plan, level, sums, "near[j]")
+    out.add(0, "for j in range(width):")
+    out.add(1, *displacements(plan, level), f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
+    out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
+
+
+def _is_slot_after_slot(plan: Plan) -> bool:
+    """Whether all particles of a row take in one slot after the other."""
+    return plan.long and not plan.gpu
+
+
+def _seen(out: Function, plan: Plan, array: str, away: str) -> str:
+    """The word for a value of an array, `away` from the particle's place in flat arrays: looked up,
+    or from a row of them where all particles take in one slot after the other. `@` in the name is
+    each axis."""
+    if not _is_slot_after_slot(plan):
+        return f"flat_{array}[at_j + {away}]"
+    row = f"row_{array} = flat_{array}[base + {away}:base + {away} + width]"
+    out.add(1, *dict.fromkeys(plan.each(row)))
+    return f"row_{array}[j]"
+
+
+def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], near: str) -> None:
+    there = _seen(out, plan, f"{level.source}_@", "away[s, k]")
+    kind = _seen(out, plan, "kind", "away[s, k]")
+    named = {Home.SLOT: f"weights{level.number}[s, k, {{n}}]", Home.CELL: "share_{n}"}
+    depth = 1 if _is_slot_after_slot(plan) else 2
+    if any(number.home is Home.CELL for number in level.seen.weights):
+        for side in (0, 1):  # where cells are cut there are few slots
+            out.add(depth, f"share_{side} = flat_share[at_j + cells_away[s, k, {side}]]")
+    shown = [_seen(out, plan, array, "away[s, k]") for array in plan.shown]
+    bonds, limits_ = (0, 0) if plan.tears else (plan.bonds, plan.limits)
+    bond = [_seen(out, plan, f"bond{n}", "bonds_away[s, k]") for n in range(bonds)]
+    fixed = [_seen(out, plan, f"limit{n}", "bonds_away[s, k]") for n in range(limits_)]
+    first = plan.bonds_first and not plan.tears
+    since = _seen(out, plan, "broken", "bonds_away[s, k]") if first else ""
+    out.add(depth, f"r = {plan.vector('rests[s, k, #]')}")
+    if _is_slot_after_slot(plan):
+        out.add(1, "for j in range(width):")
+        out.add(2, *displacements(plan, level))
+    out.add(2, f"is_there = {kind} != {EMPTY}", difference(plan, level, there))
+    out.add(2, *(f"b{n} = {value}" for n, value in enumerate(bond)))
+    out.add(2, *(f"x{n} = {value}" for n, value in enumerate(fixed)))
+    limits = {Home.SLOT: "limits[s, k, {n}]", Home.BOND: "b{n}", Home.FIXED_BOND: "x{n}"}
+    c = f"Constants({values(level.seen.bond, limits)})"
+    spares = plan.model and not plan.model.breaks_frame_bonds()
+    can = f"({kind} == {FOLLOWER})" if spares else "is_there"
+    breaks = f"breaks(signs[s, k] * d, signs[s, k] * r, {c}, q) and {can}"
+    out.add(2, *bond_lines(plan, "k", "r", c, breaks, since))
+    if plan.tears:
+        out.add(2, *torn_at_slot(plan))
+    weights = values(level.seen.weights, named)
+    out.add(2, contributions(plan, level, "r", weights, shown, torn=plan.tears))
+    if plan.mixed:
+        _write_mixed(out, plan, level, shown)
+    for n, t in enumerate(sums):
+        out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
+    out.add(2, f"{near} = {near} + (1 if is_there else 0)")
+
+
+def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
+    """What cells of a stiffness of their own add. Of the others' stiffness they have no share, and
+    few particles are beside one."""
+    nothing = plan.number(0.0)
+    out.add(2, f"if share_0 == {nothing} or share_1 == {nothing}:")
+    weights = []
+    for side in (0, 1):
+        out.add(3, f"cell_{side} = {plan.mixed} * (at_j + cells_away[s, k, {side}])")
+    for m in range(plan.mixed):
+        homes = {Home.SLOT: f"more{m}[s, k, {{n}}]", Home.CELL: f"flat_mixed[cell_{{n}} + {m}]"}
+        weights.append(values(level.seen.weights, homes))
+    out.add(3, *more_contributions(plan, level, "r", weights, shown))

@@ -1,0 +1,640 @@
+"""Who runs the members of a sweep: this process, others on this machine, or a dask cluster.
+
+How large the result of a sweep will be, before anything is run.
+
+A sweep from its file to its dataset: what is held is not run, what is run is held.
+
+Workers of this machine: a process each, and another in its place where one is killed.
+
+A sweep that is asked for in Python, where nothing need be left on the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from abc import ABC, abstractmethod
+from asyncio import CancelledError
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xxhash
+
+from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, did_you_mean
+from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column, Values
+from pbdkit.io.open import open as open_result
+from pbdkit.io.recorder import Recorder
+from pbdkit.io.save import write_dataset
+from pbdkit.io.sinks import Sink
+from pbdkit.memory import machine_memory
+from pbdkit.model.experiment import Experiment, given_classes
+from pbdkit.model.reading import OF_PROGRAM, Source
+from pbdkit.plugin import Component
+from pbdkit.plugin.registry import GIVEN
+from pbdkit.progress import progress_bar
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.engine_choice import processors
+from pbdkit.sweeps.combine import joined
+from pbdkit.sweeps.specification import Asked, Dimension, Job, Keep, Member, checked, named
+from pbdkit.sweeps.store import Store
+from pbdkit.sweeps.worker import INTERRUPTED, KEPT, LOST, Report, report_of, run_member, run_members
+
+if TYPE_CHECKING:
+    import xarray
+
+
+HANDED_OUT_S = 0.25
+"""Members are handed out in chunks that take about so long."""
+MOST_AT_ONCE = 16
+"""So many at most, so that no chunk fills the pipe to a worker that was killed."""
+HEARTBEAT_S = 0.2
+MOST_LOSSES = 3
+"""So often a member may be lost with the process that ran it, and it alone; then it has failed."""
+AHEAD = 2
+"""Chunks that a worker has at a time, so that it need not wait for the next."""
+WAIT_FOR_WORKERS_S = 30.0
+
+
+class Crew(ABC):
+    """Runs members in whatever order."""
+
+    @abstractmethod
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+        """A report for each job, and None every now and then while there is none. Once `stopping`
+        says so nothing more is begun. Whoever closes the iterator ends the workers, too."""
+
+
+@dataclass
+class Queue:
+    """What is still to be handed out, how long members take, and how often each was lost."""
+
+    jobs: deque[Job]
+    workers: int
+    false_starts: int = 0
+    _seconds: float = 0.0
+    _count: int = 0
+    _losses: dict[str, int] = field(default_factory=dict)
+
+    def chunk(self) -> list[Job]:
+        """The next members for one worker: one as long as nothing is known, and one alone that was
+        lost before."""
+        if not self._count or self.jobs[0].key in self._losses:
+            return [self.jobs.popleft()]
+        size = int(HANDED_OUT_S * self._count / max(self._seconds, 1e-9))
+        size = min(size, MOST_AT_ONCE, len(self.jobs) // (2 * self.workers))
+        found = [self.jobs.popleft()]
+        while len(found) < size and self.jobs and self.jobs[0].key not in self._losses:
+            found.append(self.jobs.popleft())
+        return found
+
+    def reported(self, reports: list[Report]) -> Iterator[Report]:
+        """The reports."""
+        for report in reports:
+            self._seconds, self._count = self._seconds + report.seconds, self._count + 1
+            yield report
+
+    def lost(self, chunk: list[Job], reason: str) -> Iterator[Report]:
+        """Takes members back whose worker came to an end; one that was alone too often is given
+        up."""
+        again = []
+        for job in chunk:
+            losses = self._losses.get(job.key, 0) + (len(chunk) == 1)
+            self._losses[job.key] = losses
+            if losses >= MOST_LOSSES:
+                text = f"{reason} {losses} times while it ran; it runs again with the next call"
+                yield report_of(job.key, LOST, text, lasting=False)
+            else:
+                again.append(job)
+        self.jobs.extendleft(reversed(again))
+
+
+class Alone(Crew):
+    """This process, with classes from Python where there are any."""
+
+    def __init__(self, components: tuple[type[Component], ...] = ()) -> None:
+        self._components = components
+
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+        """One after the other."""
+        for job in jobs:
+            if stopping():
+                return
+            yield run_member(job, self._components, stopping)
+
+
+class Cluster(Crew):
+    """The workers of a dask cluster. Who can reach it can run code on it."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+        """Chunks as tasks, a few more than there are threads; those still out are cancelled where
+        the work ends early. Raises ExperimentError where no worker is there, and StorageError where
+        the scheduler is lost."""
+        out: dict[Any, list[Job]] = {}
+        try:
+            yield from self._with_workers(stopping)
+            yield from self._handed_out(jobs, out, stopping)
+        except (Exception, CancelledError) as error:
+            if self._is_there():
+                raise
+            raise StorageError(
+                f"--dask: the scheduler is lost ({type(error).__name__}); what was finished is "
+                "held, and the same command goes on with the others"
+            ) from None
+        finally:
+            if self._is_there():
+                self._client.cancel(list(out))
+
+    def _is_there(self) -> bool:
+        """Whether the scheduler is connected."""
+        return bool(self._client.status == "running")
+
+    def _with_workers(self, stopping: Callable[[], bool]) -> Iterator[None]:
+        """Wait for the first worker."""
+        end = time.monotonic() + WAIT_FOR_WORKERS_S
+        while not self._client.nthreads():
+            if time.monotonic() > end:
+                what = f"the cluster has had no worker for {WAIT_FOR_WORKERS_S:g} s"
+                raise ExperimentError(f"--dask: {what}")
+            if stopping():
+                return
+            time.sleep(HEARTBEAT_S)
+            yield None
+
+    def _handed_out(
+        self, jobs: list[Job], out: dict[Any, list[Job]], stopping: Callable[[], bool]
+    ) -> Iterator[Report | None]:
+        from distributed import wait as wait_for
+
+        wait: Any = wait_for
+        queue = Queue(deque(jobs), 1)
+        while (out or queue.jobs) and not stopping():
+            queue.workers = max(1, sum(self._client.nthreads().values()))
+            while queue.jobs and len(out) < AHEAD * queue.workers and not stopping():
+                chunk = queue.chunk()
+                out[self._client.submit(run_members, chunk, pure=False)] = chunk
+            try:
+                wait(list(out), timeout=HEARTBEAT_S, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                yield None
+            for future in [future for future in out if future.done()]:
+                yield from _reports(future, out.pop(future), queue)
+
+
+def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[Report]:
+    """Of a task that has ended, well or not."""
+    try:
+        reports = future.result()
+    except Exception as error:  # a worker was lost, or cannot import pbdkit
+        yield from queue.lost(chunk, f"{type(error).__name__}: {error}:")
+    else:
+        yield from queue.reported(reports)
+
+
+SHAPING = ("lattice", "body", "neighbours", "frame", "fracture", "diagnostics", "units")
+"""The parts of an experiment on which the shape of its dataset depends, besides its times."""
+SHARE = 0.5
+"""Of the memory of this machine that the dataset of a sweep may take."""
+TEXT = 8
+"""Bytes of a text, about."""
+
+
+class _Plan(Sink):
+    """Takes the columns of a run that is not made."""
+
+    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
+        """Keeps what it is told."""
+        self.columns, self.sizes, self.planned = columns, sizes, planned
+
+    def put(self, values: Values) -> None:
+        """Not wanted."""
+
+    def finish(self, attributes: dict[str, str]) -> None:
+        """Does not come."""
+
+    def abandon(self) -> None:
+        """Does not come."""
+
+
+class Outlook:
+    """Looks at the experiments of all members, builds the scene of each different body, and sums up
+    the dataset that they come to."""
+
+    def __init__(self, keep: Keep, count: int) -> None:
+        self._keep, self._count = keep, count
+        self._seen: set[bytes] = set()
+        self._columns: dict[str, Column] = {}
+        self._sizes: dict[str, int] = {}
+        self._times: set[tuple[int, tuple[int, ...] | None, int, int]] = set()
+
+    def look(self, experiment: Experiment, words: str) -> None:
+        """At one more, which messages call so. Raises ExperimentError and PluginError where it has
+        no scene, and where a variable that is to be kept is none of its dataset."""
+        steps, asked = experiment.steps, experiment.record
+        between = experiment.record_count - asked.count(steps)
+        self._times.add((steps, asked.at, asked.every, between))
+        data = experiment.model_dump(mode="json", by_alias=True)
+        shape = xxhash.xxh3_128_digest(json.dumps([data.get(part) for part in SHAPING]).encode())
+        if shape in self._seen:
+            return
+        self._seen.add(shape)
+        plan = _Plan()
+        with named(words):
+            Recorder(build_scene(experiment), plan).begin()
+        known = {column.name: column for column in plan.columns}
+        for name in self._keep.variables or ():
+            if name not in known:
+                hint = did_you_mean(name, known)
+                what = f"there is no variable '{name}'{hint} (known: {', '.join(known)})"
+                raise ExperimentError(f"keep.variables: {what}", ("keep", "variables"))
+        self._columns |= known
+        for dim, size in plan.sizes.items():
+            self._sizes[dim] = max(size, self._sizes.get(dim, 0))
+        self._sizes["step"] = max(steps + 1, self._sizes.get("step", 0))
+
+    def refuse_too_large(self) -> None:
+        """Raises ExperimentError where the dataset cannot be in memory at once, or where no member
+        comes to a step that is to be kept."""
+        keep, last = self._keep, max(steps for steps, *_ in self._times)
+        if isinstance(keep.times, tuple) and min(keep.times) > last:
+            text = f"keep.times: {min(keep.times)} is beyond the last step of all, {last}"
+            raise ExperimentError(text, ("keep", "times"))
+        sizes = self._sizes | {"time": self._number_of_times()}
+        names = self._columns if keep.variables is None else keep.variables
+        wanted = [self._columns[name] for name in names]
+        each = sum(math.prod(sizes.get(d, 1) for d in c.dims) * _bytes(c) for c in wanted)
+        if each * self._count > (most := int(SHARE * machine_memory())):
+            raise ExperimentError(
+                f"{self._count} members come to a dataset of {each * self._count / 2**30:.3g} GiB, "
+                f"and this machine can hold {most / 2**30:.3g}; keep fewer variables, or "
+                "`times: last`, or vary less",
+                ("keep",),
+            )
+
+    def _number_of_times(self) -> int:
+        """Along the joined dimension, as far as it is known before."""
+        times = self._keep.times
+        if times == "last":
+            return len({steps for steps, *_ in self._times})
+        if isinstance(times, tuple):
+            return len(set(times))
+        return max(
+            between + (steps // every + 2 if at is None else len({0, steps, *at}))
+            for steps, at, every, between in self._times
+        )
+
+
+def _bytes(column: Column) -> int:
+    return TEXT if column.dtype == "str" else np.dtype(column.dtype).itemsize
+
+
+RESULT = "sweep.nc"
+Show = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a sweep went: its members, how those ended that did (status and message by key), how many
+    were run now, what was found damaged, and where the dataset is; None where it was stopped."""
+
+    members: list[Member]
+    ends: dict[str, tuple[str, str]]
+    run: int
+    faults: list[str]
+    path: Path | None
+
+    @property
+    def failures(self) -> list[tuple[Member, str, str]]:
+        """The members that ended without values, with status and message."""
+        ended = [member for member in self.members if member.job.key in self.ends]
+        every = [(member, *self.ends[member.job.key]) for member in ended]
+        return [entry for entry in every if entry[1] not in KEPT]
+
+
+def carry_out(
+    asked: Asked, folder: Path, crew: Crew, stopping: Callable[[], bool], show: Show
+) -> Summary:
+    """Validates every member, runs those that the folder does not hold, and writes the dataset.
+
+    Raises ExperimentError and PluginError before anything runs, and StorageError. `stopping` is
+    asked all the time; once it says so, what is finished is kept and there is no dataset.
+    """
+
+    def show_unless_stopped(what: str, share: float) -> None:
+        if stopping():
+            raise _StoppedError
+        show(what, share)
+
+    try:
+        grid, members, versions = validated(asked, show_unless_stopped)
+    except _StoppedError:
+        return Summary([], {}, 0, [], None)
+    jobs = {member.job.key: member.job for member in members}
+    with Store(folder) as store:
+        ends = store.held()
+        todo = [job for key, job in jobs.items() if key not in ends]
+        passing: dict[str, Report] = {}
+        run = 0
+        for report in _heard(crew.work(todo, stopping), len(jobs), len(todo), show):
+            store.commit_if_due()
+            if report is None:
+                continue
+            if report.lasting:
+                store.put(report)
+            else:
+                passing[report.key] = report
+            ends[report.key], run = (report.status, report.message), run + 1
+        store.commit()
+        store.look_around()
+        if run < len(todo):
+            return Summary(members, ends, run, store.faults, None)
+        dataset = joined(grid, members, lambda key: passing.get(key) or store.report(key))
+        dataset.attrs = _attributes(asked, versions)
+        write_dataset(dataset, folder / RESULT, replace=True)
+    return Summary(members, ends, run, store.faults, folder / RESULT)
+
+
+class _StoppedError(Exception):
+    """The sweep was stopped while its members were validated."""
+
+
+def _heard(
+    reports: Iterator[Report | None], members: int, todo: int, show: Show
+) -> Iterator[Report | None]:
+    """The reports of all but interrupted members, with what whoever waits is told meanwhile."""
+    run = failed = 0
+    for report in reports:
+        if report is not None and report.status == INTERRUPTED:
+            continue
+        run, failed = run + bool(report), failed + bool(report and report.status not in KEPT)
+        told = f"{members - todo + run} of {members} members"
+        show(told + (f", {failed} failed" if failed else ""), run / todo)
+        yield report
+
+
+def validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], dict[str, str]]:
+    """The grid, the members on it, and the versions of what they use. Raises ExperimentError and
+    PluginError."""
+    experiment = asked.experiment()
+    grid, outlook = asked.grid(experiment), Outlook(asked.sweep.keep, asked.sweep.count)
+    members: list[Member] = []
+    versions: dict[str, str] = {}
+    try:
+        for member, one in asked.members(grid, lambda share: show("validating", share)):
+            outlook.look(one, member.words)
+            members.append(member)
+            versions |= member.job.versions
+        outlook.refuse_too_large()
+    except ExperimentError as error:
+        name = asked.source.name
+        raise ExperimentError(f"{name}: {error}" if name else str(error), error.where) from None
+    return grid, members, versions
+
+
+def _attributes(asked: Asked, versions: dict[str, str]) -> dict[str, str]:
+    experiment = asked.experiment()
+    sweep = asked.sweep.model_dump(mode="json", by_alias=True)
+    sweep["experiment"] = experiment.model_dump(mode="json", by_alias=True)
+    return {
+        "Conventions": CONVENTIONS,
+        "schema_version": SCHEMA_VERSION,
+        "title": f"sweep of {experiment.name}",
+        "pbdkit_version": version("pbdkit"),
+        "sweep": json.dumps(sweep),
+        "plugins": json.dumps({k: v for k, v in versions.items() if k != GIVEN}),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+GRACE_S = 1.0
+"""Seconds that members have to end once the sweep is stopped."""
+MOST_STARTS = 10
+"""So many workers that end before they have begun, with nothing reported between, are no chance."""
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+"""What limits the threads of linear algebra where it is said before that is loaded. Kernels keep to
+the one that each member asks for."""
+
+
+class Processes(Crew):
+    """So many workers, each a pool of one process, so that who is killed takes nobody along and
+    what it was doing is known."""
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+        """Raises PbdkitError where workers cannot be started."""
+        workers = [_Worker() for _ in range(min(self._workers, len(jobs)))]
+        queue = Queue(deque(jobs), max(1, len(workers)))
+        try:
+            while queue.jobs or any(worker.chunks for worker in workers):
+                if stopping():
+                    wait([f for worker in workers for f in worker.chunks], GRACE_S)
+                    queue.jobs.clear()
+                for worker in workers:
+                    while queue.jobs and len(worker.chunks) < AHEAD and worker.take(queue):
+                        pass
+                if not _any_done(workers):
+                    yield None
+                for worker in workers:
+                    yield from worker.reports(queue)
+                if stopping():
+                    return
+        finally:
+            for worker in workers:
+                worker.end()
+
+
+def _any_done(workers: list[_Worker]) -> bool:
+    """Whether any chunk is done now, or soon."""
+    futures = [future for worker in workers for future in worker.chunks]
+    return bool(wait(futures, HEARTBEAT_S, FIRST_COMPLETED).done)
+
+
+class _Worker:
+    """One process at a time, and the chunks that it has, the one that it is at first."""
+
+    def __init__(self) -> None:
+        self.chunks: dict[Future[list[Report]], list[Job]] = {}
+        self._pool: ProcessPoolExecutor | None = None
+        self._processes: set[BaseProcess] = set()
+
+    def take(self, queue: Queue) -> bool:
+        """Whether it could take the next chunk: not where it was killed and has still to say so."""
+        chunk = queue.chunk()
+        for _ in range(1 + (not self.chunks)):
+            try:
+                with _spawning():
+                    self.chunks[self._current().submit(run_members, chunk)] = chunk
+                return True
+            except BrokenProcessPool:  # with nothing to do, another takes its place at once
+                if not self.chunks:
+                    self._renew()
+        queue.jobs.extendleft(reversed(chunk))
+        return False
+
+    def reports(self, queue: Queue) -> Iterator[Report]:
+        """Of the chunks that are done. Where the process was killed the first is what it was at."""
+        for future in [future for future in self.chunks if future.done()]:
+            chunk = self.chunks.pop(future, None)
+            if chunk is None:
+                return
+            try:
+                reports = future.result()
+            except BrokenProcessPool:
+                yield from self._killed(chunk, queue)
+                return
+            queue.false_starts = 0
+            yield from queue.reported(reports)
+
+    def end(self) -> None:
+        """Ends the process, whatever it is at, begun or not."""
+        if self._pool is not None:
+            for process in self._processes:
+                process.kill()
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    def _killed(self, chunk: list[Job], queue: Queue) -> Iterator[Report]:
+        waiting = [job for jobs in self.chunks.values() for job in jobs]
+        self.chunks.clear()
+        queue.jobs.extendleft(reversed(waiting))
+        begun = not self._begun.exception()
+        self._renew()
+        if begun:
+            yield from queue.lost(chunk, "its process was killed, as where memory runs out,")
+            return
+        queue.jobs.extendleft(reversed(chunk))
+        queue.false_starts += 1
+        if queue.false_starts >= MOST_STARTS:
+            raise PbdkitError(
+                f"{MOST_STARTS} worker processes ended while they were starting; --workers 1 runs "
+                "the members in this process, and shows why"
+            )
+
+    def _renew(self) -> None:
+        assert self._pool is not None
+        self._pool.shutdown()
+        self._pool = None
+
+    def _current(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            others = {*active_children()}
+            self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+            self._begun = self._pool.submit(os.getpid)
+            self._processes = {*active_children()} - others
+        return self._pool
+
+
+def _begin() -> None:
+    """In a worker: Ctrl-C is for the sweep, and with the sweep's process its workers end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
+
+
+def _end_after(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _spawning() -> Iterator[None]:
+    """What a process that is started in the block finds: one thread of linear algebra, Ctrl-C
+    blocked until it is ignored, and no script of the caller, which would run once more."""
+    blocks: Any = getattr(signal, "pthread_sigmask", None)
+    mask = blocks(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else None
+    main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ONE_THREAD}
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        if blocks:
+            blocks(signal.SIG_SETMASK, mask)
+
+
+def called(
+    experiment: Experiment,
+    parts: dict[str, Any],
+    folder: str | Path | None,
+    workers: int | None,
+    client: Any,
+    progress: bool,
+) -> xarray.Dataset:
+    """The dataset of a sweep with these parts, loaded where no folder keeps it."""
+    base = replace(experiment.as_written(), name="")
+    if base.beside.folder is None:
+        base.beside = OF_PROGRAM
+    given = given_classes(experiment)
+    if given and folder is not None:
+        raise ExperimentError(
+            "folder: members are known by the versions of what they use, and classes from Python "
+            "have none; leave it out, or make a plugin of them (`pbdkit plugins new`)"
+        )
+    crew = crew_of(workers, client, given)
+    sweep = checked(parts | {"experiment": base.data}, Source())
+    asked = Asked(sweep, base, Source(), given)
+    with ExitStack() as ending:
+        kept = Path(folder or ending.enter_context(tempfile.TemporaryDirectory(prefix="pbdkit-")))
+        with progress_bar(progress) as show:
+            summary = carry_out(asked, kept, crew, lambda: False, show)
+        for text in summary.faults:
+            warnings.warn(text, PbdkitWarning, stacklevel=4)
+        if failures := summary.failures:
+            member, status, message = failures[0]
+            text = f"{len(failures)} of {len(summary.members)} members have no values, as {status}"
+            warnings.warn(f"{text}: {member.words}: {message}", PbdkitWarning, stacklevel=4)
+        assert summary.path is not None  # nobody stops it but by an exception
+        dataset = open_result(summary.path)
+        if folder is None:
+            with dataset:
+                return dataset.load()
+        return dataset
+
+
+def crew_of(workers: int | None, client: Any, components: tuple[type[Component], ...] = ()) -> Crew:
+    """Who runs the members. Raises ExperimentError where that cannot be."""
+    if workers is not None and (type(workers) is not int or workers < 1):
+        raise ExperimentError(f"workers: should be a number from 1, got {workers!r}")
+    if client is not None and workers is not None:
+        raise ExperimentError("give workers of this machine, or a cluster, not both")
+    if components and (client is not None or (workers or 1) > 1):
+        raise ExperimentError(
+            "classes from Python are known in this process only: leave workers and client out, or "
+            "make a plugin of them (`pbdkit plugins new`)"
+        )
+    if client is not None:
+        return Cluster(client)
+    number = workers or (1 if components else processors())
+    return Alone(components) if number == 1 else Processes(number)

@@ -1,0 +1,267 @@
+"""Laws of mechanics, measured: how far a scene is from each, as a share of its largest stiffness.
+
+A body that is moved rigidly stores nothing; what particle a does to b, b does to a (Maxwell and
+Betti); no deformation gives energy back; a broken bond makes nothing stiffer. All hang on the
+stiffness matrix K = -∂force/∂u of the body's particles, leaders included, which is probed here by
+the forces that the stepper finds: nothing of the rule is taken for granted.
+
+The small solids on which laws of mechanics are asked of a component.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError
+from pbdkit.io.checkpoint import Standing
+from pbdkit.io.recorder import Recorder
+from pbdkit.io.sinks import MemorySink
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin import Component, FollowerRule, FramePolicy, StoresEnergy
+from pbdkit.plugin.component import as_vector
+from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.vector import vector
+from pbdkit.restart import take_up
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.simulation import Processes, Run, record, standing_of
+from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.numpy_engine import Stepper
+from pbdkit.stepping.state import State, initial_state
+from pbdkit.testing.states import displacements, state_with
+
+Floats = NDArray[np.float64]
+SHARE_BROKEN = 0.2
+"""The share of bonds that are broken in a pattern at random."""
+NUDGE = 1e-5
+"""By what share of the spacing a particle is moved where the rule is not linear: the error of a
+central difference is its square."""
+
+
+def whole_state(scene: Scene) -> State:
+    """The scene at rest with every bond that cracks and cuts leave."""
+    state = initial_state(scene)
+    state.u[...] = state.previous[...] = 0.0
+    return state
+
+
+def torn_state(scene: Scene, seed: int, before: State) -> State:
+    """A state at rest with bonds broken at random besides those that are broken."""
+    state = before.copy()
+    state.u[...] = state.previous[...] = 0.0
+    if state.broken_step is not None:
+        generator, bonds = np.random.default_rng(seed), scene.bonds
+        chosen = generator.random(len(bonds.plane)) < SHARE_BROKEN
+        planes = state.broken_step.reshape(len(state.broken_step), -1)
+        planes[bonds.plane[chosen], bonds.place[chosen]] = 1
+    return state
+
+
+def softened_state(scene: Scene, seed: int) -> State:
+    """The scene at rest after its particles were put elsewhere at random and back again, so that
+    bonds have broken and softened as its fracture model has it, and with bonds broken besides."""
+    state = Stepper(scene).advance(state_with(scene, displacements(scene, seed, share=0.3)), 1)
+    return torn_state(scene, seed, state)
+
+
+def stiffness(scene: Scene, state: State) -> Floats:
+    """K over Young's modulus and thickness at rest with the bonds of a state, (2 particles of the
+    body, 2 particles): x of the first, y of the first, ..."""
+    followers, raster = SlotFollowers(scene), scene.raster
+    place = raster.place_of(raster.body_rows)
+    is_linear = not isinstance(scene.experiment.rule, StoresEnergy)
+    unit = scene.neighbourhood.nudge_unit
+    step = unit if is_linear else NUDGE * unit
+    u = np.zeros_like(state.u, dtype=float)
+    flat = u.reshape(len(u), -1)
+
+    def pulled(particle: int, axis: int, way: float) -> Floats:
+        flat[...] = 0.0
+        if particle >= 0:
+            flat[axis, place[particle]] = way
+        if scene.frame:
+            scene.frame.follow(flat, flat)
+        forces = followers.forces(u, state).reshape(len(u), -1)[:, place]
+        return np.asarray(forces.T.ravel(), float)
+
+    still = pulled(-1, 0, 0.0)
+    columns = []
+    for particle in range(len(place)):
+        for axis in range(len(u)):
+            ahead = pulled(particle, axis, step)
+            if is_linear:
+                columns.append((still - ahead) / step)
+            else:
+                columns.append((pulled(particle, axis, -step) - ahead) / (2.0 * step))
+    return np.array(columns).T
+
+
+def pulls_at_rest(scene: Scene, state: State) -> bool:
+    """Whether particles at rest exert forces, as where fictitious points stand off: these turn with
+    the body, so that a rotation changes them."""
+    u = np.zeros_like(state.u, dtype=float)
+    return bool(np.abs(SlotFollowers(scene).forces(u, state)).max() > 0.0)
+
+
+def rigid_motions(scene: Scene) -> Floats:
+    """The translations and the small rotation about the middle, (2 particles, 3), of which the
+    largest displacement is 1."""
+    raster = scene.raster
+    X = raster.reference(raster.body_rows)
+    x, y = (X - X.mean(axis=0)).T
+    one, none = np.ones(len(X)), np.zeros(len(X))
+    motions = np.array([[one, none], [none, one], [-y, x]]).transpose(0, 2, 1)
+    motions = motions.reshape(3, -1)
+    largest = np.abs(motions).max(axis=1, keepdims=True)
+    return np.asarray((motions / np.where(largest > 0.0, largest, 1.0)).T)
+
+
+def resistance_to_rigid_motions(scene: Scene, K: Floats) -> float:
+    """The largest force of a rigid motion. Where K is symmetric no deformation has a resultant or a
+    moment, then."""
+    return _share(np.abs(K @ rigid_motions(scene)).max(), K)
+
+
+def asymmetry(K: Floats) -> float:
+    """The largest difference of what a does to b and b to a."""
+    return _share(np.abs(K - K.T).max(), K)
+
+
+def energy_given_back(K: Floats) -> float:
+    """By how much the smallest eigenvalue of the symmetric part is below 0."""
+    return _share(-np.linalg.eigvalsh((K + K.T) / 2)[0], K)
+
+
+def stiffening(before: Floats, after: Floats) -> float:
+    """By how much some deformation costs more after than before."""
+    more = after - before
+    return _share(np.linalg.eigvalsh((more + more.T) / 2)[-1], before)
+
+
+def _share(value: float, K: Floats) -> float:
+    largest = np.abs(K).max()
+    return max(0.0, float(value)) / float(largest) if largest > 0.0 else 0.0
+
+
+def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -> Any:
+    """The dataset of a run that is stopped at a step, kept as the run store keeps it, and gone on
+    with in a scene made anew."""
+    sink = MemorySink()
+    left, recorder = Run(scene, start=start), Recorder(scene, sink)
+    recorder.begin()
+    for state in left:
+        recorder.observe(state)
+        if state.step >= step:
+            break
+    kept = standing_of(left.driver, recorder)
+    facts = json.loads(json.dumps(kept.facts))
+    rest, recorder = Run(again), Recorder(again, sink)
+    standing = Standing(kept.about, facts, kept.copied().arrays)
+    take_up(rest.driver, recorder, standing, Processes())
+    record(rest, sink, recorder=recorder)
+    return sink.dataset()
+
+
+BODY = {"type": "grid", "columns": 4, "rows": 4}
+TEARS = {"type": "strain", "failure": 0.1}
+SPRINGS = {"type": "springs"}
+MOST = 2
+"""So many lattices are tried."""
+
+
+class NoSolidError(Exception):
+    """A component takes part in no scene of known forces and free edges; the text is the reason."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A scene whose rule knows forces and whose edges are free, and its stiffness: with all bonds,
+    softened by displacements at random with some broken besides, and with more of them broken."""
+
+    scene: Scene
+
+    @cached_property
+    def whole(self) -> Floats:
+        """With all bonds."""
+        return stiffness(self.scene, whole_state(self.scene))
+
+    @cached_property
+    def softened(self) -> Floats:
+        """With some softened, some broken."""
+        return stiffness(self.scene, self._softened)
+
+    @cached_property
+    def torn(self) -> Floats:
+        """With more broken."""
+        return stiffness(self.scene, torn_state(self.scene, 4, self._softened))
+
+    @property
+    def stages(self) -> list[tuple[str, Floats]]:
+        """Each stiffness by what the body is then; one after the other bonds are lost."""
+        if not self.scene.has_fracture:
+            return [("whole", self.whole)]
+        return [("whole", self.whole), ("softened", self.softened), ("torn", self.torn)]
+
+    @cached_property
+    def _softened(self) -> State:
+        return softened_state(self.scene, 3)
+
+
+def solids_of(component: Component, around: Mapping[str, Any]) -> list[Solid]:
+    """Those that a component takes part in, one a lattice, with the `lattice` and `neighbours` that
+    are tried. Raises NoSolidError without any."""
+    found: dict[str, Solid] = {}
+    for experiment in _experiments(component, around):
+        name = experiment.lattice.type
+        if name not in found and len(found) < MOST:
+            with suppress(ExperimentError):
+                solid = Solid(build_scene(experiment))
+                if not (_is_tied(solid.scene) or pulls_at_rest(solid.scene, solid._softened)):
+                    found[name] = solid
+    if not found:
+        raise NoSolidError("no scene has known forces, free edges, and no forces at rest")
+    return list(found.values())
+
+
+def _experiments(component: Component, around: Mapping[str, Any]) -> Iterator[Experiment]:
+    given: dict[str, Any] = {"name": "conformance", "body": BODY, "steps": 4}
+    lattices, neighbours = (
+        list(part) if isinstance(part := around[name], (list, tuple)) else [part]
+        for name in ("lattice", "neighbours")
+    )
+    for parts, lattice, near in product(_parts(component), lattices, neighbours):
+        with suppress(ExperimentError):
+            yield Experiment(**given, **parts, lattice=lattice, neighbours=near)
+
+
+def _parts(component: Component) -> list[dict[str, Any]]:
+    """Rule, frame and fracture with which it is tried, those first in which bonds break."""
+    if isinstance(component, FollowerRule):
+        if material_of(component) is None:
+            raise NoSolidError("it knows no forces")
+        frame = {"type": "natural" if component.uses_cells else "none"}
+        plain = {"rule": component, "frame": frame}
+        return [plain | {"fracture": TEARS}, plain]
+    if isinstance(component, FramePolicy):
+        if not component.edges_are_free:
+            raise NoSolidError("its points pull at the edges, which are not free")
+        return [{"rule": SPRINGS, "frame": component, "fracture": TEARS}]
+    return [{"rule": SPRINGS, "frame": {"type": "natural"}, "fracture": component}]
+
+
+def _is_tied(scene: Scene) -> bool:
+    """Whether what takes the place of a lost neighbour stands somewhere in space, which a body that
+    moves as a whole feels."""
+    model, slot = scene.experiment.fracture, scene.neighbourhood.slots[0][0]
+    u, p = vector([0.1] * scene.axes), scene.constants.fracture
+    there = (model.fictitious(u * share, slot.rest, p) for share in (0.0, 1.0))
+    one, other = (as_vector(each, "fictitious", u) for each in there)
+    return any(float(a) != float(b) for a, b in zip(one, other, strict=True))

@@ -1,0 +1,251 @@
+"""What is asked of scenes that are told otherwise: in other units, mirrored, turned.
+
+What is asked of the stiffness that a body has, whole and with bonds torn at random.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from pbdkit.errors import ExperimentError
+from pbdkit.model.experiment import Experiment
+from pbdkit.plugin import (
+    Component,
+    Draws,
+    FollowerRule,
+    FractureModel,
+    FramePolicy,
+    Lattice,
+    NeighbourMetric,
+    Quantity,
+    Remembers,
+    StoresEnergy,
+)
+from pbdkit.scene.scene import Scene, build_scene
+from pbdkit.testing.mechanics import (
+    NoSolidError,
+    Solid,
+    asymmetry,
+    energy_given_back,
+    resistance_to_rigid_motions,
+    stiffening,
+)
+from pbdkit.testing.states import Floats, advanced, displacements
+from pbdkit.testing.subject import NotAskedError, PropertyError, Subject, asked_of, place_of
+
+STEPS = 3
+ROUNDING = 1e-11
+"""As a share of the largest displacement."""
+LARGER = 2.0**20
+"""By so much lengths are multiplied: a power of two, so that nothing is rounded."""
+AXES: dict[str, Floats] = {
+    "mirrored in x": np.diag([-1.0, 1.0]),
+    "mirrored in y": np.diag([1.0, -1.0]),
+    "turned by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
+}
+REMEDY = (
+    "compare lengths with those of the neighbours at rest, and annotate parameters that are "
+    "lengths with `pbdkit.LENGTH`, powers of lengths with a `pbdkit.Quantity`"
+)
+EVEN = {"type": "grid", "columns": 5, "rows": 5}
+"""A body that is its own image."""
+
+
+@asked_of(Lattice, NeighbourMetric, FollowerRule, FramePolicy, FractureModel)
+def goes_alike_in_all_units(subject: Subject) -> None:
+    """Where all lengths are multiplied by one number, a step makes displacements that are as much
+    longer: no length is told apart from its share of the spacing, and parameters that are lengths
+    are annotated as such."""
+    if isinstance(subject.component, Lattice) and not _lengths(subject.component):
+        raise NotAskedError("it has no length among its parameters: it is of one size")
+    for scene in subject.scenes[:2]:
+        u = displacements(scene, 8)
+        if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
+            continue  # which is told elsewhere
+        larger = _scaled_scene(scene.experiment)
+        one, other = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
+        off = np.abs(other / LARGER - one).max() / max(1e-300, np.abs(one).max())
+        if not off <= ROUNDING:
+            fault = f"with all lengths {LARGER:g} times as large a body moves otherwise"
+            where = place_of(scene.experiment)
+            raise PropertyError(f"{fault}, by {off:.3g} of its displacement, {where}: {REMEDY}")
+
+
+def _scaled_scene(experiment: Experiment) -> Scene:
+    """The scene with all lengths of lattice, neighbours, rule and fracture multiplied."""
+    names = ("lattice", "neighbours", "rule", "frame", "fracture")
+    parts = {name: _scaled(getattr(experiment, name)) for name in names}
+    try:
+        return build_scene(experiment.model_copy(update=parts))
+    except ExperimentError as error:
+        fault = f"with all lengths {LARGER:g} times as large the scene is refused: {error}"
+        raise PropertyError(f"{fault}: {REMEDY}") from None
+
+
+def _scaled(part: Component) -> Component:
+    """The component with its lengths multiplied."""
+    found: dict[str, Any] = part.model_dump(by_alias=True)
+    for key, power in _lengths(part).items():
+        found[key] = _times(LARGER**power, found[key])
+    return type(part).model_validate(found)
+
+
+def _lengths(part: Component) -> dict[str, int]:
+    """The parameters that count in lengths, with the power; where a lattice lies is none."""
+    found = {}
+    for name, field in type(part).model_fields.items():
+        powers = {q.length for q in _quantities([field.annotation, *field.metadata])}
+        if len(powers) == 1 and name != "origin":
+            found[field.alias or name] = powers.pop()
+    return found
+
+
+def _quantities(found: Any) -> Iterator[Quantity]:
+    """Those that an annotation names, however deep."""
+    for one in found:
+        if isinstance(one, Quantity):
+            yield one
+        elif isinstance(one, type) and issubclass(one, BaseModel):
+            inner = one.model_fields.values()
+            yield from _quantities([x for f in inner for x in (f.annotation, *f.metadata)])
+        else:
+            yield from _quantities((*typing.get_args(one), *getattr(one, "__metadata__", ())))
+
+
+def _times(factor: float, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: v if k == "steps" else _times(factor, v) for k, v in value.items()}
+    if isinstance(value, (tuple, list)):
+        return type(value)(_times(factor, one) for one in value)
+    return factor * value if isinstance(value, (int, float)) else value
+
+
+@asked_of(FollowerRule, FramePolicy, FractureModel)
+def goes_alike_mirrored_and_turned(subject: Subject) -> None:
+    """A body on the square lattice that is mirrored, or turned by a right angle, moves as before,
+    mirrored or turned, to rounding; parts that declare `has_axes` need not."""
+    if subject.component.has_axes:
+        raise NotAskedError("it declares `has_axes`: directions count")
+    scenes = [scene for each in subject.scenes if (scene := _even_scene(each.experiment))][:2]
+    if not scenes:
+        raise NotAskedError("numbers are drawn or remembered, or directions count, in every scene")
+    for scene in scenes:
+        u = displacements(scene, 9, share=0.5)
+        if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
+            continue  # which is told elsewhere
+        X = scene.raster.reference(scene.raster.body_rows)
+        one, most = advanced(scene, u, STEPS)[-1], 0.0
+        for name, matrix in AXES.items():
+            order = _images(X, matrix)
+            image = np.empty_like(u)
+            image[order] = u @ matrix.T
+            other = advanced(scene, image, STEPS)[-1][order]
+            most = np.abs(other - one @ matrix.T).max() / max(1e-300, np.abs(one).max())
+            if not most <= ROUNDING:
+                fault = f"a body that is {name} moves otherwise, by {most:.3g} of its displacement"
+                remedy = "take lengths and products, not single components, or declare `has_axes`"
+                raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
+
+
+def _even_scene(experiment: Experiment) -> Scene | None:
+    """The scene on the square lattice with a body that is its own image; None where parts besides
+    the one that is asked tell directions or an order."""
+    parts: Any = (experiment.rule, experiment.frame, experiment.fracture)
+    if experiment.lattice.type != "square" or any(part.has_axes for part in parts):
+        return None
+    if any(isinstance(part, (Draws, Remembers)) and part.remembered() for part in parts):
+        return None
+    if experiment.neighbours.type not in ("coordination", "chebyshev"):
+        return None
+    body = type(experiment.body).model_validate(EVEN)
+    return build_scene(experiment.model_copy(update={"body": body}))
+
+
+def _images(X: Floats, matrix: Floats) -> Any:
+    """The particle at whose place each comes to lie."""
+    middle = X.mean(axis=0)
+    there = (X - middle) @ matrix.T + middle
+    return np.abs(there[:, None] - X[None]).max(axis=2).argmin(axis=1)
+
+
+LINEAR, NEARLY = 1e-11, 1e-8
+"""What rounding leaves, as a share of the largest stiffness: of rules that are linear, and of
+others, whose stiffness is a difference of forces."""
+
+
+@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+def moves_rigidly_for_nothing(subject: Subject) -> None:
+    """Where forces are known and edges are free, a body that is moved or turned a little as a whole
+    exerts no force, whatever bonds are broken."""
+    for solid in _solids(subject):
+        for what, K in solid.stages:
+            if (force := resistance_to_rigid_motions(solid.scene, K)) > _rounding(solid.scene):
+                _fail(
+                    solid.scene,
+                    f"a rigid motion of a {what} body meets {force:.3g} of its stiffness",
+                    "let forces act along the line between two particles, or sum to those of cells "
+                    "that feel strains alone",
+                )
+
+
+@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+def acts_both_ways_alike(subject: Subject) -> None:
+    """There, what a particle's displacement does to another is what the other's does to it (Maxwell
+    and Betti): forces have no resultant, and a work."""
+    for solid in _solids(subject):
+        for what, K in solid.stages:
+            if (off := asymmetry(K)) > _rounding(solid.scene):
+                _fail(
+                    solid.scene,
+                    f"the stiffness of a {what} body is not symmetric, by {off:.3g} of the largest",
+                    "give both ends of a bond one weight, the transpose where it is a matrix",
+                )
+
+
+@asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
+def gives_no_energy_back(subject: Subject) -> None:
+    """There, no displacement from rest has a negative energy."""
+    for solid in _solids(subject):
+        for what, K in solid.stages:
+            if (back := energy_given_back(K)) > _rounding(solid.scene):
+                _fail(
+                    solid.scene,
+                    f"some displacement of a {what} body gives energy back, {back:.3g} of the "
+                    "largest stiffness",
+                    "let `force` pull towards where neighbours are",
+                )
+
+
+@asked_of(FollowerRule, FramePolicy, FractureModel)
+def does_not_stiffen_by_breaking(subject: Subject) -> None:
+    """There, no displacement needs more force after bonds have softened or broken than before."""
+    for solid in _solids(subject):
+        for (_, before), (what, after) in pairwise(solid.stages):
+            if (more := stiffening(before, after)) > _rounding(solid.scene):
+                _fail(
+                    solid.scene,
+                    f"some displacement of a {what} body meets more force than before, by "
+                    f"{more:.3g} of the largest stiffness",
+                    "let what is seen of a bond be a share of its difference, falling from 1 to 0",
+                )
+
+
+def _solids(subject: Subject) -> list[Solid]:
+    try:
+        return subject.solids
+    except NoSolidError as reason:
+        raise NotAskedError(str(reason)) from None
+
+
+def _fail(scene: Scene, fault: str, remedy: str) -> None:
+    raise PropertyError(f"{fault}, {place_of(scene.experiment)}: {remedy}")
+
+
+def _rounding(scene: Scene) -> float:
+    return NEARLY if isinstance(scene.experiment.rule, StoresEnergy) else LINEAR

@@ -1,0 +1,84 @@
+"""The same view in a notebook: messages of a widget in place of a socket.
+
+What Python users call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import anywidget
+
+from pbdkit.api import Given, as_experiment
+from pbdkit.errors import ExperimentError
+from pbdkit.plugin import Component
+from pbdkit.plugin.discovery import refuse_without
+from pbdkit.web.commands import command_of
+from pbdkit.web.page import script, source
+from pbdkit.web.server import Conductor, Viewer
+from pbdkit.web.session import Message, Session
+
+
+class _Cells(Viewer):
+    """All cells that show one widget."""
+
+    def __init__(self, widget: anywidget.AnyWidget) -> None:
+        self._widget = widget
+
+    def tell(self, message: Message) -> None:
+        self._widget.send(message)
+
+    def show(self, picture: bytes) -> None:
+        self._widget.send({"is": "picture"}, buffers=[picture])
+
+
+class LiveWidget(anywidget.AnyWidget):
+    """A session in a notebook. `session` is what was done, ``close()`` ends it."""
+
+    _esm = script("notebook", exports=True) + "\nexport default { render };\n"
+    _css = source("live.css")
+
+    def __init__(self, session: Session, **more: Any) -> None:
+        super().__init__(**more)
+        self.session = session
+        self._conductor = Conductor(session)
+        self._cells = _Cells(self)
+        self.on_msg(self._hear)
+        self._conductor.start()
+
+    def close(self) -> None:
+        """Ends the session."""
+        self._conductor.close()
+        super().close()
+
+    def _hear(self, widget: Any, message: Any, buffers: Any) -> None:
+        """A cell that joins begins anew: it knows nothing yet."""
+        if message == {"do": "join"}:
+            self._conductor.leave(self._cells)
+            self._cells = _Cells(self)
+            self._conductor.join(self._cells)
+            return
+        try:
+            self._conductor.ask(self._cells, command_of(message))
+        except ExperimentError as error:
+            self._cells.tell({"is": "error", "text": str(error)})
+
+
+def live(
+    experiment: Given,
+    *,
+    components: Iterable[type[Component]] = (),
+    output: str | Path | None = None,
+) -> LiveWidget:
+    """A widget for a notebook: the body of an experiment answers to the mouse.
+
+    What is done to it can be saved as an experiment, at `output` or as NAME-live.yaml, that repeats
+    it bit for bit. ``widget.close()`` ends it. Raises ExperimentError where anywidget is missing,
+    and for an experiment of which there is no scene; PluginError.
+    """
+    refuse_without("anywidget", "live", "live needs anywidget")
+
+    found = as_experiment(experiment, components)
+    return LiveWidget(Session(found, Path(output) if output else None))
