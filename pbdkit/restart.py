@@ -1,8 +1,5 @@
-"""A run that has not begun goes on from where another one stood.
-
-What an earlier run has left: what it was asked for, what it recorded, and where it stood.
-
-Runs that are gone on with: what was left unfinished, and what ended and is to go further.
+"""Resume a run: from the checkpoint of an unfinished run, or from the end of a finished one that is
+to be continued.
 """
 
 from __future__ import annotations

@@ -1,13 +1,4 @@
-"""One run of a scene: what takes it from state to state, and what is kept of it.
-
-What a solver does to a scene: one interface, with two implementations.
-
-Where a run stands, between two steps.
-
-The run of a scene, its recording, and a rehearsal of that.
-
-Those who carry out a run together: here one process, alone.
-"""
+"""One run of a scene: its drivers (stepping and equilibrium), its checkpoints, and its recording."""
 
 from __future__ import annotations
 

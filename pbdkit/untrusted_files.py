@@ -1,14 +1,9 @@
-"""Bounds on what an HDF5 file declares and refers to, checked before any value of it is read.
+"""Reading of files without a seal in a separate process, with bounds on memory, time, and on what
+an HDF5 file declares and refers to.
 
 A file of some kilobytes can declare arrays of terabytes, refer to the bytes of other files, and
-name filters that HDF5 loads as programs. A seal does not tell: anybody can make one.
-
-Files without seal are first read in a process of their own.
-
-On bytes that were changed the libraries that read files can crash the process or come to no end.
-Here they do so where nothing is lost.
-
-Reads a variable over x and y of a netCDF file, in a process of its own.
+name filters that HDF5 loads as programs; on changed bytes the libraries can crash the process or
+loop. There nothing is lost. A seal is no protection: anyone can make one.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""``pbdkit check``: what will happen, before it does.
-
-``pbdkit identify``: what a rule is physically.
-"""
+"""``pbdkit check`` and ``identify``: what an experiment will do, and what a rule is physically."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""Arguments and options that several commands take.
-
-The file that a command is to write, looked at before the work and not after; and tables.
-
-What somebody at a terminal is told while a command works.
+"""Arguments and options that several commands share, output paths that are checked before the work,
+tables, and progress at a terminal.
 """
 
 from __future__ import annotations

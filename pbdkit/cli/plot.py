@@ -1,7 +1,4 @@
-"""``pbdkit plot`` and ``animate``: a result as a picture, and as a movie.
-
-``pbdkit curve``: what changes in the course of a result, as lines.
-"""
+"""``pbdkit plot``, ``animate`` and ``curve``: a result as a picture, a movie and lines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""``pbdkit plugins``: what is installed, whether it conforms, and new ones.
-
-The files of a plugin project, from templates, and the names in it, all made from that of its
-distribution.
+"""``pbdkit plugins``: list and check installed plugins, and create a new plugin project from
+templates.
 """
 
 from __future__ import annotations

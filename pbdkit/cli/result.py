@@ -1,6 +1,5 @@
-"""``pbdkit explain``, ``status`` and ``verify``: a result, or a run, looked at.
-
-``pbdkit export``: a result in the format of other programs.
+"""``pbdkit explain``, ``status``, ``verify`` and ``export``: inspect a result or an unfinished run,
+and write it in another format.
 """
 
 from __future__ import annotations

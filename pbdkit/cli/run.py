@@ -1,6 +1,5 @@
-"""The signals that end a run between two steps.
-
-``pbdkit run`` and ``resume``, which signals end between two steps: what is kept is whole.
+"""``pbdkit run`` and ``resume``, which a signal ends between two steps, so that everything kept is
+complete.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""``pbdkit sweep``: many runs, of which those that are finished need not run again.
-
-``pbdkit fit``: parameters from measurements.
-
-What there is to start from: ``pbdkit experiments``, ``init`` and ``schema``.
+"""``pbdkit sweep`` and ``fit``, and what there is to start from: ``experiments``, ``init`` and
+``schema``.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
-"""Pseudo-energies, displacements, tracks, broken bonds, cells inside out (model.md, section 8).
-
-What a body feels at each particle: strain, rotation and stress.
-
-What leaders must do to a body, and what it stores: reactions, strain energy, tensile tests.
-
-What obstacles do to a body.
+"""Built-in diagnostics: pseudo-energies, displacements, tracks and broken bonds (model.md, section
+8); strain, rotation and stress at particles; reactions, strain energy and load curves; contact
+forces.
 """
 
 from __future__ import annotations

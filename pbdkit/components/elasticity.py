@@ -1,6 +1,5 @@
-"""The stiffness of a lattice's cells, rectangles and equilateral triangles, bond by bond.
-
-Rules that are linear elasticity: calibrated to a material, derived cell by cell.
+"""Rules of linear elasticity, calibrated to a material: bond coefficients derived from the
+stiffness of the lattice's cells, rectangles and equilateral triangles.
 """
 
 from __future__ import annotations

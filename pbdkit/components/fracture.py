@@ -1,8 +1,6 @@
-"""Bonds that never break, and bonds that break beyond a length (model.md, section 6).
-
-Bonds that break by their strain, suddenly or little by little (docs/fracture.md).
-
-Fracture with energy: cracks that take as much of it on every lattice (docs/fracture.md).
+"""Built-in fracture models: none, a threshold on length (model.md, section 6), a threshold on
+strain with or without gradual damage, and cohesive bonds that dissipate a given energy per crack
+area on every lattice (docs/fracture.md).
 """
 
 from __future__ import annotations

@@ -1,33 +1,14 @@
-"""Measured boundaries as modes: smooth displacements of a leader group, few enough to be estimated.
+"""Observations of a fit: what an equilibrium or a run predicts for the displacements, tracks and
+forces that were measured.
 
-What is measured at a boundary carries noise, and whoever prescribes it prescribes the noise. So the
-displacement of each group that moves by `measured` is a polynomial along it, of which the
-measured values are only where the search begins: its coefficients are estimated with all else.
+A measured boundary carries noise, and prescribing it prescribes the noise. The displacement of each
+group that moves by `measured` is therefore a polynomial along it, for which the measured values are
+only the start: its coefficients are estimated with all other unknowns.
 
-Displacements at points between particles: bilinear in a lattice's cells.
-
-What an equilibrium shows: displacements at points, and what leader groups carry.
-
-What was measured of one experiment, and what the experiment has to say of it.
-
-What was measured while an experiment runs.
-
-Predictions are read off the run at the steps that they need; how they change with a parameter comes
-by central differences of order 8 of whole runs, between which no bond may break otherwise. Where
-the run settles, the runs of the differences make as many steps as it did: the step at which a run
-settles is no smooth function of parameters.
-
-The curve of the force that a leader group exerts while an experiment runs.
-
-A field of displacements, measured at rest: of an equilibrium, with boundaries that are unknown
-too, and with what the measurement shows beside the body's displacement.
-
-Tracks in time: how points of a body move while an experiment runs.
-
-How deep points lie within a body: their distance to its outline.
-
-A body of given sites ends at the sides of its outermost cells; where such sites are cut out of
-another body, the cells that touch them are gone.
+Points between particles are interpolated bilinearly in the cells of the lattice. Derivatives of
+what is measured while an experiment runs are central differences of order 8 of whole runs, between
+which no bond may break otherwise; where the run ends at rest, the differences make as many steps as
+the run did, since that number is no smooth function of the parameters.
 """
 
 from __future__ import annotations

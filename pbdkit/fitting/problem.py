@@ -1,14 +1,10 @@
-"""Where a fit begins: the parameters that leave the least gap to equilibrium.
+"""The least-squares problem of a fit: residuals divided by their noise, their derivatives, a start,
+and the iteration with what the data determine.
 
-Measured displacements, put on the particles, would not move on by the right rule: m(u, θ) = 0 where
-all neighbours are known. m is nearly straight in θ, so that a few linear problems find θ without
-one equilibrium (Claire, Hild, Roux 2004). Noise makes them wrong, wide bounds do not: the
-middle of wide bounds is far off.
-
-The least-squares problem of a fit: residuals over their noise, and how they change with what is
-unknown.
-
-The parameters that fit best, how well they are known, and which of them the data cannot tell.
+The start minimises the equilibrium gap: measured displacements, put on the particles, would not
+move under the right rule, m(u, θ) = 0 where all neighbours are known. m is nearly linear in θ, so
+that a few linear problems find θ without one equilibrium (Claire, Hild, Roux 2004). Noise biases
+that estimate, wide bounds do not: the middle of wide bounds is far off.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""The scene of an experiment that differs from another by numbers.
+"""Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
-How the equilibrium of a scene changes with a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
-
-An equilibrium is where no follower moves, m(u, θ) = 0. A = -∂m/∂u is the system by which it was
-found, so that each parameter costs one more solution, and the moves of a few scenes in which it is
-a little more or less. What a single number J of the displacements w · u changes by costs one
-solution for all parameters, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ.
+At equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the system by which it was found, so
+that each parameter costs one more solution, and the moves of a few scenes with slightly changed
+parameters. The change of a single number J of the displacements costs one solution for all
+parameters, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What was measured, as a fit file says it: fields of displacements, tracks in time, curves.
-
-The fit file: an experiment, what is unknown of it, and what was measured.
+"""The fit file: an experiment, its unknown parameters, and the measurements (fields of
+displacements, tracks in time, curves).
 """
 
 from __future__ import annotations

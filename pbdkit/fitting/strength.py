@@ -1,33 +1,22 @@
-"""The strength fit file: an experiment, what is unknown of its bonds, and how repeats broke.
+"""Strength of bonds and its scatter from repeated tests: fit file, likelihood, simulated specimens
+and result.
 
-The load at which bonds break in a body whose displacements grow in proportion to the load.
+The load at which the first bond breaks in a body whose displacements grow in proportion to the
+load: with d the difference along a bond under the experiment's full load, the strain under a share
+λ of it is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q = |d|²/|r|². It is
+convex and 0 at λ = 0, so that a strained bond is strained the more the larger λ.
 
-With d the difference along a bond under the experiment's full load, the strain under a share λ of
-it is ε(λ) = |r + λ d| / |r| - 1 = √(1 + 2 λ p + λ² q) - 1, p = r·d/|r|², q = |d|²/|r|². It is
-convex and 0 at λ = 0, so that a bond that is strained is strained the more the larger λ.
+A specimen bears the load λ where all its bonds do: with probability Π_b (1 - F(ε_b(λ))). The
+likelihood of repeats is therefore known without any run (weakest link: W. Weibull, J. Appl. Mech.
+18 (1951) 293). Location μ and scale σ of ln strength (Weibull: μ = ln s, σ = 1/m) or of strength
+(uniform) have the density dμ dσ/σ and the likelihood is integrated. Where all bonds are strained
+alike specimens are of a location-scale family too, and intervals from the integrated likelihood are
+exact, however few the specimens (J. Berger, Statistical Decision Theory, 1985, section 6.6).
 
-Specimens of one experiment, torn one after the other: each has a seed of its own.
-
-What the loads of the first break tell of the strengths of bonds, by law of these.
-
-A specimen bears the load λ where all its bonds do: with probability Π_b (1 - F(ε_b(λ))). So the
-likelihood of repeats is known, without any run (weakest link: W. Weibull, J. Appl. Mech. 18 (1951)
-293). Location μ and scale σ of ln strength (Weibull: μ = ln s, σ = 1/m) or of strength (uniform)
-are given the density dμ dσ/σ and the likelihood is integrated. Where all bonds are strained alike
-specimens are of a location-scale family too, and intervals from the integrated likelihood hold
-what they say exactly, however few specimens there are (J. Berger, Statistical Decision Theory,
-1985, section 6.6).
-
-What a strength fit answers with.
-
-Strengths from specimens that are torn, where no likelihood is known: a synthetic one.
-
-Single specimens are torn at strengths all over the bounds, and then where the measurement is
-likely. Mean and spread of ln peak follow from them by regression over the logarithms of the
-parameters. What is compared is the mean of the measured ln peaks and the logarithm of their
-standard deviation, which are about normal (S. Wood, Nature 466 (2010) 1102).
-
-The strength of bonds and its scatter from repeated tests: from a description to the answer.
+Where no likelihood is known it is synthetic: single specimens are torn at strengths all over the
+bounds, and then where the measurement is likely. Mean and spread of ln peak follow by regression
+over the logarithms of the parameters; the mean of the measured ln peaks and the logarithm of their
+standard deviation, which are about normal, are compared (S. Wood, Nature 466 (2010) 1102).
 """
 
 from __future__ import annotations

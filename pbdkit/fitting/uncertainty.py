@@ -1,31 +1,22 @@
-"""A value with its error, and Young's modulus, which follows from forces.
+"""Errors of a fit: standard errors, identifiable combinations, profile likelihoods, samples of the
+posterior, and comparison of models by cross-validation.
 
-Which model? The same data against several, by how well each foretells points that were left out.
+Profile likelihood: for each value of a parameter all others are fitted anew. Where -2 log L exceeds
+its minimum by less than 3.84 lies the 95 % interval (Wilks), however the parameter bends the
+predictions. With a loss the increase is that of M-estimators: it is divided by mean ψ² / mean ψ'.
 
-Blocks of neighbouring points are left out together (Roberts et al. 2017, Ecography 40, 913): what
-lies beside a left-out point would tell it.
+Posterior: all that enters linearly - boundaries of a linear rule, distortions, Young's modulus - is
+integrated out exactly, boundaries of other rules as far as they are linear around the fit: with
+their derivatives J, the remaining residuals r and a flat prior, log p = -½ |r|² - ½ log det JᵀJ.
+Walkers make the affine-invariant stretch moves of Goodman and Weare (emcee).
 
-How much worse data are met where a parameter has another value: profile likelihoods.
+Combinations: a direction v of parameters along which nothing changes is also one of their
+logarithms, d ln θ = v / θ. Products of powers Π θ^e with e · d ln θ = 0 are identifiable, and so
+are sums Σ e θ with e · v = 0. Both agree near the fit; the one that holds farther along the
+direction is found by going there.
 
-For each value all else is fitted anew. By how much -2 log L rises over its least value then, is
-below 3.84 within the interval that holds the true value in 95 of 100 cases (Wilks), however the
-parameter bends the predictions. With a loss the rise is that of M-estimators: it counts over
-mean ψ² / mean ψ'.
-
-The posterior of the parameters by a sampler: a check of standard errors, which take the problem
-to be straight.
-
-All that comes in linearly - boundaries of a linear rule, distortions, Young's modulus - is
-integrated out exactly, boundaries of other rules as far as they are straight around the fit: with
-its derivatives J, what is left of the residuals r and a flat prior, log p = -½ |r|² - ½ log det
-JᵀJ. Walkers move by the affine-invariant stretch of Goodman and Weare (emcee).
-
-Combinations of parameters that the data tell, and those that they cannot, where they do not tell
-each parameter by itself: the ratio of two stiffnesses, say, and their product.
-
-A way v of parameters along which nothing changes is one of their logarithms, d ln θ = v / θ, as
-well. Products of powers Π θ^e with e · d ln θ = 0 are told, and so are sums Σ e θ with e · v = 0.
-Both are the same near the fit; which of them is told farther along the way is found by going there.
+Cross-validation leaves out blocks of neighbouring points together (Roberts et al. 2017, Ecography
+40, 913), since the points beside a left-out point would reveal it.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Whether long waves are those of an elastic body, and of which.
+"""Elastic constants of a rule from its long-wave expansion, and whether they exist.
 
-To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. It is an elastic one where a symmetric
+To second order a step moves a body by Q_abcd ∂_c ∂_d u_b. The rule is elastic where a symmetric
 positive B exists, the inverse of the mobility, with
 
     B_ae Q_ebcd = (C_acbd + C_adbc) / 2
 
-and C the elastic constants. Six linear equations in the three numbers of B say so: the left side
-is symmetric in a and b (there is an energy: what x does to y, y does to x), and in 2 D Huang's
-relations hold, Γ_xxyy = Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (no rigid rotation costs energy).
-B = 1 but for rules that let x and y go to the same equilibrium at different rates. C is known up to
-the time a step stands for. Born and Huang, Dynamical Theory of Crystal Lattices, section 27.
+and C the elastic constants. Six linear equations determine the three numbers of B: the left side is
+symmetric in a and b (an energy exists), and in two dimensions Huang's relations hold, Γ_xxyy =
+Γ_yyxx, Γ_xxxy = Γ_xyxx, Γ_yyxy = Γ_xyyy (a rigid rotation costs no energy). B = 1 except for rules
+in which x and y approach the same equilibrium at different rates. C is determined up to the time
+that a step represents. Born and Huang, Dynamical Theory of Crystal Lattices, section 27.
 
-Harmonics of C by direction after Vannucci, Anisotropic Elasticity, chapter 4.
+Harmonics of C by direction follow Vannucci, Anisotropic Elasticity, chapter 4.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
-"""What plane waves do not tell: whether a rule rests, is linear, turns with the body, and is the
-same everywhere. Asked of the rule's own functions with single numbers.
-
-How a rule is identified: from its answer to small displacements to what long waves see.
+"""Identify a rule from its own functions: whether it rests, is linear, turns with the body and is
+the same everywhere, and its response to small displacements and long waves.
 """
 
 from __future__ import annotations

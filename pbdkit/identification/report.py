@@ -1,7 +1,4 @@
-"""What a rule is physically, on its lattice and neighbours.
-
-An identity in words: a verdict, notes, and a table to read.
-"""
+"""The physical identity of a rule on its lattice and neighbours: a verdict, notes and a table."""
 
 from __future__ import annotations
 

@@ -1,31 +1,31 @@
-"""A rule's answer to the plane waves u = exp(i k·r), and its expansion for long ones.
+"""Response of a rule to plane waves u = exp(i k·r), its expansion for long waves, and the
+dispersion of slow waves by direction and length.
 
-With L(k) = -(own + Σ W exp(i k·r)) a step takes a wave to (1 - L(k)) times itself. Where there are
-several sites a cell, L couples them; the slow waves, in which all sites move nearly alike, are
+With L(k) = -(own + Σ W exp(i k·r)) a step multiplies a wave by 1 - L(k). Where a cell has several
+sites, L couples them; the slow waves, in which all sites move nearly alike, are
 
     L(k) X(k) = X(k) A(k),  A(k) = Σ_m A_m,  A_m of degree m in k,
 
-order by order, with the shifts of the sites against each other eliminated (X_0: all alike,
-Y·X = 1 with Y the left null vectors of L(0)). The eigenvalues of the 2 × 2 matrix A(k) are then the
-rates of the slow waves to every order: of u, a step takes away A(k) u. With one site A is L.
+order by order, with the relative shifts of the sites eliminated (X_0: all alike, Y·X = 1 with Y the
+left null vectors of L(0)). The eigenvalues of the 2 × 2 matrix A(k) are the rates of the slow waves
+to every order: a step removes A(k) u from u. With one site A is L.
 
-A lattice may be told by a larger cell than it needs: two sites a cell for the rows of a hexagonal
-lattice, one of which is the other shifted. Sites that a translation takes to one another, stencil
-and all, are one site here; what then is left over are the sublattices of a lattice with a basis.
+A lattice may be described by a larger cell than necessary: two sites a cell for the rows of a
+hexagonal lattice, one of which is the other shifted. Sites that a translation maps onto one
+another, stencil included, count as one site; what remains are the sublattices of a lattice with a
+basis.
 
-The slow waves by direction and length, and the eigenvalues of all waves.
-
-The rate z of a wave is what a step takes away of it. For long waves z = d k² (1 + λ² k²): d is the
-diffusivity along the direction, of the faster and of the slower of the two waves, and λ² the
-fourth-order length. Of gradient elasticity, u'' - l² u'''', λ² is l²; a lattice has λ² < 0 of its
-own. Along the normal of a family of lattice rows, h apart, interactions with the next row alone
-give z = d s, s = (2 sin(kh/2) / h)², and so λ² = -h²/12. That much is the lattice's, and
+The rate z of a wave is the part of it that a step removes. For long waves z = d k² (1 + λ² k²): d
+is the diffusivity along the direction, of the faster and of the slower wave, and λ² the fourth-
+order length. In gradient elasticity, u'' - l² u'''', λ² is l²; a lattice alone has λ² < 0. Along
+the normal of a family of lattice rows, h apart, interactions with the next row alone give z = d s,
+s = (2 sin(kh/2) / h)², hence λ² = -h²/12. That part belongs to the lattice, and
 
     l² = λ² + h²/12
 
-is the material's: what rows beyond the next contribute. It is exactly c D for a rule
-(1 - P) u + c (1 - P)² u whose P couples next rows, and negative, of the wrong sign for gradient
-elasticity, where rows beyond the next attract.
+to the material: the contribution of rows beyond the next. It is exactly c D for a rule (1 - P) u +
+c (1 - P)² u whose P couples next rows, and negative, of the wrong sign for gradient elasticity,
+where rows beyond the next attract.
 """
 
 from __future__ import annotations

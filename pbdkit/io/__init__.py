@@ -1,6 +1,5 @@
-"""From the states of a run to its dataset: recorded, in memory or in a file, and shown.
-
-What keeps the bytes of results and of unfinished runs: files, seals and the run store.
+"""Recording of runs as datasets, result files and their seals, checkpoints of unfinished runs, and
+exports.
 """
 
 from __future__ import annotations

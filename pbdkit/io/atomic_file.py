@@ -1,8 +1,8 @@
-"""What a file system carries, and who else writes to a file on it.
+"""Atomic writing of files: complete or not at all, locked against other writers, replacing an
+earlier file only on request.
 
-A file in the making, for libraries that cannot bear a write that fails or is cut short.
-
-Write files whole or not at all, beside the earlier file until then; replace only on request.
+`NewFile` is a file under construction for libraries that do not handle a write that fails or is cut
+short.
 """
 
 from __future__ import annotations

@@ -1,13 +1,5 @@
-"""The store of an unfinished run: pieces of bytes under keys, each with its digest, in SQLite.
-
-The files of an unfinished run beside its output: their names, whether they are there, their
-removal.
-
-Where a run stands: all that decides how it goes on, as facts and arrays, and back again.
-
-An unfinished run beside its output: what was committed of it, in a store and one more file.
-
-How far an unfinished run is.
+"""Checkpoints of an unfinished run, kept beside its output in a SQLite store and a file of records:
+everything that determines how the run continues.
 """
 
 from __future__ import annotations

@@ -1,10 +1,5 @@
-"""The dataset's variables: one description that the file, xarray and the JSON Schema share.
-
-Datasets of version 1 of the layout, with the names that they have now.
-
-What a dataset says of the run that made it, as JSON in its attributes.
-
-Particles by number, and by the indices of their sites.
+"""Variables and attributes of the dataset: one description shared by the file, xarray and the JSON
+Schema, the provenance in attributes, and the conversion of datasets of layout version 1.
 """
 
 from __future__ import annotations

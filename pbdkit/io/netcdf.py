@@ -1,7 +1,6 @@
-"""A dataset in the making, in a netCDF-4 file: written chunk by whole chunk, each once.
-
-A sink that makes a netCDF-4 file, which appears whole or not at all, and from the first second
-on keeps what is there, so that the run can be gone on with.
+"""Write a dataset to a netCDF-4 file while it is recorded, each chunk once; the file appears
+complete or not at all, and the part recorded so far is kept for `resume` from the first second
+on.
 """
 
 from __future__ import annotations

@@ -1,10 +1,5 @@
-"""What stands where a result was wanted, by its content, and which command takes it.
-
-One member of the dataset of a sweep, chosen by its parameters.
-
-Opens result files.
-
-The dataset of a run that is not finished, as far as it was kept; nothing is written.
+"""Open results: of finished and of unfinished runs, one member of a sweep, and a message for files
+of other kinds that names the command that reads them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""The first bytes of the records of an unfinished run: which store they belong to, and how many
-commits it holds.
-
-The file that the HDF5 library writes into: nothing that was committed is ever overwritten.
-
-Arrays that come piece by piece, because nobody holds the whole.
+"""The file object that the HDF5 library writes into: committed bytes are never overwritten, and
+large arrays are appended piece by piece.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What a scene's parts remember and its diagnostics measure, as columns of the dataset.
-
-The recorder: takes from the states of a run what the dataset holds, and hands it to a sink.
+"""The recorder: takes the variables of the dataset from the states of a run, measured diagnostics
+and remembered numbers included, and passes them to a sink.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""The seal of a result: digests of its bytes, extent by extent, behind the last one that HDF5 uses.
+"""The seal of a result: digests of its bytes, extent by extent, appended behind the last extent
+that HDF5 uses.
 
-Whoever reads a file through its seal gets no byte that was not checked just before, so that a
-flipped bit reaches neither the HDF5 library nor anybody's figures, and of a file larger than memory
-only what is read is checked. Other programs read the file as if the seal were not there.
+Bytes read through the seal were checked immediately before, so that a flipped bit reaches neither
+the HDF5 library nor a figure, and of a file larger than memory only the extents that are read are
+checked. Other programs read the file as if the seal were absent.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Where a dataset goes while it is made: an interface, and the memory.
-
-A sink that lets the run go on while another one writes.
+"""Sinks of a dataset under construction: the interface, a sink in memory, and one that writes in a
+second thread while the run continues.
 """
 
 from __future__ import annotations

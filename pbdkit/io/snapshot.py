@@ -1,18 +1,12 @@
-"""The part of the stress that softened bonds no longer carry, cell by cell.
+"""One time step as the dataset and the diagnostics see it: a row a particle, with strain, stress
+and materials computed on request.
 
-Of what material each particle is, for those who measure.
-
-What every moment of a scene shares, made where somebody asks.
-
-The gradient of the displacement at every particle, from the cells around it.
-
-A polygon's mean gradient is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area (Green), on a
-rectangle that of the bilinear displacement, on a triangle that of the linear one. A particle gets
-the mean over the cells that meet there, by share of area; that stands at the mean of their centres,
-which on an edge is not the particle, and is carried on from there with the gradient's own slope,
-found in the same way. Quadratic displacements of rectangular cells are exact, edges included.
-
-The run at the end of a step, as the dataset and the diagnostics see it: a row a particle.
+The displacement gradient at a particle is the mean over the cells that meet there, weighted by
+area. A polygon's mean gradient is Σ_k u_k ⊗ ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area (Green),
+on a rectangle that of the bilinear displacement, on a triangle that of the linear one. The mean
+belongs to the mean of the cells' centres, which on an edge is not the particle, and is extrapolated
+from there with the gradient's own slope, found in the same way. Quadratic displacements of
+rectangular cells are exact, edges included.
 """
 
 from __future__ import annotations

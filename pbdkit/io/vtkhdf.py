@@ -1,9 +1,8 @@
-"""A body as a grid of vertices, lines and polygons, which programs for meshes understand.
+"""Export to ParaView: VTKHDF, the format of VTK in HDF5, written without VTK; the body as vertices,
+lines and polygons.
 
-Results for ParaView: VTKHDF, the format of VTK in HDF5, written without VTK.
-
-The format is that of docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid whose
-points and data follow each other step by step, and `Steps` tells where each step begins.
+The format is described at docs.vtk.org, "VTKHDF file format", version 2: an UnstructuredGrid whose
+points and data follow each other step by step, with the beginning of each step in `Steps`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""The cells of a lattice, found once for its repeat cell, and their places on the raster.
-
-The cells around a particle, and the bonds of each: what the damage of a cell is found from.
+"""The cells of a lattice on the raster, and for each bond the cells around a particle that
+determine its damage.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Puts a body and its frame on rasters.
+"""Fill the outline of a body with sites, frame points, whole cells and cut cells.
 
-Fills an outline with whole and cut cells: which share of each lies inside.
-
-Cells that would connect the two sides of a narrow void are left out: those whose inside falls in
-pieces, and at a particle in the void the cells of all but one side.
+Each cut cell has the share of its area that lies inside the outline. Cells that would connect the
+two sides of a narrow void are left out: those whose inside has several parts, and, at a particle in
+the void, the cells of all sides but one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""The neighbours of every sublattice as constant slots, in exactly opposite pairs.
-
-The bonds of a scene, and those that cross a crack or a cut.
-
-What a rule may derive its constants from.
+"""Neighbours of every sublattice as constant slots in exactly opposite pairs, and the bonds between
+them, those that cross a crack or a cut included.
 """
 
 from __future__ import annotations

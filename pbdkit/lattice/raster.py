@@ -1,8 +1,5 @@
-"""Some particles of one sublattice of a raster: a rectangle of cells, or flat places.
-
-Those who have the other rows of a lattice, while each process builds the scene of its own.
-
-Particles on padded rasters: one raster a sublattice, and the table in the order of numbers.
+"""Particles on padded rasters, one raster a sublattice, in the order of their numbers; blocks and
+lists of places on them.
 """
 
 from __future__ import annotations

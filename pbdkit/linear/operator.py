@@ -1,10 +1,8 @@
-"""Guided particles among the couplings: their moves, and what they do as leaders.
-
-The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
+"""The step operator: the paper's "transformation operator between matrices" as a sparse matrix.
 
 u(t+1) = now · u(t) + before · u(t-1) + led · u_L + source for the displacements of the followers,
-an unknown a particle and axis. `before` is empty but for frames with lag and for memory; loads are
-in `source`.
+one unknown a particle and axis. `before` is empty except for frames with lag and for memory; loads
+are in `source`.
 """
 
 from __future__ import annotations

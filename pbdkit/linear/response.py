@@ -1,7 +1,7 @@
-"""A rule's answer to small displacements, from the rule's own functions and nothing else.
+"""Linear response of a rule to small displacements, computed from the rule's own functions.
 
-Linear rules come out exactly, whatever the configuration; others linearised at a state. At rest,
-particles with the same neighbours present answer alike, and one of each kind is asked.
+Linear rules are exact in any configuration; others are linearised at a state. At rest, particles
+with the same neighbours present respond alike, and one of each kind is evaluated.
 """
 
 from __future__ import annotations

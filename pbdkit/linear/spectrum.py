@@ -1,6 +1,5 @@
-"""Who moves with whom: blocks, (axis, axis), and the matrices by their entries that they make.
-
-Whether a scene is small enough for its step operator to be looked at in about a second.
+"""Eigenvalues of the step operator of a scene that is small enough for a matrix, block by block of
+coupled unknowns.
 """
 
 from __future__ import annotations

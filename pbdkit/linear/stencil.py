@@ -1,13 +1,14 @@
-"""How a rule at rest answers on the infinite lattice: derivatives, and what they do to waves.
+"""Stencil of a rule at rest on the infinite lattice: derivatives of its functions, and their symbol
+for waves.
 
-Derivatives of elementwise functions are taken by a complex step where that serves, else by
-differences. Where functions keep to arithmetic and roots they are analytic, and ∂f = Im f(x + ih)
-/ h is exact to rounding. Others (an absolute value, a hypotenuse) drop the imaginary part or refuse
-it: a central difference finds that out, and takes its place with nine digits or so.
+Derivatives of elementwise functions are taken by a complex step where that is valid, else by
+differences. Functions built from arithmetic and roots are analytic, and ∂f = Im f(x + ih) / h is
+exact to rounding. Others (an absolute value, a hypotenuse) drop the imaginary part or refuse it: a
+central difference detects this and replaces it with about nine digits.
 
-A displacement exp(iθ·c) over repeat cells c is multiplied in a step by the symbol, a matrix of
-blocks (axis, axis) over sublattices. Modes of a finite body lie within what the waves reach, as
-long as its frame copies or mirrors: a bound that costs milliseconds.
+A step multiplies a displacement exp(iθ·c) over repeat cells c by the symbol, a matrix of blocks
+(axis, axis) over sublattices. Modes of a finite body lie within the range of the waves as long as
+its frame copies or mirrors: a bound that costs milliseconds.
 """
 
 from __future__ import annotations

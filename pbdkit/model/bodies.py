@@ -1,10 +1,8 @@
-"""What a body is: a signed distance to an outline, and the sites that lie inside; and the bodies
-with an outline of their own.
+"""Bodies: a signed distance to an outline, and the sites inside; the family of shapes with an
+outline of their own and of those made of others.
 
 A site belongs to the body where the signed distance is at most 1e-9 of a lattice constant, so that
 sites on the outline belong whatever the rounding (model.md, section 3).
-
-All bodies that an experiment can name; a closed family. Those made of others stand here.
 """
 
 from __future__ import annotations

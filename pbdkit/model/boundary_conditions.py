@@ -1,12 +1,5 @@
-"""Cuts in time: segments whose bonds are broken at the beginning of a step.
-
-From where a run starts. A closed family.
-
-Leader groups: who leads, how, and when (model.md, section 1). Selections are a closed family.
-
-Loads: forces that act on particles from outside, and when.
-
-Obstacles: rigid bodies that followers do not enter.
+"""Boundary and initial conditions of an experiment: leader groups and their selections (model.md,
+section 1), loads, obstacles, cuts in time, and the initial state.
 """
 
 from __future__ import annotations

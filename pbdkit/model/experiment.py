@@ -1,15 +1,5 @@
-"""What does not go together in an experiment, though each part is right by itself.
-
-What an experiment and its regions may be called.
-
-Functions of the place and random fields, as values over a grid: so an experiment says all in its
-file.
-
-Experiments that name retired components, with their successors instead.
-
-The experiment: a validated description of a scene, and of what to do with it.
-
-Classes that were handed over in Python, which only this process knows.
+"""The experiment: a validated description of a scene and of the run, with the checks that span
+several of its parts.
 """
 
 from __future__ import annotations

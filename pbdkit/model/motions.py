@@ -1,12 +1,5 @@
-"""Columns of numbers in a CSV file beside the experiment.
-
-What a prescribed motion is (model.md, section 1).
-
-A motion known at scattered points: each particle by its own value, linear between them.
-
-A motion by Newton's law.
-
-Prescribed motions, a closed family; where leaders go, step by step (model.md, section 1).
+"""Prescribed motions, a closed family: displacement of a leader group by step (model.md, section
+1), by formula, from columns of a CSV file, from scattered measurements, or by Newton's law.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
-"""The files that an experiment, a sweep or a fit names: those beside it, and others on request.
+"""Read and write experiment files: YAML 1.2 with the position of every value, and changes by path
+as `--set` and sweeps make them.
 
-Reads an experiment file: YAML 1.2 with the place of every value, and no way to blow up.
-
-The guard works on the events of the parser, before anything is built: size, depth, aliases, merge
-keys and tags are what makes YAML dangerous, and an experiment needs none of them.
-
-What a YAML file describes, by its keys, and which command takes it.
-
-Changes of an experiment by path and value, as ``--set`` and sweeps make them.
-
-An experiment, or a sweep, as text that is read again.
+The limits on size, depth, aliases, merge keys and tags act on the events of the parser, before
+anything is built: they are what makes YAML dangerous, and an experiment needs none of them.
 """
 
 from __future__ import annotations

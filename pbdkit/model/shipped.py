@@ -1,7 +1,4 @@
-"""The experiments that come with pbdkit, by name.
-
-The experiment that another file is about: a sweep, a fit.
-"""
+"""The experiments that come with pbdkit, by name, and the base experiment of a sweep or a fit."""
 
 from __future__ import annotations
 

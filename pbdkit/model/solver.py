@@ -1,8 +1,4 @@
-"""What is kept of a run.
-
-How an experiment is carried out: step by step, or straight to where the steps lead. A closed
-family.
-"""
+"""Settings of the solver, a closed family (stepping or equilibrium), and of what is recorded."""
 
 from __future__ import annotations
 

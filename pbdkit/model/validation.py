@@ -1,6 +1,5 @@
-"""A field of a parameter in a netCDF file: a variable over x and y.
-
-Turns what pydantic finds into one message: place, field, what is wrong, the nearest right.
+"""Validate the parts of an experiment with pydantic and word each error with place, field, cause
+and the nearest valid value; read field files.
 """
 
 from __future__ import annotations

@@ -1,3 +1,3 @@
-"""One lattice cut into parts, each with a process that steps it or finds its equilibrium."""
+"""One lattice divided among the ranks of MPI, each with a process of its own."""
 
 from __future__ import annotations

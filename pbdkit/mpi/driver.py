@@ -1,10 +1,5 @@
-"""The engine of one part: steps it by any other engine, and renews its halo in time.
-
-The driver of a part: what all processes decide together about a run.
-
-The rows of a part, in the search for an equilibrium.
-
-The driver of a part for the solver `equilibrium`.
+"""Drivers of the part of a lattice that one rank owns: stepping with halo exchange, equilibrium,
+and the decisions that all ranks take together.
 """
 
 from __future__ import annotations

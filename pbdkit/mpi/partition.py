@@ -1,17 +1,10 @@
-"""Parts that several processes have, joined piece by piece in the first of them.
+"""Partition of a lattice among ranks: rows of repeat cells with a halo, the part of a scene as a
+scene, exchange of halos, and joining of parts.
 
-Parts of a lattice: rows of repeat cells.
-
-A part holds its own rows and, beyond them, a halo of those of its neighbours. Its outermost rows,
-as many as neighbours reach, are empty; as many stand as frame points that follow nobody, but for
-leaders. In each step what is known
-shrinks from there by what a step reaches, so that several can be made before the halo is renewed.
-
-A part of a scene as a scene of its own: its rows of everything that a scene has.
-
-States in parts: the halo renewed from neighbours, parts joined, and a whole cut up.
-
-How many particles every line of sites has, found by all processes together: each counts some.
+A part holds its own rows and, beyond them, a halo of rows of its neighbours. Its outermost rows, as
+many as neighbours reach, are empty; as many again hold frame points that follow no particle, except
+for leaders. In each step the valid rows shrink by the reach of a step, so that several steps can be
+made before the halo is exchanged.
 """
 
 from __future__ import annotations

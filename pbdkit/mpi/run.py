@@ -1,10 +1,5 @@
-"""The scene of a part, which each process builds of its own rows and what is near.
-
-What the processes of a run record: each of its own particles; the first writes.
-
-A run on several processes, and its recording.
-
-Whether several processes were started together.
+"""Runs on several ranks: building the scene of each part, recording, and detection of a launch by
+mpiexec.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What the author of a component reads: the six interfaces and the data they exchange.
-
-Which components are installed, and where each comes from.
+"""The interfaces that component authors implement and the data that they exchange, and the registry
+of installed components.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What every component is, and what its functions may return.
-
-What a part remembers: numbers of its own for each bond or each particle.
+"""The base class of components, its parameters, and numbers that a component remembers for each
+bond or each particle.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""A component that fails is named: the user learns whose fault it is, not where it surfaced.
+"""Plugin hooks and discovery of installed plugins by pluggy: each is loaded in its own guard, and
+an error of a component names the component and its distribution.
 
-The hook of pbdkit and its marker; where installed plugins declare it, with nothing imported.
-
-Libraries that pbdkit does without, unless something asks for them.
-
-Loads one plugin in its own guard: whatever it does, the others load.
-
-Built-in components of earlier versions, and the ones that they are read as until version 1.0.
+Optional libraries are checked here too, and components of earlier versions are mapped to their
+successors until version 1.0.
 """
 
 from __future__ import annotations

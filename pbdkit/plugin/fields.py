@@ -1,8 +1,5 @@
-"""Parameters that are not one number but differ from place to place.
-
-Random fields: numbers that differ from place to place by chance, near places alike.
-
-Components whose numbers may be fields, a value for each place, or courses in time.
+"""Parameters that vary in space or time: functions of place, values over a grid, random fields, and
+time-dependent parameters.
 """
 
 from __future__ import annotations

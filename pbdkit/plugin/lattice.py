@@ -1,8 +1,5 @@
-"""The Lattice interface: a repeat cell with a basis, and the offsets between its sites.
-
-The NeighbourMetric interface: who is whose neighbour, in shells.
-
-The cells of a lattice: polygons of neighbouring sites that tile the plane.
+"""The interfaces Lattice (a repeat cell with a basis) and NeighbourMetric (neighbours in shells),
+and the cells of a lattice: polygons of neighbouring sites that tile the plane.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Numbers that change in the course of the steps.
-
-Forces of an experiment, along x and y: they may be written with a unit, and change in time.
-"""
+"""Schedules: numbers, and forces along x and y, that are constant or change with the steps."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Vectors, and the few words in which elementwise functions are written.
+"""Vectors, and the operations in which elementwise functions are written.
 
-A rule's functions are called with whole arrays, with single numbers or with probes, always one
-value a component. They use + - * /, the functions of numpy, and choose with `where`.
+The functions of a rule are called with whole arrays, single numbers or probes, always one value a
+component. They use + - * /, the functions of numpy, and `where` for choices.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
-"""The numbers that parts remember, as they declare them.
+"""Constants and remembered numbers that elementwise functions see, and where each is attached: to
+the scene, a slot, a cell, a bond or a particle.
 
-What the fields of an experiment's parts are at some places.
-
-The numbers that a scene's elementwise functions see: what they are, asked for once, and where
-each lives, told once for numpy and for kernels.
-
-A new kind of value is declared here: by who sees it, under which name, and where it lives.
-
-Constants of a scene that fields make differ from particle to particle or from bond to bond.
+A new kind of value is declared here: who sees it, under which name, and where it is attached. numpy
+and kernels read this description.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""Directions of particles: which remembered numbers they are, and what they go with.
-
-Leader groups on a raster: who leads when, and where to.
-
-Guided particles lead along some axes and follow along the others, as on rollers.
+"""Leader groups on a raster: who leads when and along which axes, guided particles (rollers) that
+lead along some axes and follow along the others, and prescribed directions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""The stiffness of a cell that a border of two materials cuts: of layers along the border.
-
-Of what stiffness each cell is, where fields make the material of a rule differ.
+"""Stiffness of each cell where fields make the material of a rule differ; a cell that a border of
+two materials cuts is a laminate of layers along the border.
 """
 
 from __future__ import annotations

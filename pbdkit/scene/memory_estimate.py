@@ -1,9 +1,8 @@
-"""What the linear systems of an equilibrium take, before anything of them is allocated.
+"""Estimates of the memory that a scene and the linear systems of an equilibrium need, made before
+anything of that size is allocated.
 
-All measured as the peak of a fresh process above that of its imports, over sheets of 2500 to a
-million particles: within 15 % of these, for compact bodies that leaders hold.
-
-How large a scene is, before anything of it is allocated.
+All were measured as the peak of a fresh process above that of its imports, over sheets of 2500 to a
+million particles: within 15 % of these for compact bodies that leaders hold.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""The outlines of obstacles: how far a place is from one, and which way is out.
+"""Obstacles on a lattice: where their outlines are at a step, which particles begin inside one, and
+the distance and way out from a place.
 
 `facing`, `way_out` and `clearance` are elementwise, and the same source runs on arrays and inside
-kernels; `leave` and `way_between` are of single places, here and there.
-
-Obstacles on a lattice: where their outlines are when, and who begins inside one.
+kernels; `leave` and `way_between` treat single places in both.
 """
 
 from __future__ import annotations

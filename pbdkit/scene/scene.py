@@ -1,6 +1,5 @@
-"""What a scene is built on: who is whose neighbour, and which sites the body and its frame take.
-
-Assembles the scene of an experiment: only the parts that it uses exist.
+"""Build the scene of an experiment: neighbourhood, body and frame on rasters, and only those parts
+that the experiment uses.
 """
 
 from __future__ import annotations

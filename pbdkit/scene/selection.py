@@ -1,6 +1,5 @@
-"""How a force in all is shared by those on whom it acts.
-
-Who is selected: body particles of the reference configuration.
+"""Selections of body particles in the reference configuration, and the distribution of a total
+force over a selection.
 """
 
 from __future__ import annotations

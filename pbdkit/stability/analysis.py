@@ -1,13 +1,9 @@
-"""The spectra of a scene's step: of its matrix where that is small, else an estimate.
+"""Stability analysis of an experiment: spectrum of its step operator, rate of convergence, and what
+limits both.
 
-What an experiment will do: stable or not, how fast it settles, what stands in its way.
-
-What is known of a body whose step operator is too large for a spectrum: by multigrid on the
-lattice's stencils, as its equilibrium would be found.
-
-The slowest mode is found by inverse iteration on ever finer grids: 1 - λ comes out within 1 %. The
-smallest eigenvalue is that of plane waves; where no frame surrounds the body, edges may have some
-beyond it.
+Where the step operator is too large for a matrix, the slowest mode is found by inverse iteration on
+ever finer grids, with multigrid on the lattice's stencils: 1 - λ is found within 1 %. The smallest
+eigenvalue is that of plane waves; where no frame surrounds the body, edges may have some beyond it.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""Leaders that are too light for steps: the symplectic Euler method is stable for ω ≤ 2.
+"""What `check` reports of an experiment without running it, and `run` before its first step:
+stability, supports, memory and time.
 
-What `check` says of an experiment without running it, and `run` before its first step.
-
-Whether supports hold a body against its loads: what they leave of its motions as a rigid body.
-
-A part of the body that moves as a rigid body resists nothing. Where leaders leave it such a motion
-and the loads do work along it, there is no equilibrium, and steps push it on for ever.
+Leaders of small mass: the symplectic Euler method is stable for ω ≤ 2. Supports: a part of the body
+that can move as a rigid body resists nothing; where leaders leave it such a motion and the loads do
+work along it, there is no equilibrium, and the steps never end.
 """
 
 from __future__ import annotations

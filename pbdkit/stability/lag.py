@@ -1,10 +1,9 @@
-"""What leaders and frame points do to the followers beside them, from the rule's own functions.
+"""Lag of a body behind its equilibrium while leaders move at a steady speed, computed from the
+influence of leaders and frame points on followers.
 
-How far a body trails its equilibrium while leaders move at a steady speed.
-
-A step puts leaders in place first, then followers look; frame points still stand as at the end of
-the step before, and those that follow leaders show where these stood (with the frame's lag, a step
-earlier yet). With S the share of L that frame points show,
+A step places the leaders first, then followers look; frame points still stand as at the end of the
+step before, and those that follow leaders show where these stood (with the frame's lag, one step
+earlier still). With S the share of L that frame points show,
 
     u(t+1) = P u(t) + Q u(t-1) + (L - S) u_L(t+1) + S u_L(t - lag) + s,
 
@@ -14,7 +13,7 @@ distance e = u* - u obeys
     e(t+1) = P e(t) + Q e(t-1) + δ + Q δ - (L - S) v + lag · S v,
 
 and becomes steady: A e = P δ where S = 0 and Q = 0. For the barycentre on a sheet of the square
-lattice, l long between its ends and h apart, that is 4 v l² / (9 √3 h²) at most.
+lattice, l long between its ends and with spacing h, that is at most 4 v l² / (9 √3 h²).
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
-"""Relaxation w and memory b with which the slowest mode of a rule shrinks fastest.
+"""Optimal relaxation w and memory b: the values with which the slowest mode of a rule decays
+fastest, and the choice of `auto` for a scene.
 
-A mode with the eigenvalue λ of the rule's own step becomes two, μ² - (1 + b - wz) μ + b = 0 with
-z = 1 - λ: the heavy ball (Polyak 1964). For real z from m to M, what is asked for is where the
-moduli at both ends are equal, and both roots meet at an end.
-
-Relaxation and memory `auto`: what lets the slowest mode of a scene shrink fastest.
+A mode with the eigenvalue λ of the rule's own step becomes two, μ² - (1 + b - wz) μ + b = 0 with z
+= 1 - λ: the heavy ball (Polyak 1964). For real z from m to M the optimum is where the moduli at
+both ends are equal, and both roots meet at an end.
 
 The modes are those of the rule's own step at rest, with the roles of the last step. Where a group
-of unknowns is small, all of them are known. Else the ends of the spectrum are found by iteration:
-the slowest mode by solving for equilibrium again and again, the fastest by moves alone.
+of unknowns is small, all are computed. Else the ends of the spectrum are found by iteration: the
+slowest mode by repeated equilibrium solutions, the fastest by moves alone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Runs put side by side: one dataset, with what differs between them along a dimension.
-
-The members' variables put together: one dataset with the parameters as dimensions.
+"""Combine the results of runs, or of the members of a sweep, into one dataset with the parameters
+as dimensions.
 """
 
 from __future__ import annotations

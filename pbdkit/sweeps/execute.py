@@ -1,12 +1,5 @@
-"""Who runs the members of a sweep: this process, others on this machine, or a dask cluster.
-
-How large the result of a sweep will be, before anything is run.
-
-A sweep from its file to its dataset: what is held is not run, what is run is held.
-
-Workers of this machine: a process each, and another in its place where one is killed.
-
-A sweep that is asked for in Python, where nothing need be left on the disk.
+"""Execute the members of a sweep that the store does not hold: in this process, in worker processes
+of this machine, each replaced where it is killed, or on a dask cluster.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""The sweep file: an experiment, what is varied of it, and what is kept of each run.
-
-The dimensions of a sweep, their names and what stands along them.
-
-The members of a sweep: one validated experiment each, and the digest that it is known by.
+"""The sweep file: an experiment, the parameters that vary, what is kept of each run, and the
+members with the digest of each.
 """
 
 from __future__ import annotations

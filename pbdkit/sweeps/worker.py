@@ -1,6 +1,5 @@
-"""What is kept of one run, as bytes: names and shapes as JSON, then the values as they are.
-
-Runs one member wherever it is asked to, and reports what came of it: never an exception.
+"""Run one member of a sweep and return a report, never an exception; the kept results as bytes:
+names and shapes as JSON, then the values.
 """
 
 from __future__ import annotations
