@@ -27,7 +27,7 @@ def install(session: nox.Session, group: str) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """The tests, or those that are named: `nox -s tests -- tests/test_paper.py`."""
+    """The tests, or those that are named: `nox -s tests -- tests/experiments/test_paper.py`."""
     install(session, "test")
     session.run("pytest", *(session.posargs or ["-n", "auto", "--dist", "worksteal"]))
 
@@ -77,7 +77,7 @@ def gpu(session: nox.Session) -> None:
     """Kernels for GPUs are compiled as far as that goes without one. The compiler takes half a
     gigabyte, which other environments are spared."""
     session.install("-e", ".[all,gpu]", *nox.project.dependency_groups(PROJECT, "test"))
-    session.run("pytest", "-n", "auto", "tests/test_gpu.py")
+    session.run("pytest", "-n", "auto", "tests/stepping/test_cuda_engine.py")
 
 
 @nox.session

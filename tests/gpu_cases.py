@@ -4,16 +4,20 @@ its own, as numba asks for (NUMBA_ENABLE_CUDASIM=1)."""
 import os
 
 import numpy as np
-import test_axes
-import test_courses
-import test_loads
 from property_cases import FRAMES, LATTICES, RULES
 from remembering_parts import Tiring, Weakest
-from test_cohesive_fracture import COHESIVE
-from test_composites import FIELDS, REGIONS
-from test_cuts import PLATE, cut
-from test_directions import CASES, vanes
-from test_engines import (
+from turning_frame import Turning
+
+import pbdkit
+from pbdkit.scene.scene import build_scene
+from tests.components.test_fracture_cohesive import COHESIVE
+from tests.model.test_boundary_conditions import PLATE, cut
+from tests.plugin import test_lattice as test_axes
+from tests.plugin import test_schedule as test_courses
+from tests.scene import test_loads
+from tests.scene.test_leaders_directions import CASES, vanes
+from tests.scene.test_materials import FIELDS, REGIONS
+from tests.stepping.numba_engine.test_engine import (
     CUT,
     DAMAGE,
     ELASTIC,
@@ -24,10 +28,6 @@ from test_engines import (
     assert_bitwise_equal,
     sheet,
 )
-from turning_frame import Turning
-
-import pbdkit
-from pbdkit.scene.scene import build_scene
 
 SMALL = {"body": {"type": "grid", "columns": 5, "rows": 5}}
 MOVING = {"type": "stepping", "relaxation": 0.7, "memory": 0.2}

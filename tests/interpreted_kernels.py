@@ -12,7 +12,7 @@ import pytest
 @contextmanager
 def interpreting() -> Iterator[None]:
     """For as long as this lasts, here and in processes that are started: to compile each kernel
-    takes seconds. `test_engines` says which are compiled."""
+    takes seconds. `stepping/numba_engine/test_engine` says which are compiled."""
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         patch.setattr("numba.config.DISABLE_JIT", 1)
         patch.setenv("NUMBA_DISABLE_JIT", "1")

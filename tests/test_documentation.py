@@ -30,7 +30,7 @@ def blocks(language):
         for n, code in enumerate(
             re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
         )
-        if page.name != "tutorial.md"  # its blocks build on each other: test_extending.py runs them
+        if page.name != "tutorial.md"  # its blocks build on each other: `plugin/test_documentation`
     ]
 
 
@@ -169,9 +169,9 @@ def test_readme_lists_the_two_commands_that_ci_runs():
 
 FENCES = {"python", "yaml", "console", "sh", "toml", "{code-cell}", "{toctree}", "{eval-rst}",
           "{glossary}", "text"}  # fmt: skip
-"""The kinds of blocks. The first three run above; `toml` is read by `test_extending`, those in
-braces by the builder of the site, cells above too. `text` is what a terminal shows of a run that
-others stop: `test_resume` has it."""
+"""The kinds of blocks. The first three run above; `toml` is read by
+`plugin/test_documentation`, those in braces by the builder of the site, cells above too. `text` is
+what a terminal shows of a run that others stop: `test_restart` has it."""
 SHELL = [
     *PAGES,
     *NOTEBOOKS,
@@ -186,24 +186,24 @@ ELSEWHERE = {
     "mypy": "the session `lint` of nox",
     "nox": "`.ci/run` calls its sessions",
     "pre-commit": "writes into the repository's own hooks",
-    "pip install": "`test_new_plugin` and the session `plugins` of nox install so",
-    "python tests/reliability/": "`test_reliability` runs short samples",
+    "pip install": "`cli/test_plugins_new` and the session `plugins` of nox install so",
+    "python tests/reliability/": "`io/test_checkpoint` runs short samples",
     "python tests/benchmarks": "takes an hour; `test_bench` runs what it is made of",
-    "python docs/reproduction": "takes half an hour; `test_reproduction` runs what it measures",
+    "python docs/reproduction": "half an hour; `experiments/test_paper_reproduction` does",
     "python experiments/": "minutes each; the tests of the plugins run what they show",
     "python -m build": "`test_distribution` builds",
     "twine upload": "publishes",
-    "pbdkit plugins new": "`test_new_plugin`",
-    "pbdkit run pbdkit-mine/example.yaml": "`test_new_plugin`",
-    "pbdkit plugins check pbdkit-lazy": "`test_extending`",
-    "pbdkit run paper/a --set 'rule={type: lazy}'": "`test_extending`",
+    "pbdkit plugins new": "`cli/test_plugins_new`",
+    "pbdkit run pbdkit-mine/example.yaml": "`cli/test_plugins_new`",
+    "pbdkit plugins check pbdkit-lazy": "`plugin/test_documentation`",
+    "pbdkit run paper/a --set 'rule={type: lazy}'": "`plugin/test_documentation`",
     "pbdkit run experiments/": "the tests of the plugins",
     "pbdkit plot kagome-tensile.nc": "the tests of the plugins",
     "pbdkit explain weibull-sheet.nc": "the tests of the plugins",
-    "pbdkit bench": "minutes each; `test_bench` and `test_equilibrium_bench` run smaller ones",
+    "pbdkit bench": "minutes each; `test_bench` and `test_bench_equilibrium` run smaller ones",
     "#SBATCH": "a line for the queue",
-    "pbdkit resume sheet.nc || pbdkit run sheet.yaml": "`test_resume`",
-    'eval "$(_PBDKIT_COMPLETE': "`test_command_line` asks for completions",
+    "pbdkit resume sheet.nc || pbdkit run sheet.yaml": "`test_restart`",
+    'eval "$(_PBDKIT_COMPLETE': "`cli/test_command_line` asks for completions",
 }
 """What commands in pages are not run here begin with, and who runs them, or why nobody does."""
 COMMAND = re.compile(r"^ {4}((?:pbdkit|python3?|pip|pytest|nox|bash|eval|ruff|mypy|pre-commit) .*)")

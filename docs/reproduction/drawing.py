@@ -18,10 +18,9 @@ from matplotlib.tri import Triangulation
 from PIL import Image
 from runs import Floats, Sheet
 
-from pbdkit.plotting.layers import INK, LINE
-from pbdkit.plotting.data import triangles_of, whole
 from pbdkit.plotting.colours import KINDS
-from pbdkit.plotting.data import Recording
+from pbdkit.plotting.data import Recording, triangles_of, whole
+from pbdkit.plotting.layers import INK, LINE
 
 FOLDER = Path(__file__).parent.parent / "pictures" / "reproduction"
 DPI, PAGE_IN, COLOURS = 130, 7.4, 128

@@ -149,7 +149,7 @@ WAVES = 48
 MOST_ANSWERS = 100_000
 """Of a rule that is asked what each neighbour does to each: about half a second."""
 LITTLE_MEMORY = 0.9
-"""Up to which plane waves were seen to bound random bodies (tests/test_predictions.py)."""
+"""Up to which plane waves were seen to bound random bodies (tests/stability/test_forecast.py)."""
 
 
 @dataclass(frozen=True)

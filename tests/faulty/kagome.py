@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-import pbdkit
 from faulty.rules import Sound
+
+import pbdkit
 
 
 class Kagome(pbdkit.Lattice):

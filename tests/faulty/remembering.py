@@ -6,11 +6,11 @@ import random
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from faulty.others import Extent
+from faulty.rules import Sound
 from pydantic import Field, PrivateAttr
 
 import pbdkit
-from faulty.others import Extent
-from faulty.rules import Sound
 from pbdkit import Remembered
 
 STRENGTH = Remembered("strength", "strain at which the bond breaks", "1", 0.5, changes=False)

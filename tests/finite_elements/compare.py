@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import pbdkit
 from finite_elements import uniform
 from finite_elements.drawing import draw
 from finite_elements.lattices import Solved, experiment, on_grid
 from finite_elements.problems import BAR, CANTILEVER, HOLE, Problem
 from finite_elements.stepping import setting_up, stepped
 from finite_elements.timing import Seconds, best
+
+import pbdkit
 from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import build_scene
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from finite_elements.problems import NU, E
 from scipy.spatial import cKDTree
 from skfem import Basis
 from skfem.models.elasticity import linear_elasticity
-
-from finite_elements.problems import NU, E
 
 NEWTON = 6
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
-from skfem import FacetBasis, LinearForm
-
 from finite_elements.specimen import FORCE, HEIGHT, LENGTH, THICKNESS, Data, Plate, lame, read
 from finite_elements.updating import MARGIN, Estimate, Found, alike, ways
+from scipy.optimize import least_squares
+from skfem import FacetBasis, LinearForm
 
 STRESS = FORCE / THICKNESS / HEIGHT
 WINDOWS = {"left": (1.0, 20.0), "right": (60.0, 79.0)}

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from finite_elements.problems import FINEST, PROBLEMS, Problem
 
 DATA = Path(__file__).parent / "data"

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.linalg import splu
-from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, MeshQuad2, condense
-
 from finite_elements.elasticity import plane_stress, values
 from finite_elements.problems import Problem
+from scipy.sparse.linalg import splu
+from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, MeshQuad2, condense
 
 UNIFORM_FROM = 0.2
 

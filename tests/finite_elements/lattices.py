@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-import pbdkit
 from finite_elements.errors import load, relative_l2
 from finite_elements.problems import FINEST, NU, Problem
+
+import pbdkit
 
 HAIR = 1e-6
 ELASTIC = {"type": "elastic", "poisson_ratio": NU}

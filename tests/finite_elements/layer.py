@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from finite_elements.lattices import HAIR, NATURAL
 
 import pbdkit
-from finite_elements.lattices import HAIR, NATURAL
 
 LENGTH = 0.1
 

@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
+from finite_elements.elasticity import find, local
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, MeshQuad, MeshQuad2
 from skfem.helpers import ddot, div, sym_grad
 
 import pbdkit
-from finite_elements.elasticity import find, local
 
 LENGTH, HEIGHT, RADIUS = 80.0, 20.0, 4.0
 FORCE, THICKNESS, NOISE = 6501.0, 3.05, 3e-4

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-import pbdkit
 from finite_elements.lattices import experiment, on_grid
 from finite_elements.problems import Problem
 from finite_elements.timing import Seconds, best
+
+import pbdkit
 from pbdkit.equilibrium.solve import equilibrium_state
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stepping.engine_choice import choose, make_engine

@@ -13,10 +13,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
-from skfem import condense, solve
-from skfem.models.elasticity import linear_elasticity
-
 from finite_elements.specimen import (
     FORCE,
     NOISE,
@@ -27,6 +23,9 @@ from finite_elements.specimen import (
     lame_slope,
     read,
 )
+from scipy.optimize import least_squares
+from skfem import condense, solve
+from skfem.models.elasticity import linear_elasticity
 
 BOUNDS, START, MODES, MARGIN = (0.0, 0.49), 0.245, 6, 0.5
 SCALE = 1.345

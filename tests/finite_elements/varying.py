@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from finite_elements.errors import Reference
 from finite_elements.problems import FINEST, Problem
 

@@ -27,9 +27,10 @@ from skfem import (
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import pbdkit
 from finite_elements.elasticity import plane_stress
 from finite_elements.graded import Rectangle, Solution, graded
+
+import pbdkit
 
 LENGTH, HEIGHT, WEIGHT = 4.0, 1.0, 1e-3
 ELEMENTS = 24

@@ -11,8 +11,8 @@ import argparse
 import sys
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent.parent)]
-from test_obstacles import bending, half_widths
+sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent)]
+from tests.scene.test_obstacles import bending, half_widths
 
 
 def main() -> None:

@@ -8,7 +8,8 @@ The bodies are the net of springs of ν = 1/3, which 'elastic' is for small stra
 crack's plane. What is not on that plane is linear and condensed once; the cells across it soften by
 `Cohesive` itself under the stress across the plane, settled and softened in turn as `solver:
 equilibrium` does. So finer lattices are affordable than whole bodies;
-`tests/test_cohesive_fracture.py` holds one of these, cracked, against a whole one by pbdkit.
+`tests/components/test_fracture_cohesive.py` holds one of these, cracked, against a whole one by
+pbdkit.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
 
-from test_torn_cells import (
+from tests.components.test_elasticity_torn import (
     LATTICES,
     ORTHOTROPIC,
     RULES,

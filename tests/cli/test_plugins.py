@@ -1,0 +1,233 @@
+"""No plugin brings a command down; what is wrong with it is said where it matters."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from plugin_sources import BROKEN, NEWER, listed, rule
+
+import pbdkit
+from pbdkit.cli import COMMANDS
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.plugin.registry import Registry
+from pbdkit.progress import Watch
+from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
+
+Install = Callable[..., None]
+Call = Callable[..., Any]
+
+HEALTHY = "--set=rule={type: zz-healthy}"
+"""Found among the installed ones, so that all of them are loaded."""
+TEARING = "--set=fracture={type: strain, failure: 0.05}"
+EVERY_COMMAND = {
+    "run": ["run", "e.json", HEALTHY, TEARING, "-o", "torn.nc"],
+    "sweep": ["sweep", "s.json", "--workers", "1"],
+    "resume": ["resume", "torn.nc", "--steps", "12", "--anyway"],
+    "status": ["status", "left.nc"],
+    "check": ["check", "e.json", HEALTHY],
+    "experiments": ["experiments"],
+    "init": ["init", "new.yaml"],
+    "plot": ["plot", "made.nc"],
+    "animate": ["animate", "made.nc", "-o", "made.gif", "--every", "10"],
+    "curve": ["curve", "torn.nc", "broken-bonds"],
+    "export": ["export", "torn.nc"],
+    "report": ["report", "torn.nc"],
+    "explain": ["explain", "torn.nc"],
+    "verify": ["verify", "torn.nc"],
+    "identify": ["identify", "e.json", HEALTHY],
+    "bench": ["bench", "e.json", HEALTHY, "--steps=1"],
+    "live": ["live", "--help"],  # else it serves until somebody ends it
+    "fit": ["fit", "--help"],  # `fitting/test_fit` carries some out
+    "plugins": ["plugins", "list"],
+    "schema": ["schema", "experiment"],
+    "schema dataset": ["schema", "dataset"],
+    "plugins new": ["plugins", "new", "pbdkit-fresh"],
+    "plugins json": ["plugins", "list", "--json"],
+}
+DEAR = {"bench", "plot", "animate", "curve", "report"}
+CHEAP = [name for name in EVERY_COMMAND if name not in DEAR]
+"""Those that take no second, for each kind of fault."""
+
+
+@pytest.fixture
+def healthy(install: Install, call: Call) -> None:
+    """The plugin, and an unfinished run of left.nc."""
+    install("zz-healthy", rule("zz-healthy"), "2.1")
+    run = Run(build_scene(pbdkit.load("e.json")), watch=Watch(lambda: True))
+    record(run, NetcdfSink(Path("left.nc")))
+
+
+def test_every_command_is_tried() -> None:
+    assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(COMMANDS)
+
+
+@pytest.mark.usefixtures("healthy")
+def test_all_broken_plugins_together_stop_no_command(
+    install: Install, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = ("numpy", "float64", 1)
+    Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
+    monkeypatch.setattr("pbdkit.bench.engines", lambda: [one])  # is enough
+    assert call("run", "e.json", "-o", "made.nc").code == 0
+    for n, (source, _) in enumerate(BROKEN.values()):
+        install(f"pbdkit-broken-{n}", source, f"0.{n}")
+    failed = {name: r for name, a in EVERY_COMMAND.items() if (r := call(*a)).code}
+    assert failed == {}
+    found = listed(call)
+    for n, (_, reason) in enumerate(BROKEN.values()):
+        row = found[f"pbdkit-broken-{n}"]
+        expected = reason.replace("pbdkit-broken", f"pbdkit-broken-{n}")
+        expected = expected.replace("pbdkit_broken", f"pbdkit_broken_{n}")
+        assert row["reason"].startswith(expected)
+        assert (row["version"], row["state"]) == (f"0.{n}", "broken")
+    assert (found["zz-healthy"]["state"], found["zz-healthy"]["reason"]) == ("ok", "")
+
+
+@pytest.mark.usefixtures("healthy")
+@pytest.mark.parametrize(("source", "reason"), BROKEN.values(), ids=BROKEN)
+def test_no_broken_plugin_stops_a_command(
+    install: Install, call: Call, source: str, reason: str
+) -> None:
+    install("pbdkit-broken", source, "0.3")
+    Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
+    assert {name: r for name in CHEAP if (r := call(*EVERY_COMMAND[name])).code} == {}
+    table = " ".join(call("plugins", "list").out.split())
+    assert f"pbdkit-broken 0.3 broken {reason}" in table
+
+
+def test_the_program_itself_survives_all(install: Install, call: Call) -> None:
+    install("zz-healthy", "print('noise')\n" + rule("zz-healthy"))
+    install("pbdkit-exit", BROKEN["exit"][0])
+    install("pbdkit-warns", "import warnings\nwarnings.simplefilter('error')\n" + rule("w"))
+    command = [sys.executable, "-m", "pbdkit", "run", "e.json", HEALTHY, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, json.loads(done.stdout)["status"]) == (0, "complete")
+    assert "noise" in done.stderr
+
+
+METADATA = {
+    "no equals sign": ("entry_points.txt", "[pbdkit]\nx\n", "pbdkit-torn"),
+    "no module": ("entry_points.txt", "[pbdkit]\nx = ?\n", "pbdkit-torn"),
+    "no UTF-8": ("entry_points.txt", b"\xff\xfe[pbdkit]", "pbdkit_torn-1.0.dist-info"),
+    "no name": ("METADATA", "Version: 1.0\n", "(no name)"),
+    "empty": ("METADATA", "", "(no name)"),
+}
+
+
+@pytest.mark.usefixtures("healthy")
+@pytest.mark.parametrize(("file", "content", "name"), METADATA.values(), ids=METADATA)
+def test_torn_metadata_stop_nobody(
+    install: Install, call: Call, tmp_path: Path, file: str, content: Any, name: str
+) -> None:
+    install("pbdkit-torn", rule("torn"))
+    torn = tmp_path / "site" / "pbdkit_torn-1.0.dist-info" / file
+    torn.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert call("check", "e.json", HEALTHY).code == 0
+    row = listed(call)[name]
+    assert row["state"] == "broken"
+    assert row["reason"] != ""
+    # Where it builds its first model, pydantic would go through all distributions.
+    command = [sys.executable, "-m", "pbdkit", "run", "e.json", "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_another_api_version_is_incompatible(install: Install, call: Call) -> None:
+    install("pbdkit-newer", NEWER, "9.0")
+    row = listed(call)["pbdkit-newer"]
+    expected = "it is written for version 2 of the plugin API, and pbdkit "
+    assert (row["version"], row["state"]) == ("9.0", "incompatible")
+    assert row["reason"].startswith(f"{expected}{pbdkit.__version__} has version 1; install")
+    result = call("run", "e.json", "--set=rule={type: newer}")
+    assert result.code == 2
+    assert "unknown type 'newer'" in result.err
+    assert "; pbdkit-newer 9.0 is incompatible: it is written" in result.err
+
+
+def test_this_api_version_is_fine(install: Install) -> None:
+    install("pbdkit-same", "pbdkit_api = 1\n" + rule("same"))
+    assert [p.state for p in Registry().installed] == ["ok"]
+
+
+def test_an_object_can_be_the_plugin_and_declare_its_api(install: Install, tmp_path: Path) -> None:
+    source = rule("held").split("@pbdkit")[0] + (
+        "class Plugin:\n    pbdkit_api = 3\n"
+        "    @pbdkit.hookimpl\n    def pbdkit_components(self):\n        return [Rule]\n"
+        "plugin = Plugin()\n"
+    )
+    install("pbdkit-held", source)
+    points = tmp_path / "site" / "pbdkit_held-1.0.dist-info" / "entry_points.txt"
+    points.write_text("[pbdkit]\nheld = pbdkit_held:plugin\n")
+    assert [p.state for p in Registry().installed] == ["incompatible"]
+
+
+def test_an_api_version_is_a_number(install: Install) -> None:
+    install("pbdkit-odd", "pbdkit_api = '1'\n" + rule("odd"))
+    (plugin,) = Registry().installed
+    assert (plugin.state, plugin.reason) == (
+        "broken",
+        "TypeError: its `pbdkit_api` should be a whole number, got '1'",
+    )
+
+
+def test_a_run_that_needs_the_broken_part_says_whose_it_is(install: Install, call: Call) -> None:
+    install("pbdkit-broken", "import no_such_module\n" + rule("lost"), "0.3")
+    reason = "ModuleNotFoundError: No module named 'no_such_module' (pbdkit_broken.py, line 1)"
+    result = call("run", "e.json", "--set=rule={type: 'pbdkit-broken:lost'}")
+    assert (result.code, Path("tensile.nc").exists()) == (3, False)
+    whose = "'lost' is asked of pbdkit-broken 0.3, which is broken"
+    assert f": rule.type: {whose}: {reason}\n" in result.err
+    result = call("run", "e.json", "--set=rule={type: lost}")
+    assert (result.code, Path("tensile.nc").exists()) == (2, False)
+    assert "unknown type 'lost'; " in result.err
+    assert f"; pbdkit-broken 0.3 is broken: {reason}" in result.err
+
+
+def test_a_plugin_that_changes_the_folder_changes_it_for_itself(
+    install: Install, call: Call, tmp_path: Path
+) -> None:
+    install("pbdkit-moving", f"import os\nos.chdir({str(tmp_path)!r})\n" + rule("moving"))
+    assert call("run", "e.json", "--set=rule={type: moving}", "-o", "here.nc").code == 0
+    assert Path("here.nc").exists()
+
+
+def test_a_name_is_echoed_in_one_short_line(install: Install, call: Call) -> None:
+    for name in ("\x1b[31mred", "y" * 100_000, "pbdkit-\x1b:red"):
+        result = call("run", "e.json", "--set", f"rule.type={json.dumps(name)}")
+        assert result.code in (2, 3)
+        assert "\x1b" not in result.err.split("rule.type: ")[1]
+        assert len(result.err.split("rule.type: ")[1]) < 2000
+
+
+HALF = rule(
+    "half",
+    """
+class Bad(Rule):
+    type: Literal['bad'] = 'bad'
+    def apply(self): pass
+""",
+)
+HALF = HALF.replace("[Rule]", "[Bad, Rule, int]")
+
+
+def test_one_bad_class_leaves_the_others_in_use(install: Install, call: Call) -> None:
+    install("pbdkit-half", HALF, "0.3")
+    assert call("run", "e.json", "--set=rule={type: half}").code == 0
+    result = call("check", "e.json", "--set=rule={type: bad}")
+    assert result.code == 3
+    assert "'bad' comes from pbdkit-half 0.3, which is broken: TypeError: Bad.apply" in result.err
+    rows = json.loads(call("plugins", "list", "--json").out)
+    states = [(r["interface"], r["type"], r["state"]) for r in rows if "half" in r["distribution"]]
+    assert states == [
+        ("plugin", "pbdkit-half", "broken"),
+        ("FollowerRule", "bad", "broken"),
+        ("FollowerRule", "half", "ok"),
+        ("", "", "broken"),
+    ]

@@ -1,0 +1,355 @@
+"""Fracture with energy: the law of a cell, and what is refused."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.plugin.lattice import signed_area
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.numpy_engine import Fracturing
+from pbdkit.stepping.state import initial_state
+
+sys.path.append(str(Path(__file__).parents[1] / "reliability"))
+
+ENERGY, ONSET = 6e-4, 0.01
+COHESIVE = {"type": "cohesive", "energy": ENERGY, "onset": ONSET}
+HOLD = {"select": {"edge": "bottom"}, "motion": {"type": "hold"}}
+SPRINGS, ELASTIC = {"type": "springs"}, {"type": "elastic", "poisson_ratio": 0.3}
+ORTHOTROPIC = {"type": "orthotropic", "poisson_ratio": 0.0, "modulus_ratio": 0.4}
+ORTHOTROPIC |= {"shear_ratio": 0.3}
+NUMBERS = "damage_left", "damage_right", "failure_left", "failure_right"
+
+
+def body(a, rule=SPRINGS, lattice="square", **parts):
+    sides = {"a": a, "b": 0.6 * a} if lattice == "rectangular" else {"a": a}
+    triangles = lattice == "hexagonal"
+    return {
+        "name": "torn",
+        "lattice": {"type": lattice} | sides,
+        "body": {"type": "grid", "columns": 7, "rows": 2},
+        "neighbours": {"type": "coordination" if triangles else "chebyshev"},
+        "rule": rule,
+        "frame": {"type": "natural"},
+        "fracture": COHESIVE,
+        "steps": 1,
+    } | parts
+
+
+class Strained:
+    """A body whose displacements are those of a gradient, from moment to moment."""
+
+    def __init__(self, **parts):
+        self.scene = build_scene(pbdkit.Experiment(**body(1.0, **parts)))
+        self.state = initial_state(self.scene)
+        raster = self.scene.raster
+        self.X = raster.reference(raster.body_rows)
+        self.X -= self.X.mean(axis=0)
+        self._place = raster.place_of(raster.body_rows)
+        self._fracturing = Fracturing.of(self.scene)
+        self._followers = SlotFollowers(self.scene)
+        self.area = self.scene.cells.share.sum() * abs(
+            float(signed_area(self.scene.neighbourhood.tiling.polygons[0].rest))
+        )
+
+    def forces(self, u):
+        """On the particles, (particle, axis)."""
+        self.state.u.reshape(2, -1)[:, self._place] = np.asarray(u).T
+        return self._followers.forces(self.state.u, self.state).reshape(2, -1)[:, self._place].T
+
+    def put(self, u):
+        """Displacements by which the bonds are judged."""
+        self.state.u.reshape(2, -1)[:, self._place] = np.asarray(u).T
+        self._fracturing.break_bonds(self.state.u, self.state, 1)
+
+    def stress(self, gradient):
+        """The mean stress over Young's modulus under a gradient, by which the bonds are judged."""
+        u = self.X @ np.asarray(gradient).T
+        self.put(u)
+        return -self.forces(u).T @ self.X / self.area
+
+    @property
+    def broken(self):
+        """How many bonds are."""
+        return int((self.state.broken_step >= 0).sum())
+
+
+def along(degrees):
+    return np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+
+
+def strain_of_uniaxial(rule, normal):
+    """The strain under a uniaxial stress of Young's modulus along x."""
+    (xx, yy, xy, shear, *_), nu = rule.elasticity(), rule.through_thickness()
+    C = np.array([[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, shear]])
+    modulus = (xx - xy**2 / yy) * (1 - nu**2)
+    x, y, shear = np.linalg.solve(
+        C, modulus * np.array([n := normal[0] ** 2, 1 - n, np.prod(normal)])
+    )
+    return np.array([[x, shear / 2], [shear / 2, y]]), modulus
+
+
+LATTICES = {
+    "square": (0, 90, 45, 135),
+    "rectangular": (0, 90),
+    "hexagonal": (30, 90, 150),
+}
+RULES = {
+    "springs": SPRINGS,
+    "elastic": ELASTIC,
+    "plane strain": ELASTIC | {"plane": "strain"},
+    "stiffer": ELASTIC | {"stiffness": 3.0},
+    "orthotropic": ORTHOTROPIC,
+}
+CELLS = [
+    (lattice, rule)
+    for lattice in LATTICES
+    for rule in RULES
+    if (lattice, rule) not in {("rectangular", "springs"), ("hexagonal", "orthotropic")}
+]
+
+
+@pytest.mark.parametrize(("lattice", "rule"), CELLS)
+def test_a_cell_bears_the_onset_and_takes_the_energy(lattice, rule):
+    """Strained across the crack alone, as a band between cells that stay elastic: the stress peaks
+    at onset times the modulus along its normal, and its work on the band is energy · E."""
+    onset, energy = 1e-3, 6e-6
+    fracture = {"type": "cohesive", "energy": energy, "onset": onset}
+    for degrees in LATTICES[lattice][: 2 if rule == "orthotropic" else None]:
+        given = Strained(rule=RULES[rule], lattice=lattice, fracture=fracture)
+        normal = along(degrees)
+        uniaxial, modulus = strain_of_uniaxial(given.scene.experiment.rule, normal)
+        polygon = given.scene.neighbourhood.tiling.polygons[0]
+        width = np.ptp(np.array(polygon.rest) @ normal)
+        along_normal = 1.0 if rule == "plane strain" else float(normal @ uniaxial @ normal)
+        strength, strain = onset * modulus / along_normal, np.outer(normal, normal)
+        ways = np.linspace(0.0, 2.1 * energy / (strength * width), 120)
+        pulls = [float(normal @ given.stress(way * strain) @ normal) for way in ways]
+        assert max(pulls) == pytest.approx(strength, rel=0.02)
+        assert np.trapezoid(pulls, ways) * width == pytest.approx(energy, rel=0.02)
+        assert abs(pulls[-1]) < 1e-3 * onset
+        assert given.broken > 0
+
+
+def random_gradients(seed, count=6, size=0.03):
+    return size * np.random.default_rng(seed).normal(size=(count, 2, 2))
+
+
+TURNS = {
+    "turned": np.array([[0.0, -1.0], [1.0, 0.0]]),
+    "mirrored": np.array([[-1.0, 0.0], [0.0, 1.0]]),
+    "mirrored on the diagonal": np.array([[0.0, 1.0], [1.0, 0.0]]),
+}
+GRID = {"type": "grid", "columns": 5, "rows": 5}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
+def test_it_is_the_same_turned_and_mirrored(turn, rule):
+    Q = TURNS[turn]
+    for seed in range(5):
+        one, other = Strained(rule=rule, body=GRID), Strained(rule=rule, body=GRID)
+        for gradient in random_gradients(seed):
+            expected = Q @ one.stress(gradient) @ Q.T
+            np.testing.assert_allclose(other.stress(Q @ gradient @ Q.T), expected, atol=1e-12)
+        assert one.broken == other.broken
+        assert any((value != 0.0).any() for value in one.state.bond_values)
+
+
+def test_it_is_the_same_in_other_units():
+    known = None
+    for a in (0.25, 1.0, 4.0):
+        fracture = COHESIVE | {"energy": 6e-4 * a}
+        experiment = body(a, ELASTIC, body=GRID, fracture=fracture)
+        limits = build_scene(pbdkit.Experiment(**experiment)).constants.limits
+        slot = next(s for s in limits if s.rest.y == 0.0)
+        c = limits[slot]._asdict()
+        found = {name: value / (a if name[0] in "rxy" else 1.0) for name, value in c.items()}
+        known = known or found
+        assert found == pytest.approx(known, rel=1e-12)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_nothing_stiffens_and_forces_balance(lattice):
+    """Whatever the body has been through: no probe of its energy rises, a rigid turn costs
+    nothing, and the stiffness is symmetric."""
+    generator = np.random.default_rng(3)
+    given = Strained(rule=ELASTIC, lattice=lattice, body=GRID)
+    probes = generator.normal(size=(20, *given.X.shape))
+    turned = given.X @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    before = np.full(len(probes), np.inf)
+    for n in range(12):
+        u = given.X @ random_gradients(n, 1)[0].T + 0.05 * generator.normal(size=given.X.shape)
+        given.put(u)
+        forces = [given.forces(probe) for probe in probes]
+        energies = np.array([-(f * u).sum() / 2 for f, u in zip(forces, probes, strict=True)])
+        assert (energies <= before * (1 + 1e-12)).all()
+        assert (energies >= -1e-12).all()
+        assert (forces[0] * probes[1]).sum() == pytest.approx((forces[1] * probes[0]).sum())
+        assert abs(given.forces(turned)).max() < 1e-12
+        assert max(abs(f.sum(axis=0)).max() for f in forces) < 1e-12
+        before = energies
+    assert given.broken > 0
+
+
+def test_it_unloads_along_the_secant_and_never_heals():
+    given = Strained(rule=ELASTIC, body=GRID)
+    gradient = np.array([[0.0, 0.0], [0.0, 2.0 * ONSET]])
+    pulled = given.stress(gradient)
+    kept = [value.copy() for value in given.state.bond_values]
+    assert 0.0 < pulled[1, 1] < ONSET
+    for share in (0.7, 0.0, -3.0, 1.0):
+        np.testing.assert_allclose(given.stress(share * gradient), share * pulled, atol=1e-15)
+        for value, old in zip(given.state.bond_values, kept, strict=True):
+            assert np.array_equal(value, old)
+
+
+def test_the_crack_of_a_cell_keeps_its_direction():
+    """Pulled upwards, then sideways: bonds along the crack do not soften."""
+    given = Strained(rule=ELASTIC, body=GRID)
+    given.stress([[0.0, 0.0], [0.0, 1.1 * ONSET]])
+    given.stress([[5.0 * ONSET, 0.0], [0.0, 0.0]])
+    planes = given.scene.neighbourhood.planes
+    level = next(n for n, plane in enumerate(planes) if plane.slot.rest.y == 0.0)
+    upright = next(n for n, plane in enumerate(planes) if plane.slot.rest.x == 0.0)
+    left, _, failure, _ = (
+        dict(zip(NUMBERS, given.state.bond_values, strict=True))[name] for name in NUMBERS
+    )
+    assert left[upright].max() > 0.5
+    assert left[level].max() == 0.0
+    assert failure[level].min() < 0.0
+
+
+def test_a_bond_breaks_where_both_cells_are_torn():
+    given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 3, "rows": 2})
+    planes = given.scene.neighbourhood.planes
+    upright = next(n for n, plane in enumerate(planes) if plane.slot.rest.x == 0.0)
+    above = given.X[:, 1] > 0.0
+    corner = np.zeros_like(given.X)
+    corner[above & (given.X[:, 0] < -0.5), 1] = 1.0
+    given.put(corner)  # which tears the left cell
+    left, right = (value[upright] for value in given.state.bond_values[:2])
+    broken = given.state.broken_step[upright] >= 0
+    assert np.count_nonzero((left >= 1.0) != (right >= 1.0)) == 1  # of the bond between the cells
+    assert np.array_equal(broken, (left >= 1.0) & (right >= 1.0))
+    assert np.count_nonzero(broken) == 1
+    given.put(np.where(above[:, None], [0.0, 1.0], 0.0))
+    assert np.count_nonzero(given.state.broken_step[upright] >= 0) == 3
+
+
+TORN = {
+    "body": {"type": "grid", "columns": 9, "rows": 7},
+    "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 30}],
+    "leaders": [
+        HOLD,
+        {
+            "select": {"edge": "top"},
+            "motion": {"type": "velocity", "velocity": [4e-4, 1e-3], "steps": 150},
+        },
+    ],
+    "steps": 160,
+    "diagnostics": [{"type": "displacement"}],
+}
+
+
+@pytest.mark.parametrize(
+    ("lattice", "rule", "threads"), [("square", ELASTIC, 1), ("hexagonal", SPRINGS, 2)]
+)
+def test_kernels_soften_as_numpy_does(lattice, rule, threads):
+    pytest.importorskip("numba")
+    fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01}
+    found, known = (
+        pbdkit.run(
+            body(
+                1.0, rule, lattice, fracture=fracture, **TORN,
+                solver={"type": "stepping", "engine": engine, "relaxation": 0.6} | more,
+            ),
+            progress=False,
+        )
+        for engine, more in (("compiled", {"threads": threads}), ("numpy", {}))
+    )  # fmt: skip
+    damage = known.damage_left.values[-1]
+    assert ((damage > 0.0) & (damage < 1.0)).sum() > 3
+    assert (known.broken_step.values > 0).any()
+    for name in ("u", *NUMBERS, "broken_step"):
+        assert np.array_equal(found[name].values, known[name].values), name
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        (body(14.0), ["0.0006 is too little for this spacing", "make the spacing smaller than"]),
+        (body(0.1, {"type": "barycentre"}) | {"frame": {"type": "mean"}},
+         ["'cohesive' needs a rule that is calibrated to a material", "which 'barycentre'",
+          "or fracture: {type: damage}"]),
+        (body(0.1) | {"frame": {"type": "none"}},
+         ["'cohesive' softens the cells of the body", "frame 'none'", "{type: natural}"]),
+    ],
+    ids=["spacing", "barycentre", "frame"],
+)  # fmt: skip
+def test_what_does_not_go_with_it_is_told(parts, words):
+    with pytest.raises(pbdkit.ExperimentError) as error:
+        build_scene(pbdkit.Experiment(**parts))
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_the_remedies_for_a_large_spacing_are_true():
+    with pytest.raises(pbdkit.ExperimentError) as error:
+        build_scene(pbdkit.Experiment(**body(14.0)))
+    words = str(error.value).split()
+    share, onset = float(words[words.index("than") + 1]), float(words[words.index("below") + 1][:6])
+    for size, more in ((14.0 * share * 0.99, {}), (14.0, {"onset": onset * 0.99})):
+        build_scene(pbdkit.Experiment(**body(size, fracture=COHESIVE | more)))
+
+
+def test_a_bar_bears_its_strength_and_takes_its_energy():
+    """A sample of `cohesive_strength.py`: the onset is 1.5 % lower in a zone."""
+    import cohesive_strength
+
+    rule = cohesive_strength.RULES["elastic, ν = .2"]
+    strength, energy, left = cohesive_strength.measured(
+        "square", rule, 30, height=2.0, length=5.0, increments=20
+    )
+    assert strength == pytest.approx(0.985, abs=0.01)
+    assert energy == pytest.approx(1.0, abs=0.02)
+    assert left < 1e-9
+
+
+def test_a_beam_tears_as_griffith_says():
+    """A sample of `fracture_energy.py`; the whole is in docs/fracture.md."""
+    import fracture_energy
+
+    share = fracture_energy.beam(29, far=1.3, count=8)
+    assert share.mean() == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("last", [0, 5])
+def test_a_condensed_body_carries_what_a_whole_one_does(last):
+    """A cracked beam of `fracture_energy.py`, of which the bonds across the columns up to `last`
+    are torn, and the same by pbdkit: both linear, so that they differ by rounding alone."""
+    import fracture_energy
+
+    h, columns, rows, lead, opening = 0.25, 13, 4, 2, 1e-3
+    half, middle = fracture_energy.Half.of(h, columns, rows, [lead]), (rows - 0.5) * h
+    force, _ = half.force(half.torn(0, last), opening)
+    leaders = [
+        {
+            "select": {"nearest": [[0.0, middle + side * (lead + 0.5) * h]]},
+            "motion": {"type": "displace", "displacement": [0.0, side * opening / 2]},
+        }
+        for side in (-1, 1)
+    ]
+    whole = body(h, {"type": "elastic", "poisson_ratio": 1 / 3}) | {
+        "body": {"type": "grid", "columns": columns, "rows": 2 * rows},
+        "fracture": {"type": "none"},
+        "cuts": [{"from": [-1.0, middle], "to": [(last + 0.25) * h, middle]}],
+        "leaders": leaders,
+        "solver": {"type": "equilibrium", "tolerance": 1e-10},
+        "diagnostics": [{"type": "reaction", "youngs_modulus": 1.0}],
+    }
+    carried = pbdkit.run(whole, progress=False).reaction.sel(axis="y").values[-1]
+    np.testing.assert_allclose(carried, [-force, force], rtol=1e-8)

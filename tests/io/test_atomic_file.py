@@ -1,0 +1,287 @@
+"""Whatever a command writes appears whole or not at all, and the earlier file stands until then."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.io.atomic_file import NewFile, write, write_folder, write_together, written
+from pbdkit.io.paged_file import PagedFile
+from pbdkit.io.seal import SealedFile
+from tests.conftest import Call
+
+SCRIPT = Path(__file__).parents[1] / "reliability" / "disk_faults.py"
+
+
+class Short(io.FileIO):
+    """Takes half of what it is given, as POSIX allows."""
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        return super().write(view[: (len(view) + 1) // 2])
+
+
+class Full(io.FileIO):
+    """A disk that is full once it holds some bytes."""
+
+    room = 3000
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        place = self.tell()
+        if place >= self.room and view:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(view[: self.room - place])
+
+
+def left() -> list[str]:
+    """The hidden files of the current folder, which are temporaries."""
+    return [path.name for path in Path.cwd().rglob(".*")]
+
+
+def sealed(path: Path) -> bool:
+    with SealedFile(path) as file:
+        file.check()
+        return file.seal is not None
+
+
+SWEEP = {"experiment": "e.json", "vary": {"solver.relaxation": [0.5, 1.0]}}
+
+
+@pytest.fixture
+def result(call: Call) -> Call:
+    """In the folder are the result in.nc and the sweep s.json."""
+    assert call("run", "e.json", "-o", "in.nc").code == 0
+    Path("s.json").write_text(json.dumps(SWEEP))
+    return call
+
+
+def test_a_seal_that_is_written_piece_by_piece_is_whole(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(io, "FileIO", Short)
+    assert result("run", "e.json", "-o", "out.nc").code == 0
+    assert result("sweep", "s.json", "-o", "s", "--workers", "1").code == 0
+    assert sealed(Path("out.nc"))
+    assert sealed(Path("s/sweep.nc"))
+
+
+def test_a_result_that_the_disk_gives_back_otherwise_gets_no_name(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run of less than a second has no store, and is read back nevertheless."""
+    settle = os.fsync
+
+    def spoil(descriptor: int) -> None:
+        settle(descriptor)
+        if os.fstat(descriptor).st_size > 1000:
+            os.pwrite(descriptor, b"\xff\x00\xff", 700)
+
+    monkeypatch.setattr(os, "fsync", spoil)
+    found = call("run", "e.json", "-o", "out.nc")
+    assert (found.code, Path("out.nc").exists(), left()) == (6, False, [])
+    assert "gives back what was not written" in found.err
+
+
+WRITING = {
+    "export": ["export", "in.nc", "-o", "out.vtkhdf"],
+    "animate": ["animate", "in.nc", "-o", "out.gif", "--size", "2", "2", "--dpi", "60"],
+    "plot": ["plot", "in.nc", "-o", "out.png"],
+    "plot svg": ["plot", "in.nc", "-o", "out.svg"],
+    "report": ["report", "in.nc", "-o", "out.html"],
+    "run": ["run", "e.json", "-o", "out.nc"],
+}
+
+
+@pytest.mark.parametrize("name", WRITING)
+def test_a_full_disk_leaves_the_earlier_file_and_blames_no_other(
+    result: Call, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    words = WRITING[name]
+    output = Path(words[3])
+    output.write_text("earlier")
+    with monkeypatch.context() as patch:
+        patch.setattr(io, "FileIO", Full)
+        found = result(*words, "--force")
+    assert (found.code, output.read_text(), left()) == (6, "earlier", [])
+    assert found.err.startswith(f"pbdkit: {output}: cannot be written: ")
+    assert "damaged" not in found.err
+
+
+@pytest.mark.parametrize("name", ["export", "animate"])
+def test_short_writes_make_the_same_file(
+    result: Call, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    words = WRITING[name]
+    assert result(*words).code == 0
+    whole = Path(words[3]).read_bytes()
+    monkeypatch.setattr(io, "FileIO", Short)
+    assert result(*words, "--force").code == 0
+    assert Path(words[3]).read_bytes() == whole
+
+
+def test_a_sweep_on_a_full_disk_keeps_its_earlier_dataset(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = ["sweep", "s.json", "-o", "s", "--workers", "1"]
+    assert result(*sweep).code == 0
+    earlier = Path("s/sweep.nc").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(io, "FileIO", Full)
+        found = result(*sweep)
+    assert (found.code, left()) == (6, [])
+    assert found.err == "pbdkit: s/sweep.nc: cannot be written: No space left on device\n"
+    assert Path("s/sweep.nc").read_bytes() == earlier
+
+
+def test_hdf5_never_hears_of_a_fault(tmp_path: Path) -> None:
+    """It would try again as the process ends, and crash it."""
+    disk = Full(tmp_path / "x", "x+b")
+    file = NewFile(disk)
+    with h5py.File(file, "w") as content:
+        for n in range(50):
+            content[f"variable{n}"] = np.arange(1000.0)
+    with pytest.raises(OSError, match="No space left"):
+        file.settle()
+    disk.close()
+
+
+def test_an_error_in_the_block_that_is_no_fault_of_the_disk_stays_what_it_is(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "x"
+    path.write_text("earlier")
+    for kind in (NewFile, PagedFile):
+        with pytest.raises(KeyError), written(path, kind, replace=True):
+            raise KeyError("mine")
+        with pytest.raises(KeyboardInterrupt), written(path, kind, replace=True):
+            raise KeyboardInterrupt
+    assert path.read_text() == "earlier"
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
+def test_the_earlier_file_gives_its_permissions(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_text("earlier")
+    path.chmod(0o600)
+    write(path, "new", replace=True)
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", 0o600)
+
+
+def test_links_and_pipes_are_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    link, pipe = tmp_path / "link", tmp_path / "pipe"
+    link.symlink_to("mine")
+    os.mkfifo(pipe)
+    for path, kind in ((link, "a symbolic link"), (pipe, "a pipe")):
+        with pytest.raises(pbdkit.StorageError, match=f"is {kind}, which is not replaced"):
+            write(path, "new", replace=True)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_the_figures_of_bench_replace_no_link(call: Call) -> None:
+    """Refused before anything is measured."""
+    Path("link.json").symlink_to("e.json")
+    found = call("bench", "e.json", "--json", "link.json")
+    assert (found.code, "is a symbolic link, which is not replaced" in found.err) == (2, True)
+
+
+def test_a_folder_and_files_that_belong_together_appear_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(io, "FileIO", Full)
+    texts = {"a": "a", "b/c": "x" * 9000, "b/d": "d"}
+    with pytest.raises(pbdkit.StorageError, match="folder: cannot be written: No space"):
+        write_folder(tmp_path / "folder", texts)
+    with pytest.raises(pbdkit.StorageError, match="c: cannot be written: No space"):
+        write_together({tmp_path / "a": "a", tmp_path / "c": "x" * 9000})
+    assert [*tmp_path.iterdir()] == []
+    monkeypatch.setattr(Full, "room", 10**6)
+    write_folder(tmp_path / "folder", texts)
+    assert {n: (tmp_path / "folder" / n).read_text() for n in texts} == texts
+    with pytest.raises(pbdkit.StorageError, match="File exists"):
+        write_folder(tmp_path / "folder", texts)
+
+
+@pytest.mark.parametrize("letter", ["a", "名"])
+def test_names_may_be_as_long_as_the_system_takes(call: Call, letter: str) -> None:
+    most = 243 - len(".nc")  # a run has files whose names are 12 bytes longer
+    name = letter * (most // len(letter.encode())) + ".nc"
+    assert call("run", "e.json", "-o", name).code == 0
+    assert call("plot", name).code == 0
+    assert left() == []
+
+
+@pytest.mark.parametrize("length", [244, 250, 251, 255, 256])
+def test_a_name_that_is_too_long_is_named(call: Call, length: int) -> None:
+    name = "a" * (length - 3) + ".nc"
+    for words in (["run", "e.json", "-o", name], ["resume", name]):
+        found = call(*words)
+        assert (found.code, "File name too long" in found.err) == (6, True), found
+        assert "bug" not in found.err
+
+
+PROGRAM = [sys.executable, "-m", "pbdkit"]
+OTHER_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+def test_a_name_in_utf_8_is_one_in_any_locale(call: Call) -> None:
+    command = [*PROGRAM, "run", "e.json", "-o", "ü.nc"]
+    done = subprocess.run(command, env=os.environ | OTHER_LOCALE, capture_output=True, check=False)
+    assert (done.returncode, done.stderr, Path("ü.nc").exists()) == (0, b"", True)
+
+
+def test_too_few_descriptors_for_the_workers_of_a_sweep_are_named(result: Call) -> None:
+    def few() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (22, 22))
+
+    Path("s.json").write_text(json.dumps(SWEEP | {"replicates": 3}))
+
+    command = [*PROGRAM, "sweep", "s.json", "-o", "s", "--workers", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=few, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (6, 1), done.stderr
+    assert "Too many open files; raise the limit (`ulimit -n`)" in done.stderr
+
+
+def test_standard_output_that_fails_is_named_and_no_bug(result: Call) -> None:
+    listing, told = ["experiments"], "pbdkit: standard output: {}\n"
+    full = "No space left on device"
+    runs = ["run", "e.json", "-o", "out.nc", "--force"]
+    cases = {
+        ">/dev/full": (listing, 6, told.format(full)),
+        ">&-": (listing, 6, told.format("is closed")),
+        " >/dev/full": (runs, 6, told.format(full)),
+        "--force -o in.png >/dev/full": (["plot", "in.nc"], 6, told.format(full)),
+        "2>/dev/full": (["explain", "none.nc"], 6, ""),
+        "2>&- >&- <&-": (["explain", "none.nc"], 6, ""),
+        " 2>&- <&-": (["explain", "in.nc"], 2, ""),
+    }
+    for redirection, (words, code, err) in cases.items():
+        line = f"exec {' '.join([*PROGRAM, *words])} {redirection}"
+        done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (code, err), redirection
+    assert sealed(Path("out.nc"))
+
+
+def test_a_sample_of_the_faults_of_a_disk() -> None:
+    """The script tries each call of each command; tests/reliability/disk_faults.py."""
+    some = ["--commands", "run,export vtkhdf,init", "--first", "2", "--every", "45"]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *some], capture_output=True, text=True, check=False
+    )
+    if done.returncode == 77:
+        pytest.skip(done.stdout.strip())
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " 0 of 0 held" not in done.stdout

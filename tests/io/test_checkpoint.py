@@ -1,0 +1,442 @@
+"""Runs are killed, raced, stopped, starved and mended: a short sample of the long trials, which are
+scripts in tests/reliability, and faults that are injected one by one."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scene_strategies import experiments, pulled_apart, samples
+
+import pbdkit
+from pbdkit.io import checkpoint as run_store
+from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io.atomic_file import is_local
+from pbdkit.io.checkpoint import RunStore, UnfinishedRun, status_of, store_of
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.sinks import OverlappingSink
+
+FOLDER = Path(__file__).parents[1] / "reliability"
+sys.path.append(str(FOLDER))
+OUT = Path("out.nc")
+
+
+@pytest.mark.parametrize(
+    "trial",
+    [
+        "kill_runs.py --trials 4 --kinds breaking",
+        "two_writers.py --trials 3 --kinds small",
+        "mutate_stores.py --trials 3 --kinds breaking",
+        "mutate_sweeps.py --trials 4",
+        "equilibria.py fracture --trials 3",
+        "equilibria.py certificates --trials 5",
+        "fit_coverage.py --trials 10 --processes 1 --kinds poisson",
+    ],
+)
+def test_a_sample_of_the_long_trials(trial: str) -> None:
+    script, *words = trial.split()
+    command = [sys.executable, str(FOLDER / script), *words, "--seed", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@samples(6)
+@given(experiments(leaders=pulled_apart()), st.integers(0, 10**6))
+def test_runs_that_are_stopped_and_gone_on_with_are_the_same(
+    parts: dict[str, Any], seed: int
+) -> None:
+    from stopping import NUMPY, resumed_otherwise
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(netcdf_sink, "EVERY_S", 0.0)
+        patch.setattr(netcdf_sink, "SHARE", 0)
+        patch.setitem(NetcdfSink.__init__.__kwdefaults__, "first_s", 0.0)
+        try:
+            found, _ = resumed_otherwise(parts, Path(folder), random.Random(seed), engines=[NUMPY])
+        except pbdkit.ExperimentError:  # no scene
+            return
+    assert found == []
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every state is kept."""
+    monkeypatch.setattr(netcdf_sink, "EVERY_S", 0.0)
+    monkeypatch.setattr(netcdf_sink, "SHARE", 0)
+    monkeypatch.setattr(OverlappingSink, "due", lambda self: True)
+    monkeypatch.setitem(NetcdfSink.__init__.__kwdefaults__, "first_s", 0.0)
+
+
+def before_keeping(patch: pytest.MonkeyPatch, number: int, act: Any) -> None:
+    """Does something before the run is kept for that time."""
+    keep, left = UnfinishedRun.keep, [number]
+
+    def keeping(*args: Any) -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            act()
+        keep(*args)
+
+    patch.setattr(UnfinishedRun, "keep", keeping)
+
+
+def whole(call: Any) -> Any:
+    """The positions of the run of e.json in one go."""
+    assert call("run", "e.json", "-o", "whole.nc").code == 0
+    return pbdkit.open("whole.nc")["position"].values
+
+
+def is_whole(right: Any) -> bool:
+    """Whether the output is there as it should be, and nothing besides."""
+    with pbdkit.open(OUT) as dataset:
+        same = np.array_equal(dataset["position"].values, right)
+    return same and names() <= {"e.json", "whole.nc", "out.nc"}
+
+
+@pytest.mark.parametrize(
+    ("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129), ("SIGUSR1", 138)]
+)
+def test_a_signal_leaves_a_run_to_go_on_with(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch, name: str, code: int
+) -> None:
+    right, number = whole(call), getattr(signal, name)
+    inherited = signal.getsignal(number)
+    if inherited is signal.SIG_IGN:  # as under nohup, where the program ignores it, too
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        with monkeypatch.context() as patch:
+            before_keeping(patch, 3, lambda: os.kill(os.getpid(), number))
+            found = call("run", "e.json", "-o", str(OUT))
+    finally:
+        signal.signal(number, inherited)
+    assert found.code == code
+    assert "pbdkit resume out.nc" in found.err
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+FAILING = {
+    "a large write": "disk",
+    "a commit": "commit",
+    "a new name": "link",
+    "the sync": "fsync",
+}
+
+
+@pytest.mark.parametrize("what", FAILING)
+def test_a_full_disk_is_named_and_the_run_gone_on_with(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """At the fourth commit, or what comes after it; tests/reliability/full_disk.py fills a real
+    one at each write."""
+    right = whole(call)
+
+    def full(*args: Any, **more: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+
+        def fill() -> None:
+            if FAILING[what] == "disk":
+                patch.setattr(netcdf_sink.PagedFile, "settle", full)
+            elif FAILING[what] == "commit":
+                patch.setattr(RunStore, "commit", full)
+            elif FAILING[what] == "link":
+                patch.setattr(os, "link", full)
+                patch.setattr(Path, "rename", full)
+            else:
+                patch.setattr(os, "fsync", full)
+
+        before_keeping(patch, 4, fill)
+        found = call("run", "e.json", "-o", str(OUT))
+    assert found.code == 6
+    assert "the disk is full" in found.err
+    assert "pbdkit resume out.nc" in found.err
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_a_folder_that_takes_no_file_is_refused_before_the_first_step(
+    call: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class ReadOnly(io.FileIO):
+        def __init__(self, file: Any, mode: str = "r") -> None:
+            if "x" in mode:
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+            super().__init__(file, mode)
+
+    monkeypatch.setattr(io, "FileIO", ReadOnly)
+    found = call("run", "e.json", "-o", str(OUT))
+    assert (found.code, "Read-only file system" in found.err) == (6, True)
+    assert names() == {"e.json"}
+
+
+def names() -> set[str]:
+    """Of the files in the current folder."""
+    return {path.name for path in Path.cwd().iterdir()}
+
+
+class FailingError(Exception):
+    """What a plugin may raise."""
+
+
+def stopped(call: Any, patch: pytest.MonkeyPatch) -> None:
+    """An unfinished run of e.json."""
+
+    def fail() -> None:
+        raise FailingError("at last")
+
+    with patch.context() as inner:
+        before_keeping(inner, 5, fail)
+        assert call("run", "e.json", "-o", str(OUT)).code == 1
+
+
+def test_whatever_is_raised_in_a_run_leaves_what_was_kept(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = whole(call)
+    stopped(call, monkeypatch)
+    assert call("status", str(OUT)).code == 0
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_clocks_that_are_set_back_show_in_no_figure(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped(call, monkeypatch)
+    monkeypatch.setattr(time, "time", lambda: 0.0)
+    found = status_of(OUT)
+    assert found is not None
+    assert found["age_s"] == 0.0
+    assert found["left_s"] is None or 0.0 <= found["left_s"] < 100.0
+
+
+def put(key: str, data: bytes) -> None:
+    """Something else in the store, as if it had been written so."""
+    with RunStore(store_of(OUT), mode="rw") as store:
+        store.commit([(key, data)])
+
+
+def test_a_newer_store_is_refused_with_its_version(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped(call, monkeypatch)
+    with RunStore(store_of(OUT)) as store:
+        about = store.facts("about")
+    put("about", json.dumps(about | {"format": "4"}).encode())
+    for command in ("resume", "status", "plot"):
+        found = call(command, str(OUT))
+        assert (found.code, "is of format 4" in found.err) == (6, True), found
+
+
+def test_a_store_that_a_killed_process_was_making_is_none(call: Any) -> None:
+    Path("out.nc.run").touch()
+    Path("out.nc.run-records").touch()
+    assert call("status", str(OUT)).code == 2
+    assert call("run", "e.json", "-o", str(OUT)).code == 0
+    assert names() == {"e.json", "out.nc"}
+
+
+KEPT = "out.nc.run", "out.nc.run-records", "out.nc.run-wal"
+
+
+def killed(call: Any, patch: pytest.MonkeyPatch, *more: str, number: int = 6) -> dict[str, bytes]:
+    """What a run of e.json leaves that is killed at this commit; nothing else is left."""
+    found: dict[str, bytes] = {}
+    with patch.context() as inner:
+        copying = lambda: found.update({name: Path(name).read_bytes() for name in KEPT})  # noqa: E731
+        before_keeping(inner, number, copying)
+        assert call("run", "e.json", "-o", str(OUT), *more).code == 0
+    OUT.unlink()
+    return found
+
+
+def lay(files: dict[str, bytes]) -> None:
+    """These files, and no others of the run."""
+    for path in Path.cwd().glob("out.nc*"):
+        path.unlink()
+    for name, data in files.items():
+        Path(name).write_bytes(data)
+
+
+def kept() -> dict[str, bytes]:
+    """The files of the run, but for what SQLite makes to read."""
+    found = {path.name: path.read_bytes() for path in Path.cwd().glob("out.nc*")}
+    return {name: data for name, data in found.items() if data and not name.endswith("-shm")}
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    """With one bit changed."""
+    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+
+def test_damage_to_the_log_of_a_store_is_named_and_the_rest_is_kept(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bit of its head, or of its first frame, or all of it: what the log held is lost, and known
+    to be."""
+    right, files = whole(call), killed(call, monkeypatch)
+    log = files["out.nc.run-wal"]
+    for damage in (flipped(log, 17), flipped(log, 2000), None):
+        damaged = {**files, "out.nc.run-wal": damage} if damage else dict(files)
+        if damage is None:
+            del damaged["out.nc.run-wal"]
+        lay(damaged)
+        for command in ("status", "resume", "plot", "run e.json -o"):
+            found = call(*command.split(), str(OUT))
+            assert found.code == (2 if command.startswith("run") else 6), (command, found)
+            assert kept() == damaged, command
+        assert "--anyway goes on from the last commit" in call("status", str(OUT)).err
+        assert call("resume", str(OUT), "--anyway").code == 0
+        assert is_whole(right)
+    lay(files)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_what_is_missing_of_a_store_is_named_and_the_rest_is_kept(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, files = whole(call), killed(call, monkeypatch)
+    records = files["out.nc.run-records"]
+    for changed in (
+        {"out.nc.run": None},
+        {"out.nc.run": b""},
+        {"out.nc.run": files["out.nc.run"][:100]},
+        {"out.nc.run-records": None},
+        {"out.nc.run-records": bytes(len(records))},
+        {"out.nc.run-records": flipped(records, 30)},
+    ):
+        damaged = {name: data for name, data in (files | changed).items() if data is not None}
+        lay(damaged)
+        for command in ("status", "resume", "run e.json -o"):
+            found = call(*command.split(), str(OUT))
+            assert (found.code in (2, 6), "no unfinished run" in found.err) == (True, False), found
+            assert "damaged" in found.err or "unfinished" in found.err
+            assert kept() == {name: data for name, data in damaged.items() if data}, command
+        assert call("resume", str(OUT)).code == 6
+    lay(files)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+    lay({"out.nc.run": b"", "out.nc.run-records": records})
+    assert call("run", "e.json", "-o", str(OUT), "--force").code == 0
+    assert is_whole(right)
+
+
+def test_stores_that_are_put_together_from_two_are_named(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From another run of the same experiment, and from the same run before. Where the log holds
+    all that is in the main file, that is not needed."""
+    right, files = whole(call), killed(call, monkeypatch)
+    other = killed(call, monkeypatch)
+    for name in KEPT:
+        damaged = {**files, name: other[name]}
+        lay(damaged)
+        for command in ("status", "resume"):
+            found = call(command, str(OUT))
+            if found.code == 0 and name == "out.nc.run":
+                assert command == "status" or is_whole(right)
+                continue
+            assert (found.code, "damaged" in found.err) == (6, True), (name, found)
+            assert kept() == damaged
+    lay(files)
+    with monkeypatch.context() as patch:
+        patch.setattr(UnfinishedRun, "keep", stopping(UnfinishedRun.keep, 3))
+        assert call("resume", str(OUT)).code == 1
+    now = kept()
+    assert now.keys() == {"out.nc.run", "out.nc.run-records"}
+    lay({**now, "out.nc.run": files["out.nc.run"]})
+    found = call("resume", str(OUT))
+    assert (found.code, "commits of" in found.err) == (6, True), found
+    lay(now)
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def stopping(keep: Any, number: int) -> Any:
+    """Keeps so many times, and fails then."""
+    left = [number]
+
+    def keeping(*args: Any) -> None:
+        keep(*args)
+        left[0] -= 1
+        if left[0] == 0:
+            raise FailingError("at last")
+
+    return keeping
+
+
+@pytest.mark.parametrize("cut", [0, 100, 4096])
+def test_a_store_that_was_never_whole_is_in_nobodys_way(call: Any, cut: int) -> None:
+    """As where the disk got full, or the power went, while it was made."""
+    with RunStore(store_of(OUT), mode="rwc"):
+        data = store_of(OUT).read_bytes()
+    lay({"out.nc.run": data[:cut], "out.nc.run-records": b""})
+    before = kept()
+    for command in ("status", "resume"):
+        assert call(command, str(OUT)).code == 2
+        assert kept() == before
+    assert call("run", "e.json", "-o", str(OUT)).code == 0
+    assert names() == {"e.json", "out.nc"}
+
+
+def test_a_journal_that_names_another_file_is_refused(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite would roll it back and remove the file."""
+    stopped(call, monkeypatch)
+    Path("precious").touch()
+    mark, name = run_store.JOURNAL_MARK, str(Path("precious").absolute()).encode()
+    end = b"".join(n.to_bytes(4, "big") for n in (len(name), sum(name)))
+    header = (mark + bytes(12) + (512).to_bytes(4, "big") + (4096).to_bytes(4, "big")).ljust(512)
+    Path("out.nc.run-journal").write_bytes(header + bytes(4) + name + end + mark)
+    for command in ("resume", "status"):
+        found = call(command, str(OUT))
+        assert (found.code, "names another file" in found.err) == (6, True), found
+    assert Path("precious").exists()
+
+
+def test_on_a_network_the_store_keeps_a_journal_that_needs_no_shared_memory(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    mounts = tmp_path / "mountinfo"
+    mounts.write_text("1 0 0:1 / / rw - ext4 /dev/sda rw\n2 1 0:2 / /net rw - nfs4 host:/ rw\n")
+    assert is_local(Path("/home/a.nc"), str(mounts))
+    assert not is_local(Path("/net/a.nc"), str(mounts))
+    mounts.write_text("1 0 0:1 / / rw - nfs4 host:/ rw\n")
+    monkeypatch.setattr(run_store, "is_local", lambda path: is_local(path, str(mounts)))
+    right = whole(call)
+    stopped(call, monkeypatch)
+    assert names() >= {"out.nc.run", "out.nc.run-records"}
+    assert not Path("out.nc.run-wal").exists()
+    assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_what_has_its_name_and_was_killed_before_its_store_went_is_finished(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = whole(call)
+    with monkeypatch.context() as patch:
+        patch.setattr(UnfinishedRun, "remove", lambda self: self.close())
+        assert call("run", "e.json", "-o", str(OUT)).code == 0
+    assert store_of(OUT).exists()
+    assert "is finished" in call("status", str(OUT)).err
+    assert "is finished" in call("resume", str(OUT)).err
+    assert is_whole(right)

@@ -1,0 +1,275 @@
+"""Datasets as analysts hold them: labels that select, axes that read right, runs put together."""
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from property_cases import LATTICES, experiment, pull_right
+
+import pbdkit
+from pbdkit.io.layout import OF_BODY, OF_FRAME
+from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.lattice.raster import FRAME
+from pbdkit.progress import Watch
+from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
+
+OLD = Path(__file__).parents[1] / "data" / "version-1.nc.gz"
+HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+
+
+def torn(crack=0.2, **parts):
+    """The dataset of a sheet with a crack up to a height, which is then pulled apart."""
+    cracks = [[[2.5, -2.0], [2.5, crack]]]
+    given = {
+        "leaders": [HELD, pull_right(0.3, 0.0, 8)],
+        "fracture": {"type": "threshold", "thresholds": [1.4], "cracks": cracks},
+        "diagnostics": [{"type": "pe1"}, {"type": "crack-path"}],
+        "record": {"every": 5},
+        "steps": 10,
+    }
+    return pbdkit.run(experiment(**given | parts), progress=False)
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return torn()
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_every_particle_has_indices_of_its_own(lattice):
+    ds = pbdkit.run(experiment(lattice=lattice, steps=1), progress=False)
+    assert (np.stack([ds.i, ds.j], axis=1) == ds.site).all()
+    assert len(set(zip(ds.i.values, ds.j.values, strict=True))) == ds.sizes["particle"]
+    for n in (0, ds.sizes["particle"] // 2):
+        i, j = ds.site.values[n]
+        assert ds.pbd.at(i=i, j=j).identical(ds.sel(particle=n + 1))
+        assert int(ds.set_xindex(["i", "j"]).sel(i=i, j=j).number) == n + 1
+
+
+def test_lines_of_particles_are_selected_by_one_index(sheet):
+    column = sheet.pbd.at(i=3)
+    assert column.j.values.tolist() == [-1, 0, 1, 2, 3, 4, 5]
+    assert column.identical(sheet.set_xindex("i").sel(i=3).drop_indexes("i"))
+    for asked, said in [({"i": 3, "j": 99}, "no particle at i=3, j=99"), ({"k": 1}, "not by 'k'")]:
+        with pytest.raises(pbdkit.ExperimentError, match=said):
+            sheet.pbd.at(**asked)
+
+
+def test_fields_unstack_to_rasters(sheet):
+    raster = sheet.set_index(particle=["i", "j"]).pe1.unstack("particle")
+    assert raster.dims == ("time", "i", "j")
+    np.testing.assert_array_equal(raster.sel(i=3, j=2), sheet.pbd.at(i=3, j=2).pe1)
+
+
+def test_roles_never_change_and_kinds_do():
+    released = pull_right(0.3, 0.0, 2) | {"until": 2}
+    ds = torn(leaders=[HELD, released])
+    assert ((ds.kind == FRAME) == (ds.role == OF_FRAME)).all()
+    assert ds.role.dims == ("particle",)
+    assert (ds.kind.where(ds.role == OF_BODY, drop=True).std("time") > 0).any()
+    meanings = dict(zip(ds.role.flag_meanings.split(), ds.role.flag_values, strict=True))
+    assert meanings == {"body": OF_BODY, "frame": OF_FRAME}
+    assert ds.role.dtype == ds.role.flag_values.dtype == np.int8
+
+
+def test_bonds_select_sort_and_group_by_number(sheet):
+    third = sheet.sel(bond=3)
+    assert third.bond_ends.values.tolist() == sheet.bond_ends.values[2].tolist()
+    assert sheet.sortby("bond", ascending=False).bond.values[-1] == 1
+    first = sheet.sortby("broken_step").sel(bond=sheet.crack_bond)
+    assert (first.broken_step == sheet.crack_step).all()
+    np.testing.assert_array_equal(first.broken_strain, sheet.crack_strain)
+    X = sheet.reference.sel(particle=sheet.bond_ends)
+    assert (np.hypot(*(X.diff("end").squeeze().T)) == 1.0).all()
+    assert sheet.broken_step.groupby("shell").max().item() == sheet.broken_step.max()
+
+
+def texts(figure):
+    """What stands at the axes of a figure and above them."""
+    axes = figure.axes
+    found = (t for ax in axes for t in (ax.get_xlabel(), ax.get_ylabel(), ax.get_title()))
+    return [" ".join(text.split()) for text in found if text]
+
+
+def test_axes_of_plots_say_what_is_there(sheet):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    parts, last = sheet.pbd.components(), {"time": -1}
+    drawn = {
+        "pe1": lambda: sheet.pe1.sel(particle=25).plot(),
+        "broken": lambda: sheet.broken_step.plot(),
+        "crack": lambda: sheet.crack_step.plot(),
+        "grid": lambda: sheet.isel(last).plot.scatter(x="i", y="j", hue="pe1"),
+        "places": lambda: parts.isel(last).plot.scatter(x="position_x", y="position_y"),
+    }
+    said = {}
+    for name, draw in drawn.items():
+        figure = plt.figure()
+        draw()
+        said[name] = texts(figure)
+        plt.close(figure)
+    pe1 = "pseudo-energy PE1 [lattice unit^2]"
+    assert said["pe1"][:2] == ["time [step]", pe1]
+    assert said["broken"] == ["number of the bond", "time of breaking [step]"]
+    assert said["crack"] == ["crack", "time of breaking [step]"]
+    assert said["grid"] == ["site index i", "site index j", "time = 10 [step]", pe1]
+    x, y = (f"position, {axis} component [lattice unit]" for axis in "xy")
+    assert said["places"][:2] == [x, y]
+
+
+def test_components_are_those_of_every_vector(sheet):
+    parts = sheet.pbd.components()
+    assert "axis" not in parts.dims
+    np.testing.assert_array_equal(parts.position_y, sheet.position.sel(axis="y"))
+    assert {"reference_x", "reference_y"} <= {*parts.coords}
+    assert sheet.position.long_name == "position"
+    alone = sheet.sel(axis="x")
+    assert alone.pbd.components().identical(alone)
+
+
+def test_stresses_say_in_which_unit_they_are():
+    calibrated = {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "leaders": [HELD, pull_right(0.01, 0.0, 1)],
+    }
+    asked = [{"type": "stress", "youngs_modulus": 2.0}, {"type": "reaction", "youngs_modulus": 2.0}]
+    ds = pbdkit.run(experiment(**calibrated, diagnostics=asked, steps=1), progress=False)
+    assert ds.stress_xx.units == "stress unit"
+    assert ds.stress_xx.comment == "stress unit: that of youngs_modulus as it is given"
+    assert ds.reaction.units == "stress unit * thickness unit * lattice unit"
+    assert ds.reaction.comment.endswith("thickness unit: that of thickness as it is given")
+    assert "comment" not in ds.position.attrs
+
+
+def test_plain_concatenation_of_runs():
+    runs = [torn(0.2), torn(2.2)]
+    assert runs[0].sizes["crack"] != runs[1].sizes["crack"]
+    whole = xarray.concat(runs, "run", join="outer", combine_attrs="drop_conflicts")
+    for n, run in enumerate(runs):
+        assert whole.broken_step.isel(run=n).equals(run.broken_step)
+        assert whole.crack_step.isel(run=n).dropna("crack").astype(int).equals(run.crack_step)
+    for name in ("i", "j", "role", "reference", "bond_ends", "shell", "site"):
+        assert whole[name].identical(runs[0][name]), name
+    assert {"experiment"} <= runs[0].attrs.keys() - whole.attrs.keys() <= {"experiment", "created"}
+
+
+def test_concatenated_runs_carry_what_differs():
+    runs = [torn(0.2), torn(1.2), torn(2.2, name="other", leaders=[HELD])]
+    whole = pbdkit.concat(runs)
+    assert whole.cracks_0_1_1.values.tolist() == [0.2, 1.2, 2.2]
+    assert whole.name.values.tolist() == ["small", "small", "other"]
+    assert whole.leaders.dims == ("run",)
+    assert json.loads(whole.leaders.values[2])[0]["motion"] == {"type": "hold"}
+    assert "frame" not in whole.coords
+    again = pbdkit.rerun(whole.isel(run=1), progress=False)
+    assert again.drop_attrs().identical(runs[1].drop_attrs())
+    np.testing.assert_array_equal(again.broken_step, whole.broken_step.isel(run=1))
+
+
+def test_runs_of_other_bodies_and_parts_are_concatenated(tmp_path):
+    wider = torn(body={"type": "grid", "columns": 7, "rows": 5})
+    whole = pbdkit.concat([torn(), wider, torn(fracture={"type": "none"})], "sheet")
+    assert whole.columns.values.tolist() == [6, 7, 6]
+    assert whole.fracture.values.tolist() == ["threshold", "threshold", "none"]
+    np.testing.assert_array_equal(whole.position.isel(sheet=1), wider.position)
+    assert whole.position.isel(sheet=0).dropna("particle").sizes["particle"] == 56
+    assert whole.broken_step.isel(sheet=2).isnull().all()
+    whole.to_netcdf(tmp_path / "whole.nc")
+    with xarray.open_dataset(tmp_path / "whole.nc") as opened:
+        assert opened.load().equals(whole)
+
+
+def test_what_is_no_run_is_not_concatenated(sheet):
+    for runs, said in [([], "there is no run"), ([sheet, sheet.drop_attrs()], "carries no exper")]:
+        with pytest.raises(pbdkit.ExperimentError, match=said):
+            pbdkit.concat(runs)
+    with pytest.raises(pbdkit.ExperimentError, match="have a 'time' already"):
+        pbdkit.concat([sheet], "time")
+
+
+def test_parameters_are_coordinates_of_a_sweep():
+    given = experiment(leaders=[HELD, pull_right(0.3, 0.0)], steps=3)
+    vary, keep = {"solver.relaxation": [0.5, 1.0]}, {"variables": ["u"]}
+    found = pbdkit.sweep(given, vary, keep=keep, workers=1, progress=False)
+    assert found.relaxation.values.tolist() == [0.5, 1.0]
+    ones = [pbdkit.run(given | {"solver": {"type": "stepping", "relaxation": r}}, progress=False)
+            for r in (0.5, 1.0)]  # fmt: skip
+    whole = pbdkit.concat(ones, "relaxation_")
+    np.testing.assert_array_equal(whole.u, found.u)
+    assert whole.relaxation.values.tolist() == [0.5, 1.0]
+    for name in ("i", "j", "role"):
+        assert found[name].equals(ones[0][name])
+
+
+def test_members_of_a_sweep_are_joined_along_their_cracks():
+    given = experiment(leaders=[HELD, pull_right(0.3, 0.0, 8)], steps=10,
+                       diagnostics=[{"type": "crack-path"}],
+                       fracture={"type": "threshold", "thresholds": [1.4]})  # fmt: skip
+    found = pbdkit.sweep(given, {"fracture.thresholds": [[1.4], [9.0]]}, workers=1, progress=False)
+    assert found.crack_step.dims == ("thresholds", "crack")
+    assert found.crack.values.tolist() == list(range(1, found.sizes["crack"] + 1))
+    assert found.bond_ends.dims == ("bond", "end")
+    assert (found.crack_step.sel(thresholds=1) == found.crack_step.fill_value).all()
+
+
+def test_a_run_that_is_not_finished_shows_the_same_layout(tmp_path, monkeypatch):
+    given = pbdkit.Experiment(**experiment(leaders=[HELD, pull_right(0.3, 0.0)], steps=40,
+                                           fracture={"type": "threshold", "thresholds": [1.4]},
+                                           diagnostics=[{"type": "crack-path"}]))  # fmt: skip
+    output, looks = tmp_path / "out.nc", iter(range(100))
+    run = Run(build_scene(given), watch=Watch(lambda: next(looks) >= 5))
+    assert record(run, NetcdfSink(output)).outcome.status == "interrupted"
+    whole = pbdkit.run(given, progress=False)
+    with pbdkit.open(output) as left:
+        assert {n: (v.dims, v.dtype, repr(v.attrs)) for n, v in left.variables.items()} == {
+            n: (v.dims, v.dtype, repr(v.attrs)) for n, v in whole.variables.items()
+        }
+        assert {*left.coords} == {*whole.coords}
+
+
+@pytest.fixture
+def old(tmp_path):
+    """A file that pbdkit wrote when the layout was that of version 1."""
+    path = tmp_path / "old.nc"
+    path.write_bytes(gzip.decompress(OLD.read_bytes()))
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:.*(carries no seal|made by):pbdkit.PbdkitWarning")
+def test_a_file_of_version_1_has_the_names_of_now(old):
+    with pbdkit.open(old) as before:
+        again = pbdkit.rerun(before, progress=False)
+        assert (before.schema_version, again.schema_version) == ("1", "2")
+        assert {*before.variables} == {*again.variables}
+        assert {*before.coords} == {*again.coords}
+        for name, variable in again.variables.items():
+            assert (before[name].dims, before[name].dtype) == (variable.dims, variable.dtype)
+            assert before[name].attrs.keys() == variable.attrs.keys()
+            assert before[name].attrs["long_name"] == variable.attrs["long_name"]
+            now = variable.fillna(0.0) if name == "pe1" else variable
+            if now.dtype.kind == "f":
+                np.testing.assert_allclose(before[name], now, rtol=1e-12, atol=1e-12)
+            else:
+                np.testing.assert_array_equal(before[name], now)
+        in_order = before.broken_step.sel(bond=before.crack_bond)
+        np.testing.assert_array_equal(in_order, before.crack_step)
+
+
+@pytest.mark.filterwarnings("ignore:.*carries no seal:pbdkit.PbdkitWarning")
+def test_a_file_of_version_1_is_drawn_explained_and_tried(old, call, tmp_path):
+    with xarray.open_dataset(old, engine="h5netcdf") as raw:
+        before = raw.copy(deep=True)
+        assert raw.pbd.at(i=0, j=0).kind.isel(time=0) == 0
+        assert raw.pbd.plot(color="pe1", contours=True).get_title() == "old-layout, step 12"
+        assert raw.identical(before)
+    explained = call("explain", str(old))
+    assert explained.out.splitlines()[0] == "fracture threshold: 9 of 49 bonds broke"
+    assert call("plot", str(old), "-o", str(tmp_path / "old.png")).code == 0
+    refused = call("resume", str(old), "--steps", "20")
+    assert (refused.code, "is of schema_version 1" in refused.err) == (2, True)
+    assert call("verify", str(old)).code == 6

@@ -1,0 +1,91 @@
+"""The schemas in schemas/ are current, and describe what is accepted and made."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import pbdkit
+from pbdkit.fitting.schema import fit_schema
+from pbdkit.fitting.specification import shipped_fits
+from pbdkit.io.layout import dataset_schema
+from pbdkit.model.reading import read_file
+from pbdkit.model.schema import experiment_schema
+from pbdkit.model.shipped import read_experiment, shipped_names
+from pbdkit.plugin.registry import Registry
+from pbdkit.sweeps.specification import sweep_schema
+
+SCHEMAS = Path(__file__).parents[2] / "schemas"
+EXPERIMENT = experiment_schema(Registry(), installed=False)
+DATASET = dataset_schema(Registry(), installed=False)
+SWEEP, FIT = sweep_schema(), fit_schema()
+of_experiment, of_dataset = map(jsonschema.Draft202012Validator, (EXPERIMENT, DATASET))
+
+
+@pytest.mark.parametrize(
+    ("name", "schema"),
+    [("experiment", EXPERIMENT), ("dataset", DATASET), ("sweep", SWEEP), ("fit", FIT)],
+)
+def test_committed_schema_is_current(name, schema):
+    committed = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
+    assert committed == json.loads(json.dumps(schema)), "make it anew, see CONTRIBUTING.md"
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_experiments_and_their_datasets_are_described(name):
+    of_experiment.validate(read_experiment(name).data)
+    uncut = ["cuts=[]"] if "cuts" in read_experiment(name).data else []  # they come later
+    experiment = pbdkit.load(name, settings=["steps=4", "record={every: 1}", *uncut])
+    of_experiment.validate(json.loads(experiment.model_dump_json()))
+    made = pbdkit.run(experiment, progress=False).to_dict(data=False)
+    of_dataset.validate(json.loads(json.dumps(made, default=lambda a: a.tolist())))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("lattice", "type"), "sqare"),
+        (("lattice",), {"a": 1.0}),
+        (("rule", "k"), 1.0),
+        (("leaders", 0, "select"), {}),
+        (("steps",), "10"),
+        (("stepz",), 10),
+    ],
+)
+def test_the_schema_refuses_what_the_program_refuses(path, value):
+    data = read_experiment("paper/a").data
+    *parents, last = path
+    part = data
+    for key in parents:
+        part = part[key]
+    part[last] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, EXPERIMENT)
+    with pytest.raises(pbdkit.ExperimentError):
+        pbdkit.Experiment(**data)
+
+
+def test_the_schema_of_sweeps_describes_what_is_taken():
+    shipped = SCHEMAS.parent / "docs" / "stability-map.yaml"
+    sweep = read_file(shipped).data
+    jsonschema.validate(sweep, SWEEP)
+    for wrong in ({"varry": {}}, {"keep": {"times": "lost"}}, {"replicates": 0}, {"experiment": 3}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(sweep | wrong, SWEEP)
+
+
+@pytest.mark.parametrize("name", shipped_fits())
+def test_shipped_fits_are_described(name):
+    data = read_file(Path(pbdkit.__file__).parent / "fits" / f"{name}.yaml").data
+    jsonschema.validate(data, FIT)
+    for wrong in ({"unknowns": {}}, {"unknown": 3}, {"measured": {"type": "fields"}}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(data | wrong, FIT)
+
+
+def test_one_measurement_or_several_are_described():
+    data = read_file(Path(pbdkit.__file__).parent / "fits" / "plate-with-hole.yaml").data
+    several = [data["measured"], {"type": "curve", "file": "f", "group": 1}]
+    jsonschema.validate(data | {"measured": several}, FIT)

@@ -1,0 +1,243 @@
+"""docs/extending tells of every interface, hook and public name, and its examples conform."""
+
+import ast
+import importlib
+import inspect
+import os
+import re
+import shlex
+import subprocess
+import sys
+import types
+from contextlib import nullcontext
+from pathlib import Path
+from typing import ClassVar, get_origin
+
+import pytest
+from interpreted_kernels import interpreting
+
+import pbdkit
+import pbdkit.testing
+from pbdkit.plugin import INTERFACES, Component
+from pbdkit.plugin.discovery import Hooks
+from pbdkit.testing import PROPERTIES, examine, examples_of
+
+PAGES = Path(__file__).parents[2] / "docs" / "extending"
+PAGE_OF = {
+    "Lattice": "lattice.md",
+    "NeighbourMetric": "neighbours.md",
+    "FollowerRule": "rule.md",
+    "FramePolicy": "frame.md",
+    "FractureModel": "fracture.md",
+    "Diagnostic": "diagnostic.md",
+}
+CAPABILITIES = {
+    "FollowerRule": (
+        pbdkit.Calibrated,
+        pbdkit.Loadable,
+        pbdkit.TearsCells,
+        pbdkit.StoresEnergy,
+        pbdkit.Remembers,
+        pbdkit.Draws,
+        pbdkit.RenewsParticles,
+        pbdkit.SharesParticles,
+        pbdkit.TurnsParticles,
+        pbdkit.AppliesTwice,
+    ),
+    "FractureModel": (
+        pbdkit.Remembers,
+        pbdkit.Draws,
+        pbdkit.RenewsBonds,
+        pbdkit.Softens,
+        pbdkit.SoftensCells,
+        pbdkit.StartsCracked,
+        pbdkit.BreaksAtStrain,
+        pbdkit.KnowsStiffness,
+    ),
+    "FramePolicy": (pbdkit.Anchors,),
+}
+EVERY = pytest.mark.parametrize("interface", INTERFACES.values(), ids=lambda i: i.__name__)
+
+
+def text_of(interface):
+    return (PAGES / PAGE_OF[interface.__name__]).read_text()
+
+
+def blocks(text, language="python"):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.M | re.S)
+
+
+def in_code(text):
+    """Every word that a page sets as code, arguments and blocks left out."""
+    inline = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    return set(re.findall(r"`(\w+)(?:\([^`]*\)| = \w+)?`", inline))
+
+
+@EVERY
+def test_a_page_tells_every_method_and_declaration(interface):
+    annotations = inspect.get_annotations(interface, eval_str=True)
+    declared = {n for n, kind in annotations.items() if get_origin(kind) is ClassVar}
+    methods = {
+        n for n, v in list(vars(interface).items()) if inspect.isroutine(getattr(v, "__func__", v))
+    }
+    fields = set(interface.model_fields) - set(Component.model_fields)
+    names = {n for n in declared | methods | fields if not n.startswith(("_", "model_"))}
+    assert names
+    assert names <= in_code(text_of(interface))
+
+
+@EVERY
+def test_a_page_tells_what_only_some_can_do(interface):
+    text = text_of(interface)
+    for capability in CAPABILITIES.get(interface.__name__, ()):
+        assert re.search(rf"`(pbdkit\.)?{capability.__name__}`", text)
+        assert getattr(capability, "__abstractmethods__", set()) <= in_code(text)
+
+
+@EVERY
+def test_a_page_gives_the_signatures(interface):
+    of = [interface, *CAPABILITIES.get(interface.__name__, ())]
+    for name, arguments in re.findall(r"`(\w+)\(([\w, ]*)\)` \|", text_of(interface)):
+        (method, *_) = (getattr(kind, name) for kind in of if hasattr(kind, name))
+        parameters = inspect.signature(method).parameters
+        assert [p for p in parameters if p != "self"] == re.findall(r"\w+", arguments), name
+
+
+def reports_on(interface, code, tmp_path, monkeypatch):
+    """The example's own run, and what the suite says of its component."""
+    module = f"page_of_{interface.__name__.lower()}_{len(sys.modules)}"
+    (tmp_path / f"{module}.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    page = importlib.import_module(module)
+    found = vars(page).values()
+    (component,) = (c for c in found if inspect.isclass(c) and issubclass(c, interface))
+    return [examine(example) for example in examples_of(component)]
+
+
+@EVERY
+def test_the_smallest_example_conforms(interface, tmp_path, monkeypatch):
+    code = blocks(text_of(interface))[0]
+    has_functions = interface in (pbdkit.FollowerRule, pbdkit.FractureModel)
+    with nullcontext() if has_functions else interpreting():
+        reports = reports_on(interface, code, tmp_path, monkeypatch)
+    for report in reports:
+        assert report.holds, str(report)
+        if has_functions:
+            assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
+
+
+@pytest.mark.parametrize("interface", [pbdkit.FollowerRule, pbdkit.FractureModel])
+def test_the_example_that_remembers_conforms(interface, tmp_path, monkeypatch, interpreted):
+    (code,) = (block for block in blocks(text_of(interface)) if "pbdkit.Remembered(" in block)
+    for report in reports_on(interface, code, tmp_path, monkeypatch):
+        assert report.holds, str(report)
+        assert "declares-what-it-remembers" in [outcome.property for outcome in report.ran]
+
+
+@EVERY
+def test_a_page_lists_the_properties_of_its_interface(interface):
+    asked = text_of(interface).split("## What it must hold")[1].split("## ")[0]
+    told, known = set(re.findall(r"`([a-z-]+)`", asked)), {p.name for p in PROPERTIES}
+    own = {p.name for p in PROPERTIES if interface in p.interfaces and len(p.interfaces) < 6}
+    assert told & known == own
+    assert {word for word in told if "-" in word} <= known
+
+
+def test_the_table_of_properties_is_whole():
+    rows = re.findall(
+        r"^\| `([a-z-]+)` \| (.*?) \| (.*?) \|$", (PAGES / "testing.md").read_text(), re.M
+    )
+    assert [row[0] for row in rows] == [p.name for p in PROPERTIES]
+    for (_, of, told), asked in zip(rows, PROPERTIES, strict=True):
+        whom = {i.__name__ for i in INTERFACES.values()} if of == "all" else set(of.split(", "))
+        assert whom == {i.__name__ for i in asked.interfaces}
+        assert asked.asks.startswith(told)
+
+
+@pytest.mark.parametrize("name", [*pbdkit.__all__, *pbdkit.testing.__all__])
+def test_every_public_name_is_told(name):
+    assert name in in_code((PAGES / "api.md").read_text())
+
+
+def names_in_documentation():
+    """(module, name) of the tables of public names, of `pbdkit.NAME` on the pages for authors, and
+    of the directives of the reference."""
+    module, found = "", set()
+    for line in (PAGES / "api.md").read_text().splitlines():
+        if header := re.match(r"\| of `([\w.]+)` \|", line):
+            module = header[1]
+        elif module and line.startswith("| `"):
+            found |= {(module, name) for name in re.findall(r"`(\w+)`", line.split("|")[1])}
+    for page in PAGES.glob("*.md"):
+        written = re.findall(r"\bpbdkit\.([A-Z]\w+)", page.read_text())
+        found |= {("pbdkit", name) for name in written}
+    reference = PAGES.parent / "reference.md"
+    for what, name in re.findall(r"^\.\. (\w+):: ([\w.]+)$", reference.read_text(), re.M):
+        module = name if what == "currentmodule" else module
+        found |= {(module, name)} - {(name, name)}
+    return sorted(found)
+
+
+@pytest.mark.parametrize(("module", "name"), names_in_documentation())
+def test_documented_names_are_imported_from_where_the_documentation_says(module, name):
+    assert name in importlib.import_module(module).__all__
+    assert getattr(importlib.import_module(module), name) is not None
+
+
+def test_the_public_names_are_one_list():
+    """For Python, for type checkers, and of what authors exchange with pbdkit."""
+    tree = ast.parse(Path(pbdkit.__file__).read_text())
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and n.test.id == "TYPE_CHECKING")
+    imports = (n for n in block.body if isinstance(n, ast.ImportFrom) and n.module != "typing")
+    checked = {name.asname: node.module for node in imports for name in node.names}
+    assert checked == pbdkit._MODULE_OF
+    public = {name for name, module in checked.items() if module == "pbdkit.plugin"}
+    assert public == {*pbdkit.plugin.__all__} - {"INTERFACES"}
+    for name, module in checked.items():
+        assert getattr(pbdkit, name) is getattr(importlib.import_module(module), name)
+
+
+def test_every_hook_is_told_with_its_signature():
+    hooks = {n: v for n, v in vars(Hooks).items() if not n.startswith("_")}
+    assert hooks
+    for name, hook in hooks.items():
+        arguments = ", ".join(p for p in inspect.signature(hook).parameters if p != "self")
+        assert f"def {name}({arguments}):" in (PAGES / "api.md").read_text()
+
+
+def test_every_page_is_reached_from_the_first():
+    index = (PAGES / "README.md").read_text()
+    assert {p.name for p in PAGES.glob("*.md")} - {"README.md"} == set(
+        re.findall(r"\]\(([^)#]+)", index)
+    )
+
+
+def test_the_tutorial_leads_from_a_notebook_to_a_tested_plugin(
+    tmp_path, monkeypatch, install, call, interpreted
+):
+    text = (PAGES / "tutorial.md").read_text()
+    notebook = types.ModuleType("notebook")
+    monkeypatch.setitem(sys.modules, "notebook", notebook)
+    names = vars(notebook)
+    for code in blocks(text)[:2]:
+        exec(compile(code, "tutorial.md", "exec"), names)
+    assert names["ds"].attrs["status"] == "complete"
+
+    files = dict(re.findall(r"^`(\S+)`:\n\n```\w+\n(.*?)^```", text, re.M | re.S))
+    assert set(files) == {"pyproject.toml", "pbdkit_lazy.py", "test_lazy.py"}
+    install("pbdkit-lazy", files["pbdkit_lazy.py"], version="0.1.0")
+    (tmp_path / "test_lazy.py").write_text(files["test_lazy.py"])
+    pytest_call = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_lazy.py"]
+    places = [str(Path(pbdkit.__file__).parent.parent), os.environ["PYTHONPATH"]]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(places)}
+    done = subprocess.run(
+        pytest_call, cwd=tmp_path, capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 0, done.stdout
+    assert "FollowerRule lazy: 21 properties ran, 0 failed" in done.stdout
+
+    commands = re.findall(r"^pbdkit (.*)$", text, re.M)
+    assert len(commands) == 2
+    for command in commands:
+        result = call(*shlex.split(command))
+        assert result.code == 0, result.err

@@ -1,0 +1,155 @@
+"""Mistakes of authors are met in a run, and answered with place, cause and remedy."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+import pbdkit
+
+
+class Plain(pbdkit.FollowerRule):
+    share: float = 0.5
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[1]
+
+
+class DividesByZero(Plain):
+    type: Literal["divides"] = "divides"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / pbdkit.length(total[0])
+
+
+class TakesReference(Plain):
+    type: Literal["takes-reference"] = "takes-reference"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * here.X.x
+
+
+class TakesReferenceWhole(Plain):
+    type: Literal["takes-whole"] = "takes-whole"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] + 0.0 * here.centred
+
+
+class TakesOther(Plain):
+    type: Literal["takes-other"] = "takes-other"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * p.part
+
+
+class HasTable(Plain):
+    type: Literal["has-table"] = "has-table"
+    table: tuple[float, ...] = (0.5, 1.0)
+    mode: str = "a"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * p.table[0]
+
+
+class HasMode(HasTable):
+    type: Literal["has-mode"] = "has-mode"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * (1.0 if p.mode == "a" else 0.5)
+
+
+class HasWeights(Plain):
+    type: Literal["has-weights"] = "has-weights"
+
+    def weights(self, slot, setting):
+        return {"nearness": 1.0}
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d * w.nearnes, 1.0
+
+
+class StartsAtVector(pbdkit.RenewsParticles, Plain):
+    type: Literal["starts-at-vector"] = "starts-at-vector"
+
+    def remembered(self):
+        return (pbdkit.Remembered("way", "way", "lattice unit", initial=pbdkit.Vector(0.0, 0.0)),)
+
+    @staticmethod
+    def remember(total, here, p):
+        return (here.own.way,)
+
+
+class Measured(pbdkit.Diagnostic):
+    def variables(self):
+        return (pbdkit.Variable("q", ("particle",), "q", "1"),)
+
+    def measure(self, now):
+        return np.hypot(*now.displacement().T)
+
+
+class Array(Measured):
+    type: Literal["array"] = "array"
+
+
+class Alone(Measured):
+    type: Literal["alone"] = "alone"
+
+    def variables(self):
+        return pbdkit.Variable("q", ("particle",), "q", "1")
+
+
+class Misspelt(Measured):
+    type: Literal["misspelt"] = "misspelt"
+
+    def measure(self, now):
+        return (now.displacment(),)
+
+
+class Infinite(Measured):
+    type: Literal["infinite"] = "infinite"
+
+    def measure(self, now):
+        return (np.full(len(now.reference()), np.inf),)
+
+
+DECLARE = "are given to rules that declare `uses_reference: ClassVar[bool] = True`"
+NO_NUMBER = "is none: make numbers of it in `parameters` or `weights`"
+TUPLE = ", not a tuple: write `(value,)`"
+MISTAKES = {
+    DividesByZero: ("particle 25, found at step 1", "a displacement is NaN", "in divide (test_ru",
+                    "guard divisions and roots with `pbdkit.where`"),
+    TakesReference: ("test_rule_evaluation.py, line ", "`here.X` and `here.centred`", DECLARE),
+    TakesReferenceWhole: ("test_rule_evaluation.py, line ", DECLARE),
+    TakesOther: ("has no attribute 'part'", "; `p` holds share", "mistakes.py, line "),
+    HasTable: ("`p` holds numbers, and the parameter 'table'", NO_NUMBER, "mistakes.py, line "),
+    HasMode: ("`p` holds numbers, and the parameter 'mode'", NO_NUMBER, "mistakes.py, line "),
+    HasWeights: ("did you mean 'nearness'?", "mistakes.py, line "),
+    StartsAtVector: ("'way' starts at Vector", "is one number", "as way_x and way_y"),
+    Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
+    Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
+    Misspelt: ("no attribute 'displacment'; did you mean 'displacement'?", "mistakes.py, line "),
+    Infinite: ("q of particle 1 at step 0", "displacements are finite, but not what is measured"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("part", MISTAKES, ids=lambda part: part.__name__)
+def test_a_run_names_place_cause_and_remedy(part):
+    named = {"type": part.type_name()}
+    settings = {"diagnostics": [named]} if issubclass(part, Measured) else {"rule": named}
+    with pytest.raises(pbdkit.PbdkitError) as caught:
+        pbdkit.run("paper/a", components=[part], settings=settings | {"steps": 3}, progress=False)
+    said = str(caught.value)
+    assert [words for words in MISTAKES[part] if words not in said] == [], said
