@@ -13,10 +13,11 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from importlib.metadata import (
     Distribution,
     EntryPoint,
@@ -152,6 +153,11 @@ SEVERITY = ("ok", "conflict", "broken")
 """The states of what a plugin offers; its own is the worst of them."""
 
 
+COMMAND_GROUP = "pbdkit.commands"
+"""The entry-point group of modules that implement `pbdkit_commands`. They are imported to list
+commands, those of the group "pbdkit" are not."""
+
+
 class Hooks:
     """What a plugin may implement, as functions of the module that its entry point names."""
 
@@ -159,6 +165,40 @@ class Hooks:
     def pbdkit_components(self) -> list[type[Component]]:
         """The component classes that the distribution offers."""
         raise NotImplementedError  # a specification only: pluggy never calls it
+
+    @hookspec
+    def pbdkit_commands(self) -> list[Command]:
+        """Return the commands that the distribution adds to the program `pbdkit`. The modules of
+        the commands are imported when they are called, so the module of this hook should import
+        nothing but `pbdkit.plugin`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the program `pbdkit`.
+
+    Parameters
+    ----------
+    name : str
+        The word after `pbdkit`: lower-case letters, digits and hyphens.
+    target : str
+        The click command, as ``module:attribute``.
+    does : str
+        One sentence for `pbdkit --help`.
+    group : str
+        Heading in `pbdkit --help` under which the command is listed.
+    """
+
+    name: str
+    target: str
+    does: str
+    group: str = "Plugins"
+
+    def load(self) -> Any:
+        """Import the click command."""
+        module, _, attribute = self.target.partition(":")
+        return getattr(import_module(module), attribute)
 
 
 @dataclass(frozen=True)
@@ -189,6 +229,7 @@ class Plugin:
     version: str
     entry: EntryPoint | None = None
     offers: tuple[Offer, ...] = ()
+    commands: tuple[Command, ...] = ()
     unusable: str = ""
     why: str = ""
 
@@ -221,8 +262,9 @@ class Plugin:
         return f"{self.distribution} {self.version}".strip()
 
 
-def installed_plugins() -> list[Plugin]:
-    """The entry points of all distributions but our own, sorted by the names of both, not loaded.
+def installed_plugins(group: str = GROUP) -> list[Plugin]:
+    """Return the entry points in a group of all distributions but our own, sorted by the names of
+    both, not loaded.
 
     Metadata that cannot be read become a broken plugin, and what the user does not want loaded a
     disabled one. Of two distributions with one name the first on Python's path counts, as for
@@ -232,7 +274,7 @@ def installed_plugins() -> list[Plugin]:
     found: list[Plugin] = []
     for each in distributions():
         try:
-            if f"[{GROUP}]" in (each.read_text("entry_points.txt") or ""):
+            if f"[{group}]" in (each.read_text("entry_points.txt") or ""):
                 names.add(canonical(_field(each, "Name")))
         except Exception as error:
             folder = PurePath(str(getattr(each, "_path", "(no name)"))).name
@@ -241,7 +283,7 @@ def installed_plugins() -> list[Plugin]:
         try:
             own = distribution(name)
             what = _field(own, "Name"), _field(own, "Version")
-            points = own.entry_points.select(group=GROUP)
+            points = own.entry_points.select(group=group)
             found += [_wanted(Plugin(point.name, *what, point)) for point in points]
         except Exception as error:
             found.append(_torn(name or "(no name)", error))
@@ -314,19 +356,35 @@ def load_builtin() -> Plugin:
 
 
 def loaded(plugin: Plugin) -> Plugin:
-    """Imports the plugin, unless it is disabled, and asks it for its components; a fault becomes
-    its state and reason.
+    """Import the plugin, unless it is disabled, and call its hook `pbdkit_components`; a fault
+    becomes its state and reason. One unusable class leaves the others of the plugin in use."""
 
-    One unusable class leaves the others of the plugin in use. What a plugin prints at import is no
-    output of the program; its filters of warnings and its folder are its own.
-    """
+    def load(entry: EntryPoint, package: str) -> Plugin:
+        return replace(plugin, offers=tuple(_offer(c, package) for c in _offered(entry)))
+
+    return _guarded(plugin, load)
+
+
+def with_commands(plugin: Plugin) -> Plugin:
+    """Import the plugin, unless it is disabled, and call its hook `pbdkit_commands`; a fault
+    becomes its state and reason."""
+
+    def load(entry: EntryPoint, package: str) -> Plugin:
+        answer = _answer_of(entry, "pbdkit_commands", "commands")
+        return replace(plugin, commands=tuple(map(_checked_command, answer)))
+
+    return _guarded(plugin, load)
+
+
+def _guarded(plugin: Plugin, load: Callable[[EntryPoint, str], Plugin]) -> Plugin:
+    """Return the loaded plugin, or with the reason why it cannot be. What a plugin prints at import
+    is no output of the program; its filters of warnings and its folder are its own."""
     if plugin.unusable or plugin.entry is None:
         return plugin
     package = plugin.entry.value.split(":")[0].split(".")[0].strip()
     try:
         with chdir("."), redirect_stdout(sys.stderr), warnings.catch_warnings():
-            offers = tuple(_offer(c, package) for c in _offered(plugin.entry))
-        return replace(plugin, offers=offers)
+            return load(plugin.entry, package)
     except IncompatibleError as error:
         return replace(plugin, unusable="incompatible", why=str(error))
     except KeyboardInterrupt:
@@ -341,6 +399,12 @@ def offer_of(component: type[Component]) -> Offer:
 
 
 def _offered(entry: EntryPoint) -> list[Any]:
+    answer = _answer_of(entry, "pbdkit_components", "component classes")
+    return list({id(component): component for component in answer}.values())
+
+
+def _answer_of(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
+    """Return the list of `elements` that a hook of the entry point's module returns."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     module = entry.load()
@@ -356,12 +420,30 @@ def _offered(entry: EntryPoint) -> list[Any]:
         )
     manager.register(module, entry.name)
     manager.check_pending()
-    if not manager.hook.pbdkit_components.get_hookimpls():
-        raise TypeError("its module implements no hook `pbdkit_components`")
-    answers = manager.hook.pbdkit_components()
+    caller = getattr(manager.hook, hook)
+    if not caller.get_hookimpls():
+        raise TypeError(f"its module implements no hook `{hook}`")
+    answers = caller()
     if not answers or not isinstance(answers[0], list):
-        raise TypeError("its hook `pbdkit_components` must return a list of component classes")
-    return list({id(component): component for component in answers[0]}.values())
+        raise TypeError(f"its hook `{hook}` must return a list of {elements}")
+    return answers[0]
+
+
+def _checked_command(command: Any) -> Command:
+    """Return the command; raise TypeError, with what to mend, where it cannot be used."""
+    if not isinstance(command, Command):
+        raise TypeError(f"{command!r} is no pbdkit.plugin.Command")
+    if not re.fullmatch(r"[a-z][a-z0-9-]*", command.name):
+        raise TypeError(
+            f"'{command.name}' is no name for a command: it begins with a lower-case letter and "
+            "holds lower-case letters, digits and '-' only"
+        )
+    if not re.fullmatch(r"[\w.]+:\w+", command.target):
+        raise TypeError(
+            f"the target of the command '{command.name}' is '{command.target}'; write "
+            "'module:attribute'"
+        )
+    return command
 
 
 def _offer(component: Any, package: str) -> Offer:
