@@ -97,7 +97,7 @@ if TYPE_CHECKING:
         where as where,
     )
     from pbdkit.web.report import report as report
-    from pbdkit.plugin.discovery import hookimpl as hookimpl
+    from pbdkit.plugin.discovery import Command as Command, hookimpl as hookimpl
     from pbdkit.io.open import open as open
     from pbdkit.web.widget import live as live
     from pbdkit.sweeps.combine import concat as concat
@@ -118,7 +118,7 @@ _HOME = {
         "squared_length where"
     ),
     "pbdkit.web.report": "report",
-    "pbdkit.plugin.discovery": "hookimpl",
+    "pbdkit.plugin.discovery": "Command hookimpl",
     "pbdkit.io.open": "open",
     "pbdkit.web.widget": "live",
     "pbdkit.sweeps.combine": "concat",

@@ -1,4 +1,4 @@
-"""One run of a scene: its drivers (stepping and equilibrium), its checkpoints, and its recording."""
+"""One run of a scene: its drivers (stepping and equilibrium), checkpoints and recording."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
     modules = []
 
-    def make(distribution: str, source: str, version: str = "1.0") -> None:
+    def make(distribution: str, source: str, version: str = "1.0", group: str = "pbdkit") -> None:
         module = distribution.replace("-", "_")
         modules.append(module)
         (site / f"{module}.py").write_text(source)
@@ -122,7 +122,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         info.mkdir()
         metadata = f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
         (info / "METADATA").write_text(metadata)
-        (info / "entry_points.txt").write_text(f"[pbdkit]\n{distribution} = {module}\n")
+        (info / "entry_points.txt").write_text(f"[{group}]\n{distribution} = {module}\n")
         monkeypatch.syspath_prepend(site)
 
     yield make

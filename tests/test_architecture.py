@@ -31,10 +31,10 @@ ORDER = [
     "plotting",
     "accessor",
     "api",
-    "bench",
     "testing",
-    "web",
     "cli",
+    "bench",
+    "web",
 ]
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem in ORDER)
 

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.bench import FLOOR, Row, as_dict, engines, measure, picture, resized, table
+from pbdkit.bench.work_precision import (
+    FLOOR,
+    Row,
+    as_dict,
+    engines,
+    measure,
+    picture,
+    resized,
+    table,
+)
 from pbdkit.scene.scene import build_scene
 
 FOUR = [("numpy", "float64", 1), ("numpy", "float32", 1), ("compiled", "float64", 1)]
@@ -17,7 +26,7 @@ HOLD = {"type": "hold"}
 @pytest.fixture
 def few(monkeypatch):
     """Three methods, each of which takes a second or two."""
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: FOUR)
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR)
 
 
 def measured(method=FOUR[0], size=10, error=0.0):
@@ -52,7 +61,7 @@ def test_the_table_the_figures_and_the_picture(call, few):
 
 
 def test_without_sizes_it_runs_as_it_is(call, monkeypatch):
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: FOUR[:1])
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: FOUR[:1])
     result = call("bench", "e.json", "--set", "leaders.0.select={numbers: [7, 8]}", "--json", "b")
     assert result.code == 0, result.err
     assert "as it is" in result.out
@@ -92,12 +101,12 @@ def test_a_method_that_cannot_be_had_is_a_row_with_its_reason(tmp_path, tensile,
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
     never = ("abacus", "float64", 1)
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: [FOUR[0], never])
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: [FOUR[0], never])
     exact, other = rows = list(measure(str(file), (), None, lambda _: None))
     assert (exact.reason, exact.error) == ("", 0.0)
     assert "engine" in other.reason
     assert as_dict("e", (), 3, rows)["rows"][1]["reason"] == other.reason
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: [never])
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: [never])
     with pytest.raises(pbdkit.ExperimentError, match="engine"):
         list(measure(str(file), (), None, lambda _: None))
 
@@ -109,7 +118,7 @@ def test_an_engine_that_is_not_installed_names_its_extra(monkeypatch, tmp_path, 
         "util.find_spec = lambda name, *more: None if name == 'numba' else find(name, *more)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: [FOUR[0], FOUR[2]])
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: [FOUR[0], FOUR[2]])
     file = tmp_path / "e.json"
     file.write_text(json.dumps(tensile))
     _, other = measure(str(file), (), None, lambda _: None)

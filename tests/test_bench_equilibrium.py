@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit import bench as measurement
-from pbdkit.bench import (
+from pbdkit.bench import work_precision as measurement
+from pbdkit.bench.work_precision import (
     Decay,
     Row,
     decay_of,

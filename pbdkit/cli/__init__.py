@@ -8,13 +8,13 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from importlib import import_module
+from itertools import groupby
 from typing import Any
 
 import click
 
 from pbdkit import errors
+from pbdkit.cli.commands import CommandTable, own_commands
 from pbdkit.cli.options import with_no_plugins
 from pbdkit.cli.streams import standard_streams
 from pbdkit.memory import refuse_little_memory
@@ -23,52 +23,6 @@ COMPLETING = "_PBDKIT_COMPLETE"
 """The variable in which a shell asks how a line goes on."""
 
 
-@dataclass(frozen=True)
-class Listed:
-    """A command, the module of pbdkit.cli in which it stands, and what it does, in a sentence."""
-
-    name: str
-    module: str
-    does: str
-
-
-GROUPS = {
-    "Start": (
-        Listed("init", "sweep", "Writes an experiment to start from, or copies a shipped one."),
-        Listed("experiments", "sweep", "Lists the shipped experiments, or prints one."),
-    ),
-    "Run": (
-        Listed("run", "run", "Runs an experiment, and writes its result to a file."),
-        Listed("resume", "run", "Goes on with an interrupted run, or makes one longer."),
-        Listed("status", "result", "Says how far a run is, and when it will end."),
-        Listed("live", "live", "Steps an experiment in the browser, led by the mouse."),
-    ),
-    "Look": (
-        Listed("plot", "plot", "Draws a result, or the set-up of an experiment before it runs."),
-        Listed("animate", "plot", "Makes a movie of a result."),
-        Listed("curve", "plot", "Draws what changes: a curve, a history, the crack."),
-        Listed("report", "report", "Makes one page to share: its motion, curves, all else."),
-        Listed("export", "result", "Writes a result for ParaView."),
-        Listed("explain", "result", "Says which bonds broke, when and why."),
-        Listed("verify", "result", "Says whether results are as they were written."),
-    ),
-    "Understand": (
-        Listed("check", "check", "Says before a run whether it is stable, and how long it takes."),
-        Listed("identify", "check", "Says what a rule is physically, with its constants."),
-        Listed("bench", "bench", "Measures speed against error, to choose a solver."),
-    ),
-    "Vary and fit": (
-        Listed("sweep", "sweep", "Runs an experiment over many values of its parameters."),
-        Listed("fit", "sweep", "Finds the parameters that meet what was measured, with errors."),
-    ),
-    "Extend": (
-        Listed("plugins", "plugins", "Lists, checks and begins components of your own."),
-        Listed("schema", "sweep", "Prints the JSON Schema, for completion in an editor."),
-    ),
-}
-"""Every command, by what somebody wants; a new one is a line here."""
-COMMANDS = {one.name: one.module for group in GROUPS.values() for one in group}
-"""Every command with its module."""
 FIRST = {
     "pbdkit run paper/a": "Runs a case, and writes paper-a.nc.",
     "pbdkit plot paper-a.nc --color pe1": "Draws it into paper-a.png.",
@@ -91,62 +45,9 @@ MORE = """\
 `pbdkit COMMAND --help` says what a command takes; `pbdkit --help` has the rest."""
 
 
-MEANT = {
-    ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
-    ("show", "view", "draw", "plot", "image"): "`pbdkit plot` draws a result or a set-up",
-    ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
-    ("continue", "restart"): "`pbdkit resume` goes on with a run",
-    ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
-    (
-        "new",
-        "create",
-        "template",
-    ): "`pbdkit init` writes an experiment, `pbdkit plugins new` a plugin",
-    ("convert", "vtk", "paraview"): "`pbdkit export` writes VTKHDF for ParaView",
-    (
-        "info",
-        "progress",
-    ): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
-    ("simulate", "solve", "start"): "`pbdkit run` runs an experiment",
-    ("test",): "`pbdkit plugins check` tests a plugin",
-    ("gui", "play", "interactive"): "`pbdkit live` shows a body that follows the mouse",
-    ("version",): "`pbdkit --version` prints it",
-}
-"""What is meant by words that are no commands."""
-
-
-class Commands(click.Group):
-    """A group whose commands are imported when first needed."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """In the order of a first session."""
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """The command of that name, or a usage error with the nearest right one."""
-        if name not in COMMANDS:
-            if ctx.resilient_parsing:  # a shell asks how to go on
-                return None
-            from pbdkit.errors import did_you_mean
-            from pbdkit.model.shipped import shipped_names
-
-            run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
-            meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")
-            near = run or meant or did_you_mean(name, COMMANDS) or "; `pbdkit` alone lists them"
-            ctx.fail(f"there is no command '{name}'{near}")
-        command: click.Command = getattr(import_module(f"pbdkit.cli.{COMMANDS[name]}"), name)
-        return with_no_plugins(command)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """By what somebody wants; no command is imported for its line."""
-        for wanted, group in GROUPS.items():
-            with formatter.section(wanted):
-                formatter.write_dl([(f"{one.name:<12}", one.does) for one in group])
-
-
 @with_no_plugins
 @click.group(
-    cls=Commands,
+    cls=CommandTable,
     context_settings={"help_option_names": ["-h", "--help"]},
     invoke_without_command=True,
     epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` lets the tabulator key '
@@ -165,8 +66,8 @@ def _welcome() -> str:
     """What there is to type first, and what for."""
     lines = [WELCOME, "Type this first:"]
     lines += [f"  {typed:<36} {does}" for typed, does in FIRST.items()]
-    for wanted, group in GROUPS.items():
-        lines += [f"\n{wanted}:", *(f"  {one.name:<12} {one.does}" for one in group)]
+    for group, commands in groupby(own_commands().values(), key=lambda command: command.group):
+        lines += [f"\n{group}:", *(f"  {one.name:<12} {one.does}" for one in commands)]
     return "\n".join([*lines, "", MORE])
 
 
@@ -193,7 +94,9 @@ def _exit_status(arguments: list[str] | None) -> int:
             warnings.showwarning = _warn_once()
             refuse_little_memory()
             if COMPLETING in os.environ:
-                import_module("pbdkit.cli.completion").speak_bash()
+                from pbdkit.cli.completion import speak_bash
+
+                speak_bash()
             code: Any = program.main(given, prog_name="pbdkit", standalone_mode=False)
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt) as error:

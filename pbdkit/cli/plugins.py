@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pbdkit import __version__
+from pbdkit.cli.commands import own_commands, plugins_with_commands
 from pbdkit.cli.options import json_option
 from pbdkit.errors import ExperimentError
 from pbdkit.io.atomic_file import write_folder
@@ -27,7 +28,7 @@ from pbdkit.plugin.discovery import canonical
 from pbdkit.plugin.registry import Registry
 
 if TYPE_CHECKING:
-    from pbdkit.plugin.discovery import Offer, Plugin
+    from pbdkit.plugin.discovery import Plugin
     from pbdkit.testing import Report
 
 
@@ -53,6 +54,7 @@ def list_(as_json: bool) -> None:
 
     registry = Registry()
     rows = [row for plugin in registry.plugins for row in _rows(plugin)]
+    rows += [row for plugin in plugins_with_commands() for row in _rows(plugin)]
     for warning in registry.doubts():
         click.echo(f"warning: {warning}", err=True)
     if as_json:
@@ -134,12 +136,18 @@ def check(
 
 def _rows(plugin: Plugin) -> list[dict[str, str]]:
     """One of the plugin and one of each of its components."""
-    rows: list[tuple[str, Plugin | Offer]] = [("plugin", plugin)]
-    rows += [(o.interface.__name__ if o.interface else "", o) for o in plugin.offers]
+    rows = [("plugin", plugin.name, plugin.state, plugin.reason)]
+    for offer in plugin.offers:
+        interface = offer.interface.__name__ if offer.interface else ""
+        rows.append((interface, offer.name, offer.state, offer.reason))
+    for command in plugin.commands:
+        taken = command.name in own_commands()
+        reason = f"pbdkit has a command '{command.name}'" if taken else ""
+        rows.append(("command", command.name, "conflict" if taken else "ok", reason))
     origin = {"distribution": plugin.distribution, "version": plugin.version}
     return [
-        {"interface": kind, "type": row.name, **origin, "state": row.state, "reason": row.reason}
-        for kind, row in rows
+        {"interface": kind, "type": name, **origin, "state": state, "reason": reason}
+        for kind, name, state, reason in rows
     ]
 
 

@@ -432,7 +432,7 @@ def _answer_of(entry: EntryPoint, hook: str, elements: str) -> list[Any]:
 def _checked_command(command: Any) -> Command:
     """Return the command; raise TypeError, with what to mend, where it cannot be used."""
     if not isinstance(command, Command):
-        raise TypeError(f"{command!r} is no pbdkit.plugin.Command")
+        raise TypeError(f"{command!r} is no pbdkit.Command")
     if not re.fullmatch(r"[a-z][a-z0-9-]*", command.name):
         raise TypeError(
             f"'{command.name}' is no name for a command: it begins with a lower-case letter and "

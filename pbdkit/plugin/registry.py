@@ -10,6 +10,7 @@ from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.plugin import BUILTIN, Component
 from pbdkit.plugin.discovery import (
     ALL,
+    COMMAND_GROUP,
     DISABLE,
     Offer,
     Plugin,
@@ -115,12 +116,13 @@ class Registry:
         return next(names, component.type_name())
 
     def doubts(self) -> list[str]:
-        """What the user may have meant otherwise: names to be disabled that nothing has."""
-        known = {name for p in self._found for name in (p.distribution, p.name)}
+        """Return warnings about names to be disabled that no installed plugin has."""
+        plugins = [*self._found, *installed_plugins(COMMAND_GROUP)]
+        known = {name for p in plugins for name in (p.distribution, p.name)}
         return [
             f"{DISABLE} names '{name}', which is not installed{did_you_mean(name, known)}"
             for name in disabled_names()
-            if name != ALL and not any(plugin.answers_to(name) for plugin in self._found)
+            if name != ALL and not any(plugin.answers_to(name) for plugin in plugins)
         ]
 
     @cached_property

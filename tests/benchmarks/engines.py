@@ -13,7 +13,7 @@ from bare import Copying, sweeping
 from pairing import best_in_turns, ratio, wait_for_quiet
 from sheets import DAMAGE, DISTANCE, FRACTURE, RULES, SWUNG, Running, moving
 
-from pbdkit.bench import measure
+from pbdkit.bench.work_precision import measure
 
 STEPS = {10: 4000, 100: 400, 1000: 20}
 SHEETS = {

@@ -13,7 +13,7 @@ import pytest
 from plugin_sources import BROKEN, NEWER, listed, rule
 
 import pbdkit
-from pbdkit.cli import COMMANDS
+from pbdkit.cli.commands import own_commands
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.plugin.registry import Registry
 from pbdkit.progress import Watch
@@ -65,7 +65,7 @@ def healthy(install: Install, call: Call) -> None:
 
 
 def test_every_command_is_tried() -> None:
-    assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(COMMANDS)
+    assert {arguments[0] for arguments in EVERY_COMMAND.values()} == set(own_commands())
 
 
 @pytest.mark.usefixtures("healthy")
@@ -74,7 +74,7 @@ def test_all_broken_plugins_together_stop_no_command(
 ) -> None:
     one = ("numpy", "float64", 1)
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
-    monkeypatch.setattr("pbdkit.bench.engines", lambda: [one])  # is enough
+    monkeypatch.setattr("pbdkit.bench.work_precision.engines", lambda: [one])  # is enough
     assert call("run", "e.json", "-o", "made.nc").code == 0
     for n, (source, _) in enumerate(BROKEN.values()):
         install(f"pbdkit-broken-{n}", source, f"0.{n}")

@@ -41,8 +41,8 @@ import xarray
 import pbdkit
 import pbdkit.cli.check
 import pbdkit.cli.plot
-import pbdkit.cli.report
 import pbdkit.cli.result
+import pbdkit.web.command_line
 import pbdkit.web.report  # noqa: F401  # as above
 from pbdkit.cli import main as program
 from pbdkit.io.seal import put_seal, seal_of

@@ -21,7 +21,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import pbdkit
-from pbdkit.cli.live import live
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.shipped import shipped_names
 from pbdkit.scene.scene import build_scene
@@ -29,6 +28,7 @@ from pbdkit.simulation import Run
 from pbdkit.web import script as saving
 from pbdkit.web import session as history
 from pbdkit.web import session as stage
+from pbdkit.web.command_line import live
 from pbdkit.web.commands import FARTHEST, LONGEST, command_of, obey
 from pbdkit.web.server import Access, Conductor, Page, SessionServer
 from pbdkit.web.session import Session, judged, scenery, standing

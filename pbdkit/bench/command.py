@@ -38,9 +38,9 @@ def bench(
 ) -> None:
     """Measure speed against error, at one or several sizes: engines, precisions and threads; where
     the solver is `equilibrium`, its methods and the steps, over tolerances."""
-    from pbdkit import bench as work_precision
     from pbdkit.api import load
-    from pbdkit.bench import measure, ways
+    from pbdkit.bench import work_precision
+    from pbdkit.bench.work_precision import measure, ways
     from pbdkit.cli.options import refuse_output, refuse_unwritable, save, show_table, waiting
     from pbdkit.io.atomic_file import write
 

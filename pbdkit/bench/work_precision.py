@@ -1,13 +1,7 @@
-"""Speed against error: methods measured at sizes, each in a process of its own.
+"""Work–precision measurements: solvers at several sizes, each in a process of its own.
 
-The same scene at another size, as settings such as ``--set`` takes.
-
-An experiment measured: what each method costs at a size, and how far it is from the truth.
-
-Measured rows as a table to read, lines about them, an object to keep, and a picture.
-
-What a fresh process does for one measurement: ``python -m pbdkit.bench ANSWER``, with the
-job as JSON on its input.
+The rows are shown as a table, a JSON object and a picture. A measurement is one call of
+``python -m pbdkit.bench.work_precision ANSWER``, with the job as JSON on its input.
 """
 
 from __future__ import annotations
@@ -220,7 +214,7 @@ def measure(
 def _worked(job: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
     """The result of a job (worker.py) in a fresh process, with a cache folder of its own."""
     (answer := folder / "answer.json").unlink(missing_ok=True)
-    call = [sys.executable, "-m", "pbdkit.bench", str(answer)]
+    call = [sys.executable, "-m", "pbdkit.bench.work_precision", str(answer)]
     env = os.environ | {"PBDKIT_CACHE_DIR": str(cache)}
     done = subprocess.run(call, env=env, input=json.dumps(job), capture_output=True, text=True)
     if done.returncode:

@@ -1,0 +1,228 @@
+"""The table of commands: those of pbdkit and those that plugins add by the hook `pbdkit_commands`.
+
+A command is listed by name, target and one sentence; its module is imported when it is called.
+Plugins are looked for where a name is none of pbdkit's own, and for `pbdkit --help`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from typing import Any, TypeVar
+
+import click
+import pluggy
+
+from pbdkit.cli.options import with_no_plugins
+from pbdkit.errors import PbdkitError, PluginError, did_you_mean
+from pbdkit.plugin import GROUP
+from pbdkit.plugin.discovery import (
+    COMMAND_GROUP,
+    DISABLE,
+    Command,
+    Hooks,
+    Plugin,
+    hookimpl,
+    installed_plugins,
+    with_commands,
+    worded,
+)
+
+T = TypeVar("T")
+OWN_MODULES = ("pbdkit.cli.commands", "pbdkit.web", "pbdkit.bench")
+"""Modules of pbdkit that implement `pbdkit_commands`. The latter two are leaves: they import from
+here, and only this table names them."""
+GROUPS = ("Start", "Run", "Look", "Understand", "Vary and fit", "Extend")
+"""Headings of `pbdkit --help`, in the order of a first session."""
+
+MEANT = {
+    ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
+    ("show", "view", "draw", "plot", "image"): "`pbdkit plot` draws a result or a set-up",
+    ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
+    ("continue", "restart"): "`pbdkit resume` goes on with a run",
+    ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",
+    (
+        "new",
+        "create",
+        "template",
+    ): "`pbdkit init` writes an experiment, `pbdkit plugins new` a plugin",
+    ("convert", "vtk", "paraview"): "`pbdkit export` writes VTKHDF for ParaView",
+    (
+        "info",
+        "progress",
+    ): "`pbdkit status` shows how far a run is, `pbdkit report` makes a page of it",
+    ("simulate", "solve", "start"): "`pbdkit run` runs an experiment",
+    ("test",): "`pbdkit plugins check` tests a plugin",
+    ("gui", "play", "interactive"): "`pbdkit live` shows a body that follows the mouse",
+    ("version",): "`pbdkit --version` prints it",
+}
+"""The remedy for words that are no commands but are often typed as one."""
+
+
+@hookimpl
+def pbdkit_commands() -> list[Command]:
+    """Return the commands of `pbdkit.cli`."""
+    sentences: dict[str, dict[str, str]] = {
+        "Start": {
+            "sweep:init": "Writes an experiment to start from, or copies a shipped one.",
+            "sweep:experiments": "Lists the shipped experiments, or prints one.",
+        },
+        "Run": {
+            "run:run": "Runs an experiment, and writes its result to a file.",
+            "run:resume": "Goes on with an interrupted run, or makes one longer.",
+            "result:status": "Says how far a run is, and when it will end.",
+        },
+        "Look": {
+            "plot:plot": "Draws a result, or the set-up of an experiment before it runs.",
+            "plot:animate": "Makes a movie of a result.",
+            "plot:curve": "Draws what changes: a curve, a history, the crack.",
+            "result:export": "Writes a result for ParaView.",
+            "result:explain": "Says which bonds broke, when and why.",
+            "result:verify": "Says whether results are as they were written.",
+        },
+        "Understand": {
+            "check:check": "Says before a run whether it is stable, and how long it takes.",
+            "check:identify": "Says what a rule is physically, with its constants.",
+        },
+        "Vary and fit": {
+            "sweep:sweep": "Runs an experiment over many values of its parameters.",
+            "sweep:fit": "Finds the parameters that meet what was measured, with errors.",
+        },
+        "Extend": {
+            "plugins:plugins": "Lists, checks and begins components of your own.",
+            "sweep:schema": "Prints the JSON Schema, for completion in an editor.",
+        },
+    }
+    return [
+        Command(target.partition(":")[2], f"pbdkit.cli.{target}", does, group)
+        for group, targets in sentences.items()
+        for target, does in targets.items()
+    ]
+
+
+@cache
+def own_commands() -> dict[str, Command]:
+    """Return the commands of pbdkit itself by name, in the order of the groups."""
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(Hooks)
+    for module in reversed(OWN_MODULES):  # pluggy calls the last that was registered first
+        manager.register(import_module(module))
+    listed = [command for answer in manager.hook.pbdkit_commands() for command in answer]
+    listed.sort(key=lambda command: GROUPS.index(command.group))
+    return {command.name: command for command in listed}
+
+
+def plugins_with_commands() -> list[Plugin]:
+    """Return the installed plugins that add commands, loaded or with the reason why not."""
+    return [with_commands(plugin) for plugin in installed_plugins(COMMAND_GROUP)]
+
+
+class CommandTable(click.Group):
+    """A group whose commands are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands, in the order of a first session."""
+        added = [command.name for p in plugins_with_commands() for command in p.commands]
+        return list(dict.fromkeys([*own_commands(), *added]))
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """Return the command of that name; a usage error names the nearest one."""
+        if own := own_commands().get(name):
+            command: click.Command = own.load()
+            return with_no_plugins(command)
+        plugins = plugins_with_commands()
+        offers = _offers(plugins).get(name, [])
+        if not offers and not ctx.resilient_parsing:  # else a shell completes the line
+            ctx.fail(_no_command(name, plugins))
+        if not offers:
+            return None
+        if len(offers) > 1:
+            rivals = " and ".join(str(plugin) for plugin, _ in offers)
+            raise PluginError(f"the command '{name}' is offered by {rivals}; {DISABLE_ONE}")
+        (plugin, offer), *_ = offers
+        loaded = _blamed(plugin, offer, offer.load)
+        if not isinstance(loaded, click.Command):
+            raise PluginError(
+                f"the command '{name}' of {plugin} cannot be used: {offer.target} is no click "
+                "command"
+            )
+        return with_no_plugins(loaded)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; an error of a plugin's own code names the plugin."""
+        try:
+            return super().invoke(ctx)
+        except (PbdkitError, click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except Exception as error:
+            name = ctx.invoked_subcommand or ""
+            if name not in own_commands():
+                for plugin, offer in _offers(plugins_with_commands()).get(name, []):
+                    raise _failure(plugin, offer, error) from error
+            raise
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands by group; none is imported for its line."""
+        for group, rows in _sections().items():
+            with formatter.section(group):
+                formatter.write_dl([(f"{name:<12}", does) for name, does in rows])
+
+
+DISABLE_ONE = f"name one of them in {DISABLE} to use the other"
+
+
+def _sections() -> dict[str, list[tuple[str, str]]]:
+    """Return the lines of `pbdkit --help`: (command, sentence) by group."""
+    sections: dict[str, list[tuple[str, str]]] = {group: [] for group in GROUPS}
+    for command in own_commands().values():
+        sections[command.group].append((command.name, command.does))
+    plugins = plugins_with_commands()
+    for name, offers in _offers(plugins).items():
+        origin = " and ".join(str(plugin) for plugin, _ in offers)
+        command = offers[0][1]
+        does, group = f"{command.does} ({origin})", command.group
+        if name in own_commands():
+            does, group = f"Left out of {origin}: pbdkit has a command of this name.", "Plugins"
+        elif len(offers) > 1:
+            does, group = f"Left out of {origin}: {DISABLE_ONE}.", "Plugins"
+        sections.setdefault(group, []).append((name, does))
+    for plugin in plugins:
+        if plugin.unusable not in ("", "disabled"):
+            sections.setdefault("Plugins", []).append((str(plugin), f"Is {plugin.fault}"))
+    return sections
+
+
+def _offers(plugins: list[Plugin]) -> dict[str, list[tuple[Plugin, Command]]]:
+    """Return the plugins' commands by name, with the plugins that offer them."""
+    offers: dict[str, list[tuple[Plugin, Command]]] = {}
+    for plugin in plugins:
+        for command in plugin.commands:
+            offers.setdefault(command.name, []).append((plugin, command))
+    return offers
+
+
+def _no_command(name: str, plugins: list[Plugin]) -> str:
+    from pbdkit.model.shipped import shipped_names
+
+    run = f"; `pbdkit run {name}` runs it" * (name in shipped_names())
+    meant = next((f"; {what}" for words, what in MEANT.items() if name in words), "")
+    known = [*own_commands(), *_offers(plugins)]
+    near = run or meant or did_you_mean(name, known) or "; `pbdkit` alone lists them"
+    unusable = "".join(f"; {plugin} is {plugin.fault}" for plugin in plugins if plugin.fault)
+    return f"there is no command '{name}'{near}{unusable}"
+
+
+def _blamed(plugin: Plugin, command: Command, call: Callable[[], T]) -> T:
+    """Call the plugin's code; its errors become a PluginError that names the plugin."""
+    try:
+        return call()
+    except PbdkitError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise _failure(plugin, command, error) from error
+
+
+def _failure(plugin: Plugin, command: Command, error: BaseException) -> PluginError:
+    package = command.target.partition(":")[0].partition(".")[0]
+    return PluginError(f"the command '{command.name}' of {plugin} failed: {worded(error, package)}")
