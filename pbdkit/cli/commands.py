@@ -38,7 +38,7 @@ GROUPS = ("Start", "Run", "Look", "Understand", "Vary and fit", "Extend")
 
 MEANT = {
     ("list", "ls"): "`pbdkit experiments` lists shipped experiments, `pbdkit plugins list` plugins",
-    ("show", "view", "draw", "plot", "image"): "`pbdkit plot` draws a result or a set-up",
+    ("show", "view", "draw", "picture", "image"): "`pbdkit plot` draws a result or a set-up",
     ("movie", "video", "gif"): "`pbdkit animate` makes a movie",
     ("continue", "restart"): "`pbdkit resume` goes on with a run",
     ("validate", "lint", "analyse", "analyze"): "`pbdkit check` checks an experiment",

@@ -255,7 +255,7 @@ def test_pages_are_small(sheet, torn):
 
 def test_a_large_body_is_thinned_and_the_page_says_so(page, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "FIRST", 200_000)
-    monkeypatch.setattr(report, "MOST", 200_000)
+    monkeypatch.setattr(report, "MOST_BYTES", 200_000)
     settings = ["body.columns=60", "body.rows=60", "steps=80"]
     dataset = pbdkit.run(pbdkit.load("paper/a", settings=settings), progress=False)
     opened(page, written(dataset, tmp_path))

@@ -51,7 +51,7 @@ def scene_of(leaders, **parts):
 
 
 def work_here(job, folder, cache):
-    """A job in this process: one of its own, which takes a second, has test_bench.py."""
+    """A job in this process: one of its own, which takes a second, is in test_work_precision.py."""
     return measurement._without_fault(json.loads(json.dumps(result_of(job))))
 
 
