@@ -67,9 +67,9 @@ def plugins(session: nox.Session) -> None:
 
 @nox.session
 def installs(session: nox.Session) -> None:
-    """Commands work without extras, or name the one that they need: in environments that the script
-    makes, a bare one and one an extra."""
-    session.run("python", "tests/installs.py")
+    """Commands work with all extras, and without them or name the one that they need, in
+    environments that the script makes; `nox -s installs -- --each` tries each extra alone."""
+    session.run("python", "tests/installs.py", *session.posargs)
 
 
 @nox.session

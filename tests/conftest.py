@@ -23,9 +23,9 @@ from pbdkit.scene.scene import Scene, build_scene
 
 # The same random scenes in every run that decides about landing; elsewhere new ones each time. No
 # deadline: what an example takes depends on what else the processors do.
-# `pytest --hypothesis-profile long` draws twenty times as many.
-settings.register_profile("anywhere", deadline=None)
-settings.register_profile("landing", derandomize=True, deadline=None)
+# `pytest --hypothesis-profile long` draws fifty times as many.
+settings.register_profile("anywhere", max_examples=40, deadline=None)
+settings.register_profile("landing", max_examples=40, derandomize=True, deadline=None)
 settings.register_profile("long", max_examples=2000, deadline=None)
 settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
 

@@ -1,13 +1,16 @@
-"""What works without extras, and what names the one that it needs: ``python tests/installs.py``.
+"""Test commands without extras, and with them: ``python tests/installs.py [--each]``.
 
-`pip install` puts the wheel of this checkout into an environment of its own. Each extra has a
-further one that holds what pip adds for it and takes the rest from the first: what one extra brings
-is of no use to what needs another. `gpu` is left out: it takes half a gigabyte, and has a session
-of its own in noxfile.py. In each environment every row of `CASES` is tried.
+`pip install` puts the wheel of this checkout into an environment of its own, in which commands work
+or name the extra that they need. The extra `all` has a further environment, which holds what pip
+adds for it and takes the rest from the first. `--each` does the same with every extra alone
+instead: what one extra brings is of no use to what needs another. `gpu` is left out: it takes half
+a gigabyte, and has a session of its own in noxfile.py. In each environment every row of `CASES` is
+tried.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -21,7 +24,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 BARE = "bare"
-LEFT_OUT = ("all", "gpu")
+ALL = "all"
+LEFT_OUT = (ALL, "gpu")
 FILES = {
     "torn.yaml": """\
 name: torn
@@ -141,23 +145,34 @@ CASES = (
 
 def main() -> int:
     """Make the environments, try the cases, and return 1 where one came out otherwise."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--each", action="store_true", help="Each extra alone in place of `all`.")
+    each = parser.parse_args().each
     with tempfile.TemporaryDirectory(prefix="pbdkit-installs-") as name:
         folder = Path(name)
         wheel = _wheel(folder)
         bare = _environment(folder / BARE, None, str(wheel))
-        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-        extras = [e for e in project["optional-dependencies"] if e not in LEFT_OUT]
+        known = _extras()
+        extras = {e: {e} for e in known if e not in LEFT_OUT} if each else {ALL: known[ALL]}
 
         def try_in(extra: str) -> list[str]:
             own = bare
             if extra != BARE:
                 own = _environment(folder / extra, bare, f"{wheel}[{extra}]")
-            return _faults(extra, own, folder / f"work-{extra}")
+            return _faults(extra, extras.get(extra, set()), own, folder / f"work-{extra}")
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             faults = [fault for found in pool.map(try_in, [BARE, *extras]) for fault in found]
-    print("\n".join(faults) or f"bare, and with each of {', '.join(extras)}: as expected")
+    print("\n".join(faults) or f"bare, and with {', '.join(extras)}: as expected")
     return 1 if faults else 0
+
+
+def _extras() -> dict[str, set[str]]:
+    """The extras of the project; `all` with the names of those that it takes together."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    optional: dict[str, list[str]] = project["optional-dependencies"]
+    (together,) = optional[ALL]
+    return {name: {name} for name in optional} | {ALL: set(together[:-1].split("[")[1].split(","))}
 
 
 def _wheel(folder: Path) -> Path:
@@ -182,14 +197,14 @@ def _pip(*arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "pip", "-q", *arguments], check=True)
 
 
-def _faults(extra: str, python: Path, folder: Path) -> list[str]:
-    """A line for each case that comes out otherwise than it should."""
+def _faults(name: str, extras: set[str], python: Path, folder: Path) -> list[str]:
+    """A line for each case that comes out otherwise than it should with these extras."""
     folder.mkdir()
-    for name, text in FILES.items():
-        (folder / name).write_text(text)
+    for file, text in FILES.items():
+        (folder / file).write_text(text)
     faults = []
-    for case in (*RESULTS, *(c for c in CASES if c.extras or extra == BARE)):
-        works = not case.extras or extra in case.extras
+    for case in (*RESULTS, *(c for c in CASES if c.extras or not extras)):
+        works = not case.extras or not extras.isdisjoint(case.extras)
         python_call = case.arguments[0] == "-c" and case.call != INTERRUPTED
         status = case.status if works else 1 if python_call else 2
         told = case.told if works else f"pip install 'pbdkit[{case.extras[0]}]'"
@@ -204,7 +219,7 @@ def _faults(extra: str, python: Path, folder: Path) -> list[str]:
         output = done.stdout + done.stderr
         if done.returncode != status or told not in output or "a bug in pbdkit" in output:
             last = (output.strip().splitlines() or [""])[-1]
-            faults.append(f"{extra}: {case.call}: status {done.returncode}, not {status} with "
+            faults.append(f"{name}: {case.call}: status {done.returncode}, not {status} with "
                           f"{told!r}: {last}")  # fmt: skip
     shutil.rmtree(folder)
     return faults

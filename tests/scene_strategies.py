@@ -13,9 +13,10 @@ from pbdkit.plugin.registry import Registry
 
 
 def samples(count, **more):
-    """Settings for a test that draws so many scenes, and as many times more as the profile does."""
+    """Settings for a test that draws so many scenes where the profile draws 100, else in proportion,
+    but at least three."""
     return settings(
-        max_examples=count * settings().max_examples // 100,
+        max_examples=max(3, count * settings().max_examples // 100),
         deadline=None,
         suppress_health_check=list(HealthCheck),
         **more,

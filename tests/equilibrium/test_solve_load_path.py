@@ -61,7 +61,7 @@ def run(experiment):
 
 
 @pytest.mark.parametrize(
-    "displacement", [[0, 2.0], [0, 1.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str
+    "displacement", [[0, 2.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str
 )
 def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
     found = run(springs(displacement))

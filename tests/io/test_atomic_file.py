@@ -277,7 +277,7 @@ def test_standard_output_that_fails_is_named_and_no_bug(result: Call) -> None:
 
 def test_a_sample_of_the_faults_of_a_disk() -> None:
     """The script tries each call of each command; tests/reliability/disk_faults.py."""
-    some = ["--commands", "run,export vtkhdf,init", "--first", "2", "--every", "45"]
+    some = ["--commands", "run,export vtkhdf,init", "--first", "2", "--every", "120"]
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *some], capture_output=True, text=True, check=False
     )

@@ -38,10 +38,10 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs.py --trials 4 --kinds breaking",
-        "two_writers.py --trials 3 --kinds small",
-        "mutate_stores.py --trials 3 --kinds breaking",
-        "mutate_sweeps.py --trials 4",
+        "kill_runs.py --trials 2 --kinds breaking",
+        "two_writers.py --trials 2 --kinds small",
+        "mutate_stores.py --trials 2 --kinds breaking",
+        "mutate_sweeps.py --trials 2",
         "equilibria.py fracture --trials 3",
         "equilibria.py certificates --trials 5",
         "fit_coverage.py --trials 10 --processes 1 --kinds poisson",

@@ -638,5 +638,5 @@ def test_what_only_some_members_have_is_theirs_alone(small):
 
 
 def test_under_fire(tmp_path):
-    found = under_fire(tmp_path, members=40, kills=1, workers=2)
-    assert found == {"exit": 0, "killed": 1, "right": 40, "wrong": 0, "run again": 0}
+    found = under_fire(tmp_path, members=16, kills=1, workers=2)
+    assert found == {"exit": 0, "killed": 1, "right": 16, "wrong": 0, "run again": 0}

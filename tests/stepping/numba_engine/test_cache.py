@@ -3,6 +3,7 @@ the rule."""
 
 import json
 import os
+import shutil
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,24 @@ SHEET = {
 }
 
 
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory):
+    """A cache folder that holds the kernel of the sheet."""
+    folder = tmp_path_factory.mktemp("kernel") / "cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PBDKIT_CACHE_DIR", str(folder))
+        assert steps_as_numpy_does()
+    return folder
+
+
+@pytest.fixture
+def kept_kernel(cache, kernel):
+    """The cache folder of a test, with a kernel that another process left there."""
+    shutil.copytree(kernel, cache)
+    cache.chmod(kernel.stat().st_mode)
+    return cache
+
+
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A cache folder of its own, as a new process meets it."""
@@ -53,7 +72,8 @@ def kept(folder):
     return {file.suffix: file for file in files}
 
 
-def test_damaged_files_are_made_anew(cache):
+def test_damaged_files_are_made_anew(kept_kernel):
+    cache = kept_kernel
     assert steps_as_numpy_does()
     assert set(kept(cache)) == {".py", ".json", ".nbi", ".nbc"}
     for suffix in (".py", ".json", ".nbi", ".nbc"):
@@ -66,7 +86,8 @@ def test_damaged_files_are_made_anew(cache):
     assert len(list(cache.iterdir())) == 1
 
 
-def test_a_whole_kernel_is_read_and_not_made(cache, monkeypatch):
+def test_a_whole_kernel_is_read_and_not_made(kept_kernel, monkeypatch):
+    cache = kept_kernel
     assert steps_as_numpy_does()
     before = {file: file.stat().st_mtime_ns for file in kept(cache).values()}
     monkeypatch.setattr(kernel_cache, "_digests", counted := Counted(kernel_cache._digests))
@@ -97,8 +118,8 @@ def test_a_full_disk_is_no_fault_of_the_rule_and_leaves_nothing(cache, monkeypat
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes are of POSIX systems")
-def test_a_folder_that_others_can_write_is_not_run(cache):
-    assert steps_as_numpy_does()
+def test_a_folder_that_others_can_write_is_not_run(kept_kernel):
+    cache = kept_kernel
     kept(cache)[".py"].write_text("raise SystemExit('planted')")
     cache.chmod(0o777)
     assert kernel_cache.cache_folder() is None
