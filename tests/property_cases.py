@@ -1,6 +1,7 @@
 """What the property tests share: small experiments, all combinations, and states made by hand."""
 
-from itertools import product
+from collections.abc import Iterable
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,23 @@ FRAMES: dict[str, dict[str, Any]] = {
     "wide": {"type": "mean", "layers": 3},
 }
 LATTICES_AND_NEIGHBOURS = list(product(LATTICES, NEIGHBOURS))
+
+
+def all_pairs(*values: Iterable[Any]) -> list[tuple[Any, ...]]:
+    """Cases for a parametrised test in which any two values of two arguments meet, and not any
+    three: about as many as the two longest lists have pairs, found greedily."""
+    given = [list(of_argument) for of_argument in values]
+    cases = {
+        case: frozenset(combinations(enumerate(case), 2))
+        for case in product(*(range(len(of_argument)) for of_argument in given))
+    }
+    left, found = frozenset().union(*cases.values()), []
+    while left:
+        best = max(cases, key=lambda case: len(left & cases[case]))
+        left -= cases[best]
+        found.append(best)
+    return [tuple(of[n] for of, n in zip(given, case, strict=True)) for case in sorted(found)]
+
 
 HOLD_LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 HOLD_RIGHT = {"select": {"edge": "right"}, "motion": {"type": "hold"}}

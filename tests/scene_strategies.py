@@ -13,8 +13,8 @@ from pbdkit.plugin.registry import Registry
 
 
 def samples(count, **more):
-    """Settings for a test that draws so many scenes where the profile draws 100, else in proportion,
-    but at least three."""
+    """Settings for a test that draws so many scenes where the profile draws 100, otherwise in
+    proportion, but at least three."""
     return settings(
         max_examples=max(3, count * settings().max_examples // 100),
         deadline=None,

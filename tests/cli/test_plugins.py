@@ -53,7 +53,7 @@ EVERY_COMMAND = {
 }
 DEAR = {"bench", "plot", "animate", "curve", "report"}
 CHEAP = [name for name in EVERY_COMMAND if name not in DEAR]
-"""Those that take no second, for each kind of fault."""
+"""Those that take no second."""
 
 
 @pytest.fixture
@@ -91,13 +91,15 @@ def test_all_broken_plugins_together_stop_no_command(
 
 
 @pytest.mark.usefixtures("healthy")
-@pytest.mark.parametrize(("source", "reason"), BROKEN.values(), ids=BROKEN)
-def test_no_broken_plugin_stops_a_command(
-    install: Install, call: Call, source: str, reason: str
-) -> None:
+@pytest.mark.parametrize("kind", BROKEN)
+def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: str) -> None:
+    """A run, whose result others read, and a quarter of the other commands, each in its turn."""
+    source, reason = BROKEN[kind]
+    run, *others = CHEAP
+    tried = [run, *others[[*BROKEN].index(kind) % 4 :: 4]]
     install("pbdkit-broken", source, "0.3")
     Path("s.json").write_text('{"experiment": "e.json", "vary": {"rule.type": ["zz-healthy"]}}')
-    assert {name: r for name in CHEAP if (r := call(*EVERY_COMMAND[name])).code} == {}
+    assert {name: r for name in tried if (r := call(*EVERY_COMMAND[name])).code} == {}
     table = " ".join(call("plugins", "list").out.split())
     assert f"pbdkit-broken 0.3 broken {reason}" in table
 

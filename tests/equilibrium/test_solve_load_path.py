@@ -60,9 +60,7 @@ def run(experiment):
     return pbdkit.run(experiment, progress=False)
 
 
-@pytest.mark.parametrize(
-    "displacement", [[0, 2.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str
-)
+@pytest.mark.parametrize("displacement", [[0, 2.0], [0, 1.2], [3.0, 0], [0.5, 4.0]], ids=str)
 def test_springs_end_where_slow_loading_leads_and_are_not_folded(displacement):
     found = run(springs(displacement))
     steps = 200

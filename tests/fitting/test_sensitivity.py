@@ -206,8 +206,16 @@ def test_what_loads_do_falls_with_the_stiffness_beside_a_field_of_another_number
     np.testing.assert_allclose(found, -u / 4.0, rtol=0.0, atol=1e-8 * np.abs(u).max())
 
 
-@pytest.mark.parametrize("frame", sensitivity_cases.FRAMES)
-@pytest.mark.parametrize("rule", sensitivity_cases.RULES)
+RULES_AND_FRAMES = [
+    (rule, frame)
+    for n, rule in enumerate(sensitivity_cases.RULES)
+    for m, frame in enumerate(sensitivity_cases.FRAMES)
+    if frame in ("natural", "mean") or (n + m) % 3 == 0
+]
+"""Each rule with the natural and the mean frame, where it takes them, and with others in turn."""
+
+
+@pytest.mark.parametrize(("rule", "frame"), RULES_AND_FRAMES)
 def test_derivatives_and_gradients_are_those_of_equilibria_found_anew(rule, frame):
     given = sensitivity_cases.case(rule, frame)
     rules, told = sensitivity_cases.REFUSED.get(frame, ((), ""))
@@ -235,8 +243,9 @@ def test_derivatives_by_other_parts_are_those_of_equilibria_found_anew(path, fra
 
 def test_every_rule_and_frame_that_ships_is_among_those_compared():
     own = next(plugin for plugin in Registry().plugins if plugin.distribution == BUILTIN)
-    rules = {rule["type"] for rule, _, _ in sensitivity_cases.RULES.values()}
-    for kind, compared in ((FollowerRule, rules), (FramePolicy, {*sensitivity_cases.FRAMES})):
+    rules = {sensitivity_cases.RULES[name][0]["type"] for name, _ in RULES_AND_FRAMES}
+    frames = {frame for _, frame in RULES_AND_FRAMES}
+    for kind, compared in ((FollowerRule, rules), (FramePolicy, frames)):
         assert {offer.name for offer in own.offers if offer.interface is kind} == compared
 
 

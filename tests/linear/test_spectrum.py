@@ -13,6 +13,7 @@ from property_cases import (
     LINEAR_RULES,
     RULES,
     advanced,
+    all_pairs,
     body_sites,
     experiment,
     scene_of,
@@ -248,9 +249,12 @@ def test_nothing_is_claimed_of_frames_that_lag():
     assert analysis.swing(1.0, 0.5) is None
 
 
-@pytest.mark.parametrize("frame", ["mean", "first", "lag", {"type": "none"}], ids=str)
-@pytest.mark.parametrize("neighbours", ["coordination-1", "chebyshev-1"])
-@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize(
+    ("lattice", "neighbours", "frame"),
+    all_pairs(
+        LATTICES, ["coordination-1", "chebyshev-1"], ["mean", "first", "lag", {"type": "none"}]
+    ),
+)
 def test_what_turns_without_memory_is_gone_before_it_is_seen(lattice, neighbours, frame):
     """Frames that lag or lean make some eigenvalues complex; all of them are looked at."""
     found = [

@@ -10,6 +10,7 @@ from property_cases import (
     HOLD_LEFT,
     LATTICES,
     NEIGHBOURS,
+    all_pairs,
     body_of,
     experiment,
     pull_right,
@@ -58,9 +59,10 @@ def test_lag_is_what_a_run_shows():
     assert closed_form(0.0035, 19) == pytest.approx(0.3242, abs=1e-4)
 
 
-@pytest.mark.parametrize("frame", ["mean", "first", "lag", "wide", {"type": "none"}], ids=str)
-@pytest.mark.parametrize("neighbours", NEIGHBOURS)
-@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize(
+    ("lattice", "neighbours", "frame"),
+    all_pairs(LATTICES, NEIGHBOURS, ["mean", "first", "lag", "wide", {"type": "none"}]),
+)
 def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours, frame):
     """Frame points that follow leaders are late, in every neighbourhood and frame its own way."""
     parts = pulled(
@@ -76,10 +78,14 @@ def test_what_is_reached_is_what_runs_show_on_every_lattice(lattice, neighbours,
     assert lag.reached == pytest.approx(trailing(**parts), rel=1e-7)
 
 
-@pytest.mark.parametrize("frame", ["mean", "lag"])
-@pytest.mark.parametrize(("relaxation", "memory"), [(0.7, 0.0), (1.0, 0.9), (0.5, -0.4)])
-@pytest.mark.parametrize("rule", ["barycentre", "mixed-coordinate"])
-def test_relaxation_and_memory_have_their_share(rule, relaxation, memory, frame):
+@pytest.mark.parametrize(
+    ("rule", "weights", "frame"),
+    all_pairs(
+        ["barycentre", "mixed-coordinate"], [(0.7, 0.0), (1.0, 0.9), (0.5, -0.4)], ["mean", "lag"]
+    ),
+)
+def test_relaxation_and_memory_have_their_share(rule, weights, frame):
+    relaxation, memory = weights
     solver = {"type": "stepping", "relaxation": relaxation, "memory": memory}
     for steps in (2, 9, 2000):
         parts = pulled(7, 6, 2e-3, 1e-3, steps=steps, rule=rule, frame=frame, solver=solver)

@@ -16,6 +16,7 @@ from property_cases import (
     NEIGHBOURS,
     RULES,
     advanced,
+    all_pairs,
     displace,
     displacements,
     experiment,
@@ -34,14 +35,15 @@ combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_N
 every_rule = pytest.mark.parametrize("rule", RULES)
 
 
+with_some_rules = pytest.mark.parametrize(
+    ("lattice", "neighbours", "rule"),
+    all_pairs(LATTICES, NEIGHBOURS, ["barycentre", "mean-displacement", "distance-weighted"]),
+)
+
+
 def paired(rules, frames):
-    """Cases (lattice, neighbours, rule, frame): any two of a lattice with its neighbours, a rule
-    and a frame meet, and not any three."""
-    cases = [
-        (*around, rule, frames[(n + m) % len(frames)])
-        for n, around in enumerate(LATTICES_AND_NEIGHBOURS)
-        for m, rule in enumerate(rules)
-    ]
+    """Cases (lattice, neighbours, rule, frame)."""
+    cases = all_pairs(LATTICES, NEIGHBOURS, rules, frames)
     return pytest.mark.parametrize(("lattice", "neighbours", "rule", "frame"), cases)
 
 
@@ -78,8 +80,7 @@ def test_relaxation_memory_and_unbroken_bonds_leave_rest_exact(lattice, rule):
     assert not u.any()
 
 
-@combinations
-@pytest.mark.parametrize("rule", ["barycentre", "mean-displacement", "distance-weighted"])
+@with_some_rules
 def test_translating_every_particle_translates_the_step(lattice, neighbours, rule):
     scene = scene_of(lattice=lattice, neighbours=neighbours, rule=rule)
     u = np.random.default_rng(1).uniform(-0.1, 0.1, (len(scene.raster.body_rows), 2))
@@ -99,8 +100,7 @@ def test_a_body_whose_leaders_all_translate_ends_translated(lattice, neighbours)
     np.testing.assert_allclose(u, np.broadcast_to(shift, u.shape), rtol=0, atol=ROUNDING)
 
 
-@combinations
-@pytest.mark.parametrize("rule", ["barycentre", "mean-displacement", "distance-weighted"])
+@with_some_rules
 def test_the_origin_does_not_matter_to_a_single_bit(lattice, neighbours, rule):
     parts = {"neighbours": neighbours, "rule": rule, "leaders": [HOLD_LEFT, pull_right(0.3, 0.1)]}
     parts |= {"steps": 12}
@@ -157,8 +157,9 @@ def test_mirrored_loading_gives_mirrored_displacements(lattice, neighbours, flip
     )
 
 
-@combinations
-@pytest.mark.parametrize("frame", ["mean", "first", "wide"])
+@pytest.mark.parametrize(
+    ("lattice", "neighbours", "frame"), all_pairs(LATTICES, NEIGHBOURS, ["mean", "first", "wide"])
+)
 def test_a_particle_k_layers_away_moves_at_step_k_and_not_before(lattice, neighbours, frame):
     parts = {"lattice": lattice, "neighbours": neighbours, "frame": frame, "columns": 8, "rows": 6}
     scene = scene_of(**parts)
@@ -217,9 +218,9 @@ def test_loads_superpose_under_linear_rules(lattice, neighbours, rule, frame):
 FRACTURE = {"type": "threshold", "thresholds": [2.4]}
 
 
-@every_lattice
-@every_rule
-@pytest.mark.parametrize("fracture", [None, FRACTURE], ids=["whole", "torn"])
+@pytest.mark.parametrize(
+    ("lattice", "rule", "fracture"), all_pairs(LATTICES, RULES, [None, FRACTURE])
+)
 def test_two_runs_and_any_cut_into_row_blocks_agree_bitwise(lattice, rule, fracture, monkeypatch):
     leaders = [HOLD_LEFT, pull_right(0.7, 0.1)]
     given = experiment(
