@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 import xarray
 
 from pbdkit.io.layout import experiment_of, in_this_layout, indices_of, rows_at
-from pbdkit.io.open import member
+from pbdkit.io.members import member
 from pbdkit.io.physical import in_physical_units
 from pbdkit.io.save import save
 from pbdkit.plotting.configuration import compare, plot

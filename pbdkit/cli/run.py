@@ -97,7 +97,7 @@ def run(
     """Run an experiment: a YAML file or the name of a shipped one, e.g. paper/a."""
     from pbdkit.cli.options import disk_warnings, folder_kept, refuse_output, refuse_unfinished
     from pbdkit.model.loading import load_experiment
-    from pbdkit.mpi.run import launched
+    from pbdkit.mpi.launch import launched
 
     with launched() as processes:
         with processes.agreeing():
@@ -146,7 +146,7 @@ def run(
 @json_option
 def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: bool) -> int:
     """Go on with an interrupted run that was to write OUT.nc, to the same result bit for bit."""
-    from pbdkit.mpi.run import launched
+    from pbdkit.mpi.launch import launched
     from pbdkit.restart import resumption
 
     with launched() as processes:

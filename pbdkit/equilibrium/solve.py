@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbdkit.equilibrium.breaking_kernel import settler_of
 from pbdkit.equilibrium.certificate import (
     Certificate,
     RoundingError,
@@ -32,7 +31,7 @@ from pbdkit.linear.spectrum import TooDearError, excess, spectrum
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.divergence import Guard, most_of, size_of, way_of
-from pbdkit.stepping.engine_choice import chosen_engine
+from pbdkit.stepping.engine_choice import chosen_engine, obstacle
 from pbdkit.stepping.leaders import bends_of, last_event, place, prescribe
 from pbdkit.stepping.numpy_engine import Fracturing
 from pbdkit.stepping.state import State, cut_bonds, initial_state
@@ -324,7 +323,11 @@ def _load(
     last = every[-1]
     every = sorted({*every, *(stop for stop in stops if stop < last)})
     planned = [moment for moment in every if moment > since] or every[-1:]
-    quick = settler_of(scene, finder.tolerance, finder.watch) if finder.linear else None
+    quick = None
+    if finder.linear and scene.has_fracture and not obstacle():
+        from pbdkit.equilibrium.breaking_kernel import settler_of  # imports numba
+
+        quick = settler_of(scene, finder.tolerance, finder.watch)
     farthest = size_of(scene) + finder.scale
     for moment in planned:
         finder.watch.load = f"step {moment:.6g} of {last:g}, "

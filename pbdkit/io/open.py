@@ -4,36 +4,20 @@ of other kinds that names the command that reads them.
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from pbdkit.errors import (
-    ExperimentError,
-    PbdkitError,
-    PbdkitWarning,
-    StorageError,
-    WriteError,
-    did_you_mean,
-)
-from pbdkit.io.checkpoint import STORE, UnfinishedRun, has_committed, put_together
-from pbdkit.io.layout import SCHEMA_VERSION, Column, Values, base_columns, carried, in_this_layout
-from pbdkit.io.netcdf import NetcdfFile, reopened
-from pbdkit.io.recorder import Outcome, Recorder, Seen, columns_of
-from pbdkit.io.seal import BrokenSealError, SealedFile, opened, opened_in, seal_of
-from pbdkit.io.sinks import Sink
-from pbdkit.model.experiment import Experiment
-from pbdkit.model.reading import EXPERIMENT, Source, kind_of, read_file, what_takes, with_value
+from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, WriteError
+from pbdkit.io.checkpoint import STORE, has_committed
+from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
+from pbdkit.io.members import SWEEP, choices, member
+from pbdkit.io.seal import BrokenSealError, SealedFile, opened, seal_of
+from pbdkit.model.reading import EXPERIMENT, kind_of, read_file, what_takes
 from pbdkit.model.shipped import shipped_names
-from pbdkit.plugin.discovery import one_line, refuse_retired
-from pbdkit.scene.scene import build_scene
-from pbdkit.stepping.state import State, initial_state
+from pbdkit.plugin.discovery import one_line
 from pbdkit.untrusted_files import BEGINNINGS, opened_unsealed, try_reading
 
 if TYPE_CHECKING:
@@ -99,125 +83,6 @@ def refuse_store(path: Path) -> None:
     if path.name.endswith(STORE) and path.is_file():
         output = path.with_name(path.name.removesuffix(STORE))
         raise ExperimentError(f"{path}: is what was kept of an unfinished run; name {output}")
-
-
-SWEEP, STATUS = "sweep", "status"
-"""The attribute that only datasets of sweeps have, and the variable along all their dimensions."""
-TEXT = "_text"
-"""Added to the name of a dimension for the values that it counts, as text."""
-PARAMETER = "parameter"
-"""The attribute of a coordinate that names a parameter by its path in the experiment."""
-SHOWN = 6
-"""So many values are listed in messages."""
-
-
-def type_alone(text: str) -> str:
-    """Return of a part that has nothing but its type, that; else the text as it is."""
-    with suppress(ValueError, RecursionError):
-        part = json.loads(text)
-        if isinstance(part, dict) and part.keys() == {"type"}:
-            return str(part["type"])
-    return text
-
-
-def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset:
-    """Return the part of a sweep in which parameters have these values.
-
-    Where every parameter is chosen, the dataset carries the experiment of that member, and its
-    title names the choice.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        The dataset of a sweep.
-    choice : mapping
-        Values by the names of parameters, which are numbers, or texts such as the `type` of a part.
-
-    Raises
-    ------
-    ExperimentError
-        For a dataset of one run, a name that is no parameter, and a value that no member has.
-    """
-    if SWEEP not in dataset.attrs:
-        raise ExperimentError(
-            f"{', '.join(choice)}: there is nothing to choose, as this is the result of one run"
-        )
-    chosen: dict[str, int] = {}
-    for name, value in choice.items():
-        dim, row = _place(dataset, name, value)
-        if chosen.setdefault(dim, row) != row:
-            raise ExperimentError(f"{name}={value}: no member has this with the other choices")
-    found = dataset.isel(chosen)
-    words = ", ".join(f"{name}={value}" for name, value in choice.items())
-    title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
-    found = found.assign_attrs(title=title) if choice else found
-    return found if found[STATUS].ndim else _with_experiment(found)
-
-
-def choices(dataset: xarray.Dataset) -> str:
-    """Return what can be chosen, as messages list it: ``steel: 1, 2, 3; rule: barycentre``."""
-    parts = []
-    for dim in map(str, dataset[STATUS].dims):
-        shown = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
-        more = ", ..." if dataset.sizes[dim] > SHOWN else ""
-        parts.append(f"{dim}: {', '.join(shown)}{more}")
-    return "; ".join(parts)
-
-
-def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
-    """The values along a dimension, or of a parameter beside it."""
-    for label in (f"{name}{TEXT}", name):
-        if label in dataset.coords:
-            return np.asarray(dataset[label].values)
-    return np.arange(dataset.sizes[name])
-
-
-def _word(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else type_alone(str(value))
-
-
-def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
-    """The dimension of a parameter, and the place along it of the value."""
-    grid = [str(dim) for dim in dataset[STATUS].dims]
-    beside = {str(n): str(c.dims[0]) for n, c in dataset.coords.items() if c.ndim == 1}
-    known = {dim: dim for dim in grid} | {n: dim for n, dim in beside.items() if dim in grid}
-    if name not in known:
-        hint = did_you_mean(name, known)
-        raise ExperimentError(f"{name}: is no parameter of this sweep{hint} ({choices(dataset)})")
-    labels = _labels(dataset, name)
-    rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
-    if not rows:
-        near = ", ".join(map(_word, labels.tolist()[:SHOWN]))
-        raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
-    return known[name], rows[0]
-
-
-def _is_alike(label: Any, value: Any) -> bool:
-    if isinstance(label, str):
-        return str(value) in (label, type_alone(label))
-    with suppress(TypeError, ValueError):
-        return bool(np.isclose(float(value), float(label), rtol=1e-6, atol=0.0))
-    return False
-
-
-def _with_experiment(one: xarray.Dataset) -> xarray.Dataset:
-    """The member with its experiment, and without the times that only others reached."""
-    source = Source(data=carried(one, SWEEP).get("experiment"))
-    for name, coordinate in one.coords.items():
-        path = coordinate.attrs.get(PARAMETER)
-        if path is None or coordinate.ndim or f"{name}{TEXT}" in one.coords:
-            continue
-        value, units = coordinate.item(), str(coordinate.attrs.get("units", "1"))
-        if isinstance(value, str):
-            with suppress(ValueError):
-                value = json.loads(value)
-        written = f"{value!r} {units}" if units != "1" and "unit" not in units else value
-        source = with_value(source, str(path), written, str(name), Experiment.defaults())
-    growing = [n for n, v in one.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"]
-    found = one.dropna("time", how="all", subset=growing) if growing else one.copy()
-    attributes = {name: value for name, value in one.attrs.items() if name != SWEEP}
-    found.attrs = attributes | {"experiment": json.dumps(source.data)}
-    return found
 
 
 UNSEALED = "carries no seal: nobody can tell whether it is as it was written"
@@ -295,6 +160,8 @@ def _dataset(content: Any) -> xarray.Dataset:
 
 def _unfinished(output: Path) -> xarray.Dataset:
 
+    from pbdkit.io.unfinished import unfinished_dataset
+
     return _dataset(unfinished_dataset(output))
 
 
@@ -366,59 +233,3 @@ def fault_of(dataset: xarray.Dataset) -> str | None:
             what = "has no" if dims is None else f"has other dimensions, {dims}, of"
             return f"{what} variable '{column.name}': it is damaged, or was changed"
     return None
-
-
-class Overlay(Sink):
-    """Puts the end of a dataset over a file that stays as it is."""
-
-    def __init__(self, file: NetcdfFile) -> None:
-        self._file = file
-
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """It has begun."""
-
-    def put(self, values: Values) -> None:
-        """Over the file."""
-        self._file.put(values)
-
-    def finish(self, attributes: dict[str, str]) -> None:
-        """Over the file."""
-        self._file.finish(attributes)
-
-    def abandon(self) -> None:
-        """Nothing was written."""
-
-
-def unfinished_dataset(output: Path) -> Any:
-    """The content as an h5netcdf.File, with status "interrupted", at the last commit: what was
-    recorded until then, its state and what is known at the end of a run.
-
-    Raises StorageError, and what building the experiment's scene raises.
-    """
-    left = UnfinishedRun.open(output, writing=False)
-    facts, file = left.facts, left.file(read_only=True)
-    if "finished" in facts:
-        left.release()
-        return opened_in(file)
-    standing = left.standing()
-    left.release()
-    try:
-        parts = json.loads(standing.about["experiment"])
-        kinds: dict[str, type] = {"State": State, "Seen": Seen}
-        state = put_together(facts["run"]["state"], standing.arrays, kinds)
-        seen = put_together(facts["seen"], standing.arrays, kinds)
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise StorageError(f"{output}: its store is damaged: {error}") from None
-    refuse_retired(parts, f"{output}, which is unfinished,")
-    scene = build_scene(Experiment.build(Source(f"{output}, unfinished", parts)))
-    if not isinstance(state, State) or not state.fits(initial_state(scene)):
-        raise StorageError(f"{output}: its store holds a state of another experiment")
-    compress = scene.experiment.record.compression == "zlib"
-    making = reopened(file, columns_of(scene), standing, compress=compress)
-    recorder = Recorder(scene, Overlay(making))
-    recorder.seen = seen
-    reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
-    with suppress(FloatingPointError):  # a state that is not finite is not shown
-        recorder.observe(state, last=True)
-    recorder.finish(state, Outcome("interrupted", reason, state.step), {})
-    return opened_in(file)

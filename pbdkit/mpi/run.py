@@ -5,7 +5,6 @@ mpiexec.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -43,12 +42,12 @@ from pbdkit.mpi.partition import (
     widest_halo,
 )
 from pbdkit.plugin import AppliesTwice, Cell, Diagnostic, FollowerRule
-from pbdkit.plugin.discovery import blaming, refuse_without
+from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.frame import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.memory_estimate import TooLargeError
 from pbdkit.scene.scene import Ground, Scene, build_scene
-from pbdkit.simulation import Driver, Processes, Run
+from pbdkit.simulation import Driver, Run
 from pbdkit.stability.forecast import prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned, with_solver
 from pbdkit.stepping.state import State
@@ -431,43 +430,3 @@ class SharingRanks(Ranks):
     def run(self, scene: Scene, watch: Watch) -> Run:
         """Each its part."""
         return DividedRun(self, scene, watch)
-
-
-SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
-"""How many processes launchers of MPI programs say in the environment that there are."""
-RANK = "PMIX_RANK"
-"""What others leave there."""
-
-
-@contextmanager
-def launched() -> Iterator[Processes]:
-    """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
-    and this one alone where it was not.
-
-    Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
-    launcher.
-    """
-    size = max(int(os.environ.get(name, 1)) for name in SIZES)
-    if RANK not in os.environ and size == 1:
-        yield Processes()
-        return
-    refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
-    try:
-        from mpi4py import MPI
-    except (ImportError, RuntimeError) as error:
-        raise ExperimentError(
-            "mpi4py finds no MPI library; install one, for instance by pip install mpich, and "
-            f"start the processes by its mpiexec ({str(error).splitlines()[0]})"
-        ) from None
-    if MPI.COMM_WORLD.size == 1:
-        if size > 1:
-            raise ExperimentError(
-                f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
-                "another launcher; start them by that one's mpiexec"
-            )
-        yield Processes()
-        return
-
-    ranks = SharingRanks(MPI.COMM_WORLD)
-    with ranks.speaking():
-        yield ranks

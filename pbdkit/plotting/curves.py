@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import INDICES, rows_at, scene_of
-from pbdkit.io.open import TEXT, type_alone
+from pbdkit.io.members import TEXT, type_alone
 from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
 from pbdkit.plotting.style import in_its_units, label, plain
 from pbdkit.plugin.discovery import refuse_no_matplotlib

@@ -14,8 +14,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.lattice.neighbourhood import count_bonds
@@ -364,6 +362,10 @@ def _parts(scene: Scene) -> Iterator[Indices]:
     of_body[rows] = np.arange(len(rows))
     ends = of_body[scene.bonds.ends]
     ends = ends[(ends >= 0).all(axis=1)]
+    # Imported here: only bodies in several parts need it, and scipy takes long to import.
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
     graph = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(rows), len(rows)))
     count, label = connected_components(graph, directed=False)
     for n in range(count):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import carried, in_this_layout, reserved_names
-from pbdkit.io.open import STATUS
+from pbdkit.io.members import STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
 from pbdkit.sweeps.worker import KEPT, Report, Variable, unpacked

@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from pbdkit.errors import ExperimentError, PluginError, did_you_mean
 from pbdkit.io.layout import SCHEMA_VERSION, reserved_names
-from pbdkit.io.open import PARAMETER, STATUS, TEXT
+from pbdkit.io.members import PARAMETER, STATUS, TEXT
 from pbdkit.io.physical import IN_MM
 from pbdkit.model.experiment import Experiment, Version
 from pbdkit.model.reading import SWEEP, Source, of_kind, plain, read_file, read_text, with_value

@@ -43,7 +43,8 @@ from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
 from pbdkit.io.explain import Explained, Standing
 from pbdkit.io.layout import OF_BODY, carried, in_this_layout, scene_of
-from pbdkit.io.open import STATUS, SWEEP, TEXT, reading, type_alone
+from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
+from pbdkit.io.open import reading
 from pbdkit.io.physical import TWIN_OF
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.model.experiment import Experiment

@@ -1,0 +1,138 @@
+"""One member of the dataset of a sweep, chosen by its parameters."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbdkit.errors import ExperimentError, did_you_mean
+from pbdkit.io.layout import carried
+from pbdkit.model.reading import Source, with_value
+
+if TYPE_CHECKING:
+    import xarray
+
+SWEEP, STATUS = "sweep", "status"
+"""The attribute that only datasets of sweeps have, and the variable along all their dimensions."""
+TEXT = "_text"
+"""Added to the name of a dimension for the values that it counts, as text."""
+PARAMETER = "parameter"
+"""The attribute of a coordinate that names a parameter by its path in the experiment."""
+SHOWN = 6
+"""So many values are listed in messages."""
+
+
+def type_alone(text: str) -> str:
+    """Return of a part that has nothing but its type, that; else the text as it is."""
+    with suppress(ValueError, RecursionError):
+        part = json.loads(text)
+        if isinstance(part, dict) and part.keys() == {"type"}:
+            return str(part["type"])
+    return text
+
+
+def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset:
+    """Return the part of a sweep in which parameters have these values.
+
+    Where every parameter is chosen, the dataset carries the experiment of that member, and its
+    title names the choice.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The dataset of a sweep.
+    choice : mapping
+        Values by the names of parameters, which are numbers, or texts such as the `type` of a part.
+
+    Raises
+    ------
+    ExperimentError
+        For a dataset of one run, a name that is no parameter, and a value that no member has.
+    """
+    if SWEEP not in dataset.attrs:
+        raise ExperimentError(
+            f"{', '.join(choice)}: there is nothing to choose, as this is the result of one run"
+        )
+    chosen: dict[str, int] = {}
+    for name, value in choice.items():
+        dim, row = _place(dataset, name, value)
+        if chosen.setdefault(dim, row) != row:
+            raise ExperimentError(f"{name}={value}: no member has this with the other choices")
+    found = dataset.isel(chosen)
+    words = ", ".join(f"{name}={value}" for name, value in choice.items())
+    title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
+    found = found.assign_attrs(title=title) if choice else found
+    return found if found[STATUS].ndim else _with_experiment(found)
+
+
+def choices(dataset: xarray.Dataset) -> str:
+    """Return what can be chosen, as messages list it: ``steel: 1, 2, 3; rule: barycentre``."""
+    parts = []
+    for dim in map(str, dataset[STATUS].dims):
+        shown = [_word(value) for value in _labels(dataset, dim)[:SHOWN]]
+        more = ", ..." if dataset.sizes[dim] > SHOWN else ""
+        parts.append(f"{dim}: {', '.join(shown)}{more}")
+    return "; ".join(parts)
+
+
+def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
+    """The values along a dimension, or of a parameter beside it."""
+    for label in (f"{name}{TEXT}", name):
+        if label in dataset.coords:
+            return np.asarray(dataset[label].values)
+    return np.arange(dataset.sizes[name])
+
+
+def _word(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else type_alone(str(value))
+
+
+def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
+    """The dimension of a parameter, and the place along it of the value."""
+    grid = [str(dim) for dim in dataset[STATUS].dims]
+    beside = {str(n): str(c.dims[0]) for n, c in dataset.coords.items() if c.ndim == 1}
+    known = {dim: dim for dim in grid} | {n: dim for n, dim in beside.items() if dim in grid}
+    if name not in known:
+        hint = did_you_mean(name, known)
+        raise ExperimentError(f"{name}: is no parameter of this sweep{hint} ({choices(dataset)})")
+    labels = _labels(dataset, name)
+    rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
+    if not rows:
+        near = ", ".join(map(_word, labels.tolist()[:SHOWN]))
+        raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
+    return known[name], rows[0]
+
+
+def _is_alike(label: Any, value: Any) -> bool:
+    if isinstance(label, str):
+        return str(value) in (label, type_alone(label))
+    with suppress(TypeError, ValueError):
+        return bool(np.isclose(float(value), float(label), rtol=1e-6, atol=0.0))
+    return False
+
+
+def _with_experiment(one: xarray.Dataset) -> xarray.Dataset:
+    """The member with its experiment, and without the times that only others reached."""
+    from pbdkit.model.experiment import Experiment  # imports pydantic
+
+    source = Source(data=carried(one, SWEEP).get("experiment"))
+    for name, coordinate in one.coords.items():
+        path = coordinate.attrs.get(PARAMETER)
+        if path is None or coordinate.ndim or f"{name}{TEXT}" in one.coords:
+            continue
+        value, units = coordinate.item(), str(coordinate.attrs.get("units", "1"))
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = json.loads(value)
+        written = f"{value!r} {units}" if units != "1" and "unit" not in units else value
+        source = with_value(source, str(path), written, str(name), Experiment.defaults())
+    growing = [n for n, v in one.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"]
+    found = one.dropna("time", how="all", subset=growing) if growing else one.copy()
+    attributes = {name: value for name, value in one.attrs.items() if name != SWEEP}
+    found.attrs = attributes | {"experiment": json.dumps(source.data)}
+    return found

@@ -1,0 +1,51 @@
+"""Detection of a launch by mpiexec, which imports little where there was none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pbdkit.errors import ExperimentError
+from pbdkit.plugin.discovery import refuse_without
+from pbdkit.simulation import Processes
+
+SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
+"""How many processes launchers of MPI programs say in the environment that there are."""
+RANK = "PMIX_RANK"
+"""What others leave there."""
+
+
+@contextmanager
+def launched() -> Iterator[Processes]:
+    """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
+    and this one alone where it was not.
+
+    Raises ExperimentError where mpi4py is missing, finds no MPI library, or belongs to another
+    launcher.
+    """
+    size = max(int(os.environ.get(name, 1)) for name in SIZES)
+    if RANK not in os.environ and size == 1:
+        yield Processes()
+        return
+    refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:
+        raise ExperimentError(
+            "mpi4py finds no MPI library; install one, for instance by pip install mpich, and "
+            f"start the processes by its mpiexec ({str(error).splitlines()[0]})"
+        ) from None
+    if MPI.COMM_WORLD.size == 1:
+        if size > 1:
+            raise ExperimentError(
+                f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
+                "another launcher; start them by that one's mpiexec"
+            )
+        yield Processes()
+        return
+    from pbdkit.mpi.run import SharingRanks
+
+    ranks = SharingRanks(MPI.COMM_WORLD)
+    with ranks.speaking():
+        yield ranks
