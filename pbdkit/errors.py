@@ -6,6 +6,7 @@ import difflib
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
@@ -128,3 +129,34 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         return ""
     before = f"{', '.join(names[:-1])} or " if len(names) > 1 else ""
     return f"; did you mean {before}{names[-1]}?"
+
+
+LONGEST_LINE = 400
+"""Maximum number of characters of a message that is quoted."""
+
+
+def one_line(text: str) -> str:
+    """Return the printable words of a text in one line, cut where it is long."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return words if len(words) <= LONGEST_LINE else words[: LONGEST_LINE - 3] + "..."
+
+
+def refuse_without(library: str, extra: str, reason: str) -> None:
+    """Raise ExperimentError where a library is not installed.
+
+    Parameters
+    ----------
+    library : str
+        Name of the module.
+    extra : str
+        Extra of pbdkit that installs it.
+    reason : str
+        What needs the library, in a message: "pictures need matplotlib".
+    """
+    if find_spec(library) is None:
+        raise ExperimentError(f"{reason}: pip install 'pbdkit[{extra}]'")
+
+
+def refuse_no_matplotlib() -> None:
+    """Raise ExperimentError where matplotlib is not installed."""
+    refuse_without("matplotlib", "plot", "pictures need matplotlib")

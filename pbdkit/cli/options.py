@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from pbdkit.errors import ExperimentError, StorageError
-from pbdkit.plugin.discovery import refuse_no_matplotlib
+from pbdkit.errors import ExperimentError, StorageError, refuse_no_matplotlib
 from pbdkit.progress import PATIENCE_S
 
 if TYPE_CHECKING:

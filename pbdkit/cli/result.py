@@ -68,9 +68,8 @@ def _verified(file: Path) -> str:
 
 def _refuse_elsewhere(file: Path) -> None:
     """Raises StorageError where the bytes are what was sealed, and refer to others elsewhere."""
-    from pbdkit.errors import StorageError
+    from pbdkit.errors import StorageError, one_line
     from pbdkit.io.seal import opened
-    from pbdkit.plugin.discovery import one_line
 
     try:
         opened(file).close()

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import UnconvergedError
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.fitting.observations import Carried, FieldSeen
 from pbdkit.fitting.problem import (
     MODULUS,
@@ -45,7 +45,6 @@ from pbdkit.fitting.problem import (
     solved,
 )
 from pbdkit.fitting.specification import Force
-from pbdkit.plugin.discovery import refuse_without
 from pbdkit.plugin.units import STRESS
 from pbdkit.stepping.state import Floats
 

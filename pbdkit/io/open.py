@@ -10,14 +10,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, WriteError
+from pbdkit.errors import (
+    ExperimentError,
+    PbdkitError,
+    PbdkitWarning,
+    StorageError,
+    WriteError,
+    one_line,
+)
 from pbdkit.io.checkpoint import STORE, has_committed
 from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
 from pbdkit.io.members import SWEEP, choices, member
 from pbdkit.io.seal import BrokenSealError, SealedFile, opened, seal_of
 from pbdkit.model.reading import EXPERIMENT, kind_of, read_file, what_takes
 from pbdkit.model.shipped import shipped_names
-from pbdkit.plugin.discovery import one_line
 from pbdkit.untrusted_files import BEGINNINGS, opened_unsealed, try_reading
 
 if TYPE_CHECKING:

@@ -17,10 +17,17 @@ import numpy as np
 from pydantic import BeforeValidator, ValidationError, ValidationInfo
 from pydantic_core import PydanticCustomError
 
-from pbdkit.errors import ExperimentError, PbdkitError, PluginError, StorageError, did_you_mean
+from pbdkit.errors import (
+    ExperimentError,
+    PbdkitError,
+    PluginError,
+    StorageError,
+    did_you_mean,
+    one_line,
+)
 from pbdkit.model.reading import Beside, Source, beside
 from pbdkit.plugin import INTERFACES, Component
-from pbdkit.plugin.discovery import blame, one_line
+from pbdkit.plugin.discovery import blame
 from pbdkit.plugin.fields import MOST_VALUES, Gridded, TakesFields
 from pbdkit.plugin.registry import Registry
 from pbdkit.plugin.schedule import FORMS, WORD

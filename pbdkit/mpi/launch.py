@@ -6,8 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from pbdkit.errors import ExperimentError
-from pbdkit.plugin.discovery import refuse_without
+from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.simulation import Processes
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")

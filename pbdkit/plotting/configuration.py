@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.transforms import ScaledTranslation
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import in_this_layout
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
 from pbdkit.plotting.data import (
@@ -46,7 +46,6 @@ from pbdkit.plotting.layers import (
 )
 from pbdkit.plotting.layout import Legend, Page, Panels, ScaleBar, dress_bar, legend_handles
 from pbdkit.plotting.style import Look, figure_of, label
-from pbdkit.plugin.discovery import refuse_no_matplotlib
 
 if TYPE_CHECKING:
     import xarray

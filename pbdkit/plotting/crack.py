@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import OF_BODY, rows_of
 from pbdkit.plotting.curves import BROAD, TALL, Line, draw_lines, member_dims, new_axes
 from pbdkit.plotting.style import in_its_units, label
-from pbdkit.plugin.discovery import refuse_no_matplotlib
 
 if TYPE_CHECKING:
     import xarray

@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_no_matplotlib
 from pbdkit.io.layout import INDICES, rows_at, scene_of
 from pbdkit.io.members import TEXT, type_alone
 from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
 from pbdkit.plotting.style import in_its_units, label, plain
-from pbdkit.plugin.discovery import refuse_no_matplotlib
 from pbdkit.scene.scene import Scene
 
 if TYPE_CHECKING:

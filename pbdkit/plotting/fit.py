@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.plugin.discovery import refuse_no_matplotlib
+from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plugin.units import LENGTH
 
 if TYPE_CHECKING:

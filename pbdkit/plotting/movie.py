@@ -13,12 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import (
+    ExperimentError,
+    StorageError,
+    one_line,
+    refuse_no_matplotlib,
+    refuse_without,
+)
 from pbdkit.io.atomic_file import NewFile, written
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Recording, Snapshot, extent_of
 from pbdkit.plotting.style import Look
-from pbdkit.plugin.discovery import one_line, refuse_no_matplotlib, refuse_without
 
 if TYPE_CHECKING:
     import xarray

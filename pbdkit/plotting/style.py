@@ -22,9 +22,8 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, one_line
 from pbdkit.io.physical import FACTOR, UNITS
-from pbdkit.plugin.discovery import one_line
 from pbdkit.progress import in_notebook
 
 PYPLOT = "matplotlib.pyplot"

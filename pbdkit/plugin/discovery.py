@@ -1,8 +1,7 @@
 """Plugin hooks and discovery of installed plugins by pluggy: each is loaded in its own guard, and
 an error of a component names the component and its distribution.
 
-Optional libraries are checked here too, and components of earlier versions are mapped to their
-successors until version 1.0.
+Components of earlier versions are mapped to their successors until version 1.0.
 """
 
 from __future__ import annotations
@@ -26,18 +25,16 @@ from importlib.metadata import (
     entry_points,
     version,
 )
-from importlib.util import find_spec
 from pathlib import PurePath, PureWindowsPath
 from typing import Any
 
 import pluggy
 from pydantic import ValidationError
 
-from pbdkit.errors import ExperimentError, PbdkitError, PluginError, did_you_mean
+from pbdkit.errors import ExperimentError, PbdkitError, PluginError, did_you_mean, one_line
 from pbdkit.plugin import BUILTIN, GROUP, INTERFACES, Component, SharesParticles
 from pbdkit.plugin.component import AnswerError
 
-LONGEST = 400
 NUMBERS = {"Parameters": "p", "Weights": "w", "Constants": "c", "Own": "here.own"}
 """What authors call the tuples of numbers that their functions are given."""
 NO_REFERENCE = (
@@ -132,12 +129,6 @@ def remedy(error: BaseException, component: type[Component] | None = None) -> st
     known = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
     there = f"; `{NUMBERS[kind]}` holds {', '.join(known) or 'nothing'}" if kind in NUMBERS else ""
     return did_you_mean(name, known) or there
-
-
-def one_line(text: str) -> str:
-    """The words of the text, printable ones, cut where it is long."""
-    words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    return words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."
 
 
 API = 1
@@ -322,18 +313,6 @@ def disabled_names() -> list[str]:
 def canonical(name: str) -> str:
     """The name of a distribution in the one spelling that installers compare."""
     return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def refuse_without(library: str, extra: str, said: str) -> None:
-    """Raises ExperimentError, with what is `said` to need it and the extra that brings it, where
-    the library is not installed."""
-    if find_spec(library) is None:
-        raise ExperimentError(f"{said}: pip install 'pbdkit[{extra}]'")
-
-
-def refuse_no_matplotlib() -> None:
-    """Raises ExperimentError where there is none."""
-    refuse_without("matplotlib", "plot", "pictures need matplotlib")
 
 
 TYPE = r"[A-Za-z0-9][A-Za-z0-9._-]*"

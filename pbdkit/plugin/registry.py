@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 
-from pbdkit.errors import ExperimentError, PluginError, did_you_mean
+from pbdkit.errors import ExperimentError, PluginError, did_you_mean, one_line
 from pbdkit.plugin import BUILTIN, Component
 from pbdkit.plugin.discovery import (
     ALL,
@@ -22,7 +22,6 @@ from pbdkit.plugin.discovery import (
     is_retired,
     load_builtin,
     loaded,
-    one_line,
 )
 
 GIVEN = "components"

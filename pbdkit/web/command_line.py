@@ -38,7 +38,7 @@ def live(
     The page is served to this machine alone, under an address that nobody guesses. Ctrl-C ends it.
     """
     from pbdkit.api import load
-    from pbdkit.plugin.discovery import refuse_without
+    from pbdkit.errors import refuse_without
     from pbdkit.web.server import Conductor
     from pbdkit.web.session import Session
 

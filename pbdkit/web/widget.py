@@ -12,9 +12,8 @@ from typing import Any
 import anywidget
 
 from pbdkit.api import Given, as_experiment
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_without
 from pbdkit.plugin import Component
-from pbdkit.plugin.discovery import refuse_without
 from pbdkit.web.commands import command_of
 from pbdkit.web.page import script, source
 from pbdkit.web.server import Conductor, Viewer

@@ -747,7 +747,7 @@ def test_the_module_of_a_notebook_shows_a_body_and_goes_again(page, tmp_path):
 
 
 def test_what_is_missing_is_said_with_the_remedy(monkeypatch):
-    monkeypatch.setattr("pbdkit.plugin.discovery.find_spec", lambda name: None)
+    monkeypatch.setattr("pbdkit.errors.find_spec", lambda name: None)
     for call in (lambda: pbdkit.live("paper/a"), lambda: live.main(["paper/a", "--no-browser"])):
         with pytest.raises(pbdkit.ExperimentError, match=re.escape("pip install 'pbdkit[live]'")):
             call()
