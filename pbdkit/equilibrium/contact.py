@@ -24,7 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.sparse import DriftingError, Floating, Ground, Held, Part
+from pbdkit.equilibrium.linear_solver import Coordinates
+from pbdkit.equilibrium.sparse import (
+    ConstrainedSubsystem,
+    DriftingError,
+    SingularSubsystem,
+    Subsystem,
+)
 from pbdkit.equilibrium.system import PUSH, Moves, NoEquilibriumError, System
 from pbdkit.linear.operator import step_operator
 from pbdkit.linear.spectrum import connected, one_minus
@@ -70,7 +76,7 @@ class ContactSystem(System):
         held[operator.held] = True
         self._parts = self._split(matrix, held)
 
-    def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Part]]:
+    def _split(self, matrix: Any, held: NDArray[np.bool_]) -> list[tuple[Indices, Subsystem]]:
         """What leaders or obstacles hold together, and each part that nothing holds by itself."""
         count, label = connected(matrix, strongly=False)
         is_held = np.bincount(label, held, count) > 0.0
@@ -78,14 +84,14 @@ class ContactSystem(System):
         groups += [np.flatnonzero(label == n) for n in np.flatnonzero(~is_held)]
         return [(some, self._part(matrix, some, bool(is_held[label[some[0]]]))) for some in groups]
 
-    def _part(self, matrix: Any, some: Indices, held: bool) -> Part:
+    def _part(self, matrix: Any, some: Indices, held: bool) -> Subsystem:
         """Held parts have an inverse, unless they are left some freedom: then they float."""
         own = matrix if len(some) == matrix.shape[0] else matrix[some][:, some]
         if held:
-            ground = Ground(2, self._X[some[::2] // 2], self._led)
+            coordinates = Coordinates(2, self._X[some[::2] // 2], self._led)
             with suppress(np.linalg.LinAlgError):
-                return Held(own, self._method, ground, self._watch)
-        return Floating(own, None, self._watch)
+                return ConstrainedSubsystem(own, self._method, coordinates, self._watch)
+        return SingularSubsystem(own, None, self._watch)
 
     @property
     def methods(self) -> str:
@@ -121,7 +127,7 @@ class ContactSystem(System):
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Part by part."""
+        """Subsystem by part."""
         r = self._table(moves)
         x = np.zeros_like(r)
         for some, part in self._parts:
@@ -143,7 +149,7 @@ class ContactSystem(System):
         """Unknown."""
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """Part by part."""
+        """Subsystem by part."""
         b = self._table(weights)
         found = np.zeros_like(b)
         for some, part in self._parts:
@@ -196,14 +202,16 @@ class ContactSystem(System):
         """A correction, as far as `most`, where weak springs hold what nothing else does: it leads
         to where obstacles may."""
         matrix = self._matrix + WEAK * _one(self._matrix)
-        ground = Ground(2, self._X, self._led)
-        found = Held(matrix, "lu", ground, self._watch).solve(self._table(moves))
+        coordinates = Coordinates(2, self._X, self._led)
+        found = ConstrainedSubsystem(matrix, "lu", coordinates, self._watch).solve(
+            self._table(moves)
+        )
         found *= min(1.0, most / np.abs(found).max())
         return self._planes(found)
 
     @property
     def _floats(self) -> list[Indices]:
-        return [some for some, part in self._parts if isinstance(part, Floating)]
+        return [some for some, part in self._parts if isinstance(part, SingularSubsystem)]
 
     def _not_unique(self, some: Indices) -> NoEquilibriumError:
         return NoEquilibriumError(
@@ -213,7 +221,7 @@ class ContactSystem(System):
         )
 
     def is_stable(self) -> bool:
-        """Part by part."""
+        """Subsystem by part."""
         return all(part.is_stable() for _, part in self._parts)
 
     def _named(self, unknowns: Indices) -> str:

@@ -1,20 +1,15 @@
-"""Solvers of sparse linear systems: an inverse, factors, or an iteration.
+"""The linear system of an equilibrium as a sparse matrix, in its diagonal blocks.
 
-The parts of a body in a linear system: those that leaders hold, and those that nothing holds.
-
-What of a linear system is solved at once.
-
-The linear system of an equilibrium as a sparse matrix, taken apart.
-
-Where x and y do not move each other there are two systems, often equal; where one moves the other
-only (mixed coordinates), it is solved first. Parts of the body that nothing holds are told apart.
+Where x and y do not move each other there are two blocks, often equal; where one moves the other
+only (mixed coordinates), it is solved first. Within a block, what leaders hold is solved together,
+and each part of the body that nothing holds by itself: its matrix is singular.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.amg import SparseGrids, dissected
+from pbdkit.equilibrium.linear_solver import (
+    Coordinates,
+    Dense,
+    Krylov,
+    LinearSolver,
+    SparseLU,
+    dense,
+    is_symmetric,
+    linear_solver,
+)
 from pbdkit.equilibrium.system import PUSH, NoEquilibriumError, System
 from pbdkit.linear.operator import step_operator
 from pbdkit.linear.spectrum import DENSE, connected, identity_like, one_minus
@@ -32,212 +36,6 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 Floats = NDArray[np.floating[Any]]
-Preconditioner = Callable[[Floats], Floats]
-MOST_ITERATIONS = 400
-FINEST = 1e-14
-"""No residual becomes smaller than this share."""
-LARGEST_LU, LARGEST_COUPLED_LU = 30_000, 200_000
-"""Unknowns up to which `auto` takes an LU factorisation; more where the axes move each other."""
-STURDY = 0.1
-"""Diagonal entries that are this share of the largest of their columns serve as pivots."""
-LOPSIDED = 1.2
-"""A matrix and its transpose together may have so many times its entries for it to count as nearly
-symmetric."""
-SAME = 1e-12
-"""Relative difference up to which a matrix counts as symmetric."""
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Where the unknowns lie, `axes` of each particle next to each other: the places of particles
-    and of leaders, (particle, axis of space); which unknowns are `held`, each alone in its row and
-    column (None: none)."""
-
-    axes: int
-    places: Floats
-    led: Floats
-    held: NDArray[np.bool_] | None = None
-
-    def grids(self, matrix: Any) -> Preconditioner:
-        """Multigrid for a matrix of these unknowns."""
-        return SparseGrids(matrix, self.axes, self.places, self.led, self.held)
-
-
-class LinearSolver(ABC):
-    """Solves A x = b for one matrix, with an unknown a row."""
-
-    name: str
-    iterations = 0
-
-    @abstractmethod
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """x with ‖b - A x‖₂ ≤ accuracy · ‖b‖₂ as far as the method gets."""
-
-    @abstractmethod
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """The same of Aᵀ x = b."""
-
-
-class Dense(LinearSolver):
-    """The inverse itself, for small matrices."""
-
-    name = "lu"
-
-    def __init__(self, matrix: Floats) -> None:
-        self.inverse = np.linalg.inv(matrix)
-
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By a product."""
-        return self.inverse @ b
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By a product."""
-        return self.inverse.T @ b
-
-
-class SparseLU(LinearSolver):
-    """SuperLU. Where the pattern is nearly symmetric, in an order that fills in little: by nested
-    dissection where it is known where the many unknowns lie, else by minimum degree."""
-
-    name = "lu"
-
-    def __init__(self, matrix: Any, symmetric: bool, ground: Ground | None = None) -> None:
-        from scipy.sparse.linalg import splu
-
-        how: dict[str, Any] = {}
-        self._order = None
-        if symmetric:
-            how = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-        elif is_nearly_symmetric(matrix):
-            how = {"diag_pivot_thresh": STURDY}
-        if how:
-            how["permc_spec"] = "MMD_AT_PLUS_A"
-            places = ground.places.repeat(ground.axes, axis=0) if ground else None
-            self._order = None if places is None else dissected(matrix, places)
-        if self._order is not None:
-            how["permc_spec"] = "NATURAL"
-            matrix = matrix[self._order][:, self._order]
-        try:
-            self._factors = splu(matrix.tocsc(), **how)
-        except RuntimeError as error:  # "Factor is exactly singular"
-            raise np.linalg.LinAlgError(str(error)) from None
-
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """By the factors."""
-        return self._by_factors(b, "N")
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By the same factors."""
-        return self._by_factors(b, "T")
-
-    def _by_factors(self, b: Floats, how: str) -> Floats:
-        if self._order is None:
-            return np.asarray(self._factors.solve(b, trans=how))
-        x = np.empty_like(b, dtype=float)
-        x[self._order] = self._factors.solve(b[self._order], trans=how)
-        return x
-
-
-class Krylov(LinearSolver):
-    """Conjugate gradients for symmetric matrices, GMRES for others; `grids` makes the multigrid
-    preconditioner of a matrix, None for none."""
-
-    def __init__(
-        self,
-        matrix: Any,
-        symmetric: bool,
-        watch: Watch,
-        grids: Callable[[Any], Preconditioner] | None = None,
-    ) -> None:
-        inner = "conjugate-gradients" if symmetric else "gmres"
-        self.name = f"multigrid, {inner}" if grids else inner
-        self._matrix, self._symmetric, self._watch = matrix, symmetric, watch
-        self._grids = grids
-        self._cycle = grids(matrix) if grids else np.copy
-        self._most = MOST_ITERATIONS + (0 if grids else 20 * math.isqrt(matrix.shape[0]))
-
-    def solve(self, b: Floats, accuracy: float) -> Floats:
-        """Until it is accurate enough, or most iterations are made."""
-        from scipy.sparse.linalg import LinearOperator, cg, gmres
-
-        accuracy, whole = max(accuracy, FINEST), float(np.linalg.norm(b))
-        if not 0.0 < whole < math.inf:
-            return np.zeros_like(b)
-
-        def tell(left: float) -> None:
-            self.iterations += 1
-            self._watch.look(math.log(left) / math.log(accuracy) if 0.0 < left < 1.0 else 0.0)
-
-        def told(r: Floats) -> Floats:
-            """Conjugate gradients precondition the residual of every iteration."""
-            tell(float(np.linalg.norm(r)) / whole)
-            return self._cycle(r)
-
-        first = told if self._symmetric else self._cycle
-        M = LinearOperator(self._matrix.shape, matvec=first, dtype=float)
-        how: dict[str, Any] = {"M": M, "rtol": accuracy, "atol": 0.0}
-        with np.errstate(all="ignore"):  # A that is no matrix for it: what comes out shows it
-            if self._symmetric:
-                x, _ = cg(self._matrix, b, maxiter=self._most, **how)
-            else:
-                how |= {"callback": tell, "callback_type": "pr_norm", "restart": 30}
-                x, _ = gmres(self._matrix, b, maxiter=MOST_ITERATIONS // 30, **how)
-        self._watch.look(1.0)
-        return np.asarray(x)
-
-    def solve_transposed(self, b: Floats, accuracy: float) -> Floats:
-        """By grids of the transpose, where that is another matrix."""
-        return (self if self._symmetric else self._transposed).solve(b, accuracy)
-
-    @cached_property
-    def _transposed(self) -> Krylov:
-        return Krylov(self._matrix.T.tocsr(), False, self._watch, self._grids)
-
-
-def linear_solver(
-    matrix: Any,
-    method: str,
-    *,
-    symmetric: bool,
-    ground: Ground | None = None,
-    watch: Watch | None = None,
-) -> LinearSolver:
-    """The solver for a sparse matrix by a method, or by what serves its size.
-
-    `ground` says where the unknowns lie: grids need it, and an order of elimination where axes
-    move each other gains by it. Raises LinAlgError where the matrix is found to be singular.
-    """
-    size, coupled = matrix.shape[0], ground is not None and ground.axes > 1
-    if method == "auto":
-        large = size > (LARGEST_COUPLED_LU if coupled else LARGEST_LU)
-        method = "multigrid" if large and ground else "lu"
-    if method == "lu":
-        if size <= DENSE:
-            return Dense(dense(matrix))
-        return SparseLU(matrix, symmetric, ground if coupled else None)
-    grids = ground.grids if ground and method == "multigrid" else None
-    return Krylov(matrix, symmetric, watch or Watch(), grids)
-
-
-def dense(matrix: Any) -> Floats:
-    """The matrix as an array."""
-    return matrix if isinstance(matrix, np.ndarray) else np.asarray(matrix.toarray())
-
-
-def is_symmetric(matrix: Any) -> bool:
-    """Whether a matrix equals its transpose, up to rounding."""
-    difference = abs(matrix - matrix.T)
-    return bool(difference.max() <= SAME * max(1.0, abs(matrix).max()))
-
-
-def is_nearly_symmetric(matrix: Any) -> bool:
-    """Whether a sparse matrix has most entries where its transpose has them."""
-    from scipy.sparse import csr_array
-
-    ones = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), matrix.shape)
-    return bool((ones + ones.T).nnz <= LOPSIDED * matrix.nnz)
-
-
 Mask = NDArray[np.bool_]
 SAFETY = 3.0
 """What an estimate that may come out too small is multiplied with."""
@@ -273,7 +71,7 @@ class TooSoftError(DriftingError):
     """Double precision does not tell whether a part is held softly or not at all."""
 
 
-class Part(ABC):
+class Subsystem(ABC):
     """A x = r for the unknowns of a part, by a solver for them and, after them, for what borders
     A; without one only rest is an equilibrium."""
 
@@ -362,24 +160,24 @@ class Part(ABC):
         return SAFETY * float(np.abs(self._inverted(signs, accuracy)).max(initial=0.0))
 
 
-class Held(Part):
+class ConstrainedSubsystem(Subsystem):
     """A part whose matrix has an inverse. Raises LinAlgError where some motion costs nothing."""
 
     def __init__(
         self,
         matrix: Any,
         method: str,
-        ground: Ground,
+        coordinates: Coordinates,
         watch: Watch,
     ) -> None:
         if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
             from scipy.sparse import csr_array
 
             matrix = csr_array(matrix)
-        self._how: dict[str, Any] = {"symmetric": is_symmetric(matrix), "ground": ground}
+        self._coordinates = coordinates
         self._matrix, self._is_short = matrix, False
         self._has_choice = method == "auto" and matrix.shape[0] <= LARGEST_FALLBACK
-        solver = linear_solver(matrix, method, watch=watch, **self._how)
+        solver = linear_solver(matrix, method, coordinates=coordinates, watch=watch)
         super().__init__(matrix.shape[0], solver, watch)
         if self._spread < SOFT or matrix.shape[0] > LARGEST_FALLBACK:
             return
@@ -413,7 +211,7 @@ class Held(Part):
             if not (self._is_short and self._has_choice):
                 self.is_stuck |= self._is_short
                 break
-            self._solver = linear_solver(self._matrix, "lu", **self._how)
+            self._solver = linear_solver(self._matrix, "lu", coordinates=self._coordinates)
             self._is_short = False
         return x
 
@@ -436,7 +234,7 @@ class Held(Part):
         return found + (self._spread * rounding if rounding else 0.0)
 
 
-class Floating(Part):
+class SingularSubsystem(Subsystem):
     """A part with modes that no step changes: what their invariants Yᵀ u, Yᵀ A = 0, were, they
     remain. `before` is the share of A that looks back a step: it has a share in the invariants,
     K = Yᵀ (1 + before). Solves A x + Y μ = r, K x = k; without a solver where modes grow, or where
@@ -515,12 +313,12 @@ def _left_kernel(matrix: Any) -> Floats:
 
 
 @dataclass
-class Stage:
+class DiagonalBlock:
     """The unknowns of one axis, or of both where they move each other, with their parts: who
     belongs to each. `into` is what the axis solved before adds to the moves."""
 
     axes: list[int]
-    parts: list[tuple[Indices, Part]]
+    parts: list[tuple[Indices, Subsystem]]
     into: Any = None
 
 
@@ -560,14 +358,14 @@ class MatrixSystem(System):
         self._guided.ravel()[operator.held] = True
         self._both = both = operator.couplings_both
         first = 1 if both.couples(0, 1) else 0
-        self._stages = [] if both.couples(first, 1 - first) else [self._stage([first])]
+        self._blocks = [] if both.couples(first, 1 - first) else [self._block([first])]
         # One axis has a share in the invariants of the other, where it moves it.
-        parts = [part for stage in self._stages for _, part in stage.parts]
-        floats = any(isinstance(part, Floating) for part in parts)
-        if not self._stages or (floats and both.couples(1 - first, first)):
-            self._stages = [self._stage([0, 1])]
+        parts = [part for block in self._blocks for _, part in block.parts]
+        floats = any(isinstance(part, SingularSubsystem) for part in parts)
+        if not self._blocks or (floats and both.couples(1 - first, first)):
+            self._blocks = [self._block([0, 1])]
         else:
-            self._stages.append(self._following(first))
+            self._blocks.append(self._following(first))
 
     @property
     def amplification(self) -> float:
@@ -577,7 +375,7 @@ class MatrixSystem(System):
     @property
     def methods(self) -> str:
         """The names of the methods used."""
-        names = {part.name for stage in self._stages for _, part in stage.parts}
+        names = {part.name for block in self._blocks for _, part in block.parts}
         return ", ".join(sorted(names)) or "nothing to solve"
 
     @property
@@ -585,13 +383,13 @@ class MatrixSystem(System):
         """By the solution; its rounding by the inverse itself where that is at hand."""
         if self._damping:
             return "damped"
-        ways = {part.how for stage in self._stages for _, part in stage.parts}
+        ways = {part.how for block in self._blocks for _, part in block.parts}
         return next((way for way in ("solution", "inverse") if way in ways), "nothing to solve")
 
     @property
     def iterations(self) -> int:
         """Of all linear solvers together."""
-        parts = {id(part): part for stage in self._stages for _, part in stage.parts}
+        parts = {id(part): part for block in self._blocks for _, part in block.parts}
         return sum(part.iterations for part in parts.values())
 
     def _table(self, planes: Floats) -> Floats:
@@ -607,49 +405,52 @@ class MatrixSystem(System):
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """Looks at each part by itself."""
         table = self._table(moves)
-        for stage in self._stages:
-            for unknowns, part in stage.parts:
-                r = table[:, stage.axes].ravel()[unknowns]
-                if isinstance(part, Floating) and np.abs(r).max(initial=0.0) > 8 * rounding:
+        for block in self._blocks:
+            for unknowns, part in block.parts:
+                r = table[:, block.axes].ravel()[unknowns]
+                if (
+                    isinstance(part, SingularSubsystem)
+                    and np.abs(r).max(initial=0.0) > 8 * rounding
+                ):
                     raise NoEquilibriumError(
                         "there is no unique equilibrium: leaders do not hold a part of "
-                        f"{self._named(stage, unknowns)}; let one hold it, or take solver: "
+                        f"{self._named(block, unknowns)}; let one hold it, or take solver: "
                         "{type: stepping}",
                         ("leaders",),
                     )
 
     @property
     def is_stuck(self) -> bool:
-        """Part by part."""
-        return any(part.is_stuck for stage in self._stages for _, part in stage.parts)
+        """Subsystem by part."""
+        return any(part.is_stuck for block in self._blocks for _, part in block.parts)
 
     def solve(
         self, moves: Floats, tolerance: float, owed: State | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Stage by stage, part by part."""
+        """DiagonalBlock by block, part by part."""
         back = None if owed is None else self._owed(owed)
         return self._planes(self._solved(self._table(moves), back, rounding))
 
     def _solved(self, moves: Floats, owed: Floats | None, rounding: float) -> Floats:
         found = np.zeros_like(moves)
-        for stage in self._stages:
-            r = moves[:, stage.axes].ravel()
-            if stage.into is not None:
-                r = r + stage.into @ found[:, 1 - stage.axes[0]]
-            back = None if owed is None else owed[:, stage.axes].ravel()
+        for block in self._blocks:
+            r = moves[:, block.axes].ravel()
+            if block.into is not None:
+                r = r + block.into @ found[:, 1 - block.axes[0]]
+            back = None if owed is None else owed[:, block.axes].ravel()
             x = np.zeros_like(r)
-            for some, part in stage.parts:
+            for some, part in block.parts:
                 try:
                     own = None if back is None else back[some]
                     x[some] = part.solve(r[some], own, rounding)
                 except DriftingError as error:
                     soft = isinstance(error, TooSoftError) or (
-                        part.is_soft and self._is_fixed(stage.axes, some)
+                        part.is_soft and self._is_fixed(block.axes, some)
                     )
                     text = SOFT_MESSAGE if soft else DRIFTS
-                    named = self._named(stage, some)
+                    named = self._named(block, some)
                     raise NoEquilibriumError(text.format(named), ("leaders",)) from None
-            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
+            found[:, block.axes] = x.reshape(-1, len(block.axes))
         return found
 
     def answer(self, moves: Floats, share: float, near: Sequence[Floats] = ()) -> Floats:
@@ -660,17 +461,17 @@ class MatrixSystem(System):
         """Unknown."""
 
     def solve_transposed(self, weights: Floats, share: float) -> Floats:
-        """The last stage first."""
+        """The last block first."""
         table = self._table(weights)
         found = np.zeros_like(table)
-        for stage in reversed(self._stages):
-            b = table[:, stage.axes].ravel()
+        for block in reversed(self._blocks):
+            b = table[:, block.axes].ravel()
             x = np.zeros_like(b)
-            for some, part in stage.parts:
+            for some, part in block.parts:
                 x[some] = part.solve_transposed(b[some])
-            found[:, stage.axes] = x.reshape(-1, len(stage.axes))
-            if stage.into is not None:
-                table[:, 1 - stage.axes[0]] += stage.into.T @ x
+            found[:, block.axes] = x.reshape(-1, len(block.axes))
+            if block.into is not None:
+                table[:, 1 - block.axes[0]] += block.into.T @ x
         found[self._guided] = 0.0
         return self._planes(found)
 
@@ -693,38 +494,38 @@ class MatrixSystem(System):
     def distance(self, moves: Floats, rounding: float) -> float:
         """Solves once more for what is left of the moves, and adds what rounding may make of it."""
         table, bounds = self._table(moves), np.zeros(2)
-        for stage in self._stages:
-            r = table[:, stage.axes].ravel()
+        for block in self._blocks:
+            r = table[:, block.axes].ravel()
             unsure = np.full(len(r), rounding)
-            if stage.into is not None:
-                unsure += abs(stage.into).sum(axis=1) * bounds[1 - stage.axes[0]]
+            if block.into is not None:
+                unsure += abs(block.into).sum(axis=1) * bounds[1 - block.axes[0]]
             far = (
                 part.farthest(r[some], float(unsure[some].max(initial=0.0)))
-                for some, part in stage.parts
+                for some, part in block.parts
             )
-            bounds[stage.axes] = max(far, default=0.0)
+            bounds[block.axes] = max(far, default=0.0)
         return math.hypot(*bounds)
 
     def is_stable(self) -> bool:
-        """Part by part."""
-        return all(part.is_stable() for stage in self._stages for _, part in stage.parts)
+        """Subsystem by part."""
+        return all(part.is_stable() for block in self._blocks for _, part in block.parts)
 
-    def _named(self, stage: Stage, unknowns: Indices) -> str:
-        numbers = np.unique(self._operator.followers[unknowns // len(stage.axes)]) + 1
+    def _named(self, block: DiagonalBlock, unknowns: Indices) -> str:
+        numbers = np.unique(self._operator.followers[unknowns // len(block.axes)]) + 1
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
-    def _following(self, first: int) -> Stage:
-        """The stage of the other axis; it shares the solvers of the first where both are alike."""
+    def _following(self, first: int) -> DiagonalBlock:
+        """The block of the other axis; it shares the solvers of the first where both are alike."""
         other, led = 1 - first, self._operator.couplings_led
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None
         if self._both.is_isotropic() and led.is_isotropic():
-            return Stage([other], self._stages[0].parts, into)
-        stage = self._stage([other])
-        stage.into = into
-        return stage
+            return DiagonalBlock([other], self._blocks[0].parts, into)
+        block = self._block([other])
+        block.into = into
+        return block
 
-    def _stage(self, axes: list[int]) -> Stage:
+    def _block(self, axes: list[int]) -> DiagonalBlock:
         matrix = one_minus(self._both.entries(axes).matrix())
         if self._damping:
             matrix = matrix + self._damping * identity_like(matrix)
@@ -741,21 +542,21 @@ class MatrixSystem(System):
         held[label[led.rows[led.values != 0.0]]] = True
         # What leaders move directly or not is solved together, each part that floats by itself.
         groups = [np.flatnonzero((held & ~alone)[label])] if held.any() else []
-        stage = Stage(axes, [])
+        block = DiagonalBlock(axes, [])
         for some in groups + [np.flatnonzero(label == n) for n in np.flatnonzero(~held & ~alone)]:
             part = self._part(_within(matrix, some), axes, some, bool(held[label[some[0]]]))
-            stage.parts.append((some, part))
-        return stage
+            block.parts.append((some, part))
+        return block
 
-    def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Part:
-        """Held parts have an inverse, unless leaders leave them some freedom: then they float."""
+    def _part(self, matrix: Any, axes: list[int], some: Indices, held: bool) -> Subsystem:
+        """Held parts have an inverse, unless leaders leave them some freedom."""
         if held:
-            ground = self._ground(axes, some)
+            coordinates = self._coordinates(axes, some)
             with suppress(np.linalg.LinAlgError):
-                return Held(matrix, self._method, ground, self._watch)
+                return ConstrainedSubsystem(matrix, self._method, coordinates, self._watch)
         before = self._operator.couplings_before
         back = _within(before.entries(axes).matrix(), some) if before.parts else None
-        return Floating(matrix, back, self._watch)
+        return SingularSubsystem(matrix, back, self._watch)
 
     def _is_fixed(self, axes: list[int], some: Indices) -> bool:
         """Whether what leads, led components and leaders beside these unknowns, leaves them no
@@ -774,12 +575,12 @@ class MatrixSystem(System):
             motions = np.column_stack([motions, np.where(along == 0, -y, x)])
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    def _ground(self, axes: list[int], some: Indices) -> Ground:
+    def _coordinates(self, axes: list[int], some: Indices) -> Coordinates:
         """Where these unknowns lie; who leads along the one axis asked for is a leader."""
         where, held = some[:: len(axes)] // len(axes), self._guided[:, axes]
         led = self._X[held[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = held[where].ravel() if len(axes) > 1 and held.any() else None
-        return Ground(len(axes), self._X[where], np.concatenate([self._led, led]), guided)
+        return Coordinates(len(axes), self._X[where], np.concatenate([self._led, led]), guided)
 
 
 def _within(matrix: Any, unknowns: Indices) -> Any:

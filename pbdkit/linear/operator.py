@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.response import by_sublattice, has_neighbours, respond
-from pbdkit.linear.spectrum import Couplings, Entries, frame_matrices, scaled, some_of
+from pbdkit.linear.spectrum import Couplings, Entries, frame_matrices
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin.frame import Indices
 from pbdkit.scene.leaders import kinds_at
@@ -67,16 +67,16 @@ class Guiding:
 
     def put(
         self, free: Couplings, led: Couplings, rows: Indices, there: Indices,
-        unknown: tuple[NDArray[np.int32], NDArray[np.int32]], blocks: Floats,
+        numbers: tuple[Indices, Indices], blocks: Floats,
     ) -> None:  # fmt: skip
-        """Adds what particles at flat places do as followers, and what guided ones do as leaders,
-        by the numbers `unknown` that each flat place has among both."""
+        """Add what particles at flat places do as followers, and what guided ones do as leaders;
+        `numbers` are those of each as a follower and as a leader."""
         own = self.numbers(there)
-        others, some = own < 0, np.flatnonzero(own >= 0)
-        free.add(rows[others], unknown[0][there[others]], some_of(blocks, others))
-        kept = np.einsum("eab,ebc->eac", blocks[some], self.free[own[some]])
-        free.add(rows[some], unknown[0][there[some]], kept)
-        led.add(rows[some], unknown[1][there[some]], blocks[some] - kept)
+        if (some := np.flatnonzero(own >= 0)).size:
+            led_blocks, blocks = blocks[some], blocks.copy()
+            blocks[some] = np.einsum("eab,ebc->eac", led_blocks, self.free[own[some]])
+            led.add(rows[some], numbers[1][some], led_blocks - blocks[some])
+        free.add(rows, numbers[0], blocks)
 
 
 Integers = NDArray[np.signedinteger[Any]]
@@ -196,11 +196,11 @@ def _directly(scene: Scene, state: State, place: Indices) -> tuple[Floats, Coupl
         some = moving[own]
         (response,) = respond(scene, state, s, place[some])
         moves[some] = response.of_each(response.answer)
-        couplings.add(some, place[some], response.of_each(response.own))
-        for slot, derivative in response.neighbours.items():
-            there = place[some] + slot_step(scene.raster.shape, slot)
-            has = kind[there] != EMPTY
-            couplings.add(some[has], there[has], some_of(response.of_each(derivative), has))
+        steps = [0, *(slot_step(scene.raster.shape, slot) for slot in response.neighbours)]
+        there = place[some] + np.array(steps)[:, None]
+        blocks = np.stack([response.own, *response.neighbours.values()])
+        slot, row = np.nonzero(kind[there] != EMPTY)
+        couplings.add(some[row], there[slot, row], blocks[slot, response.kind[row]])
     return moves, couplings
 
 
@@ -238,7 +238,7 @@ class _Assembly:
             for rows, there, blocks in couplings.parts
         ]
         for rows, there, blocks in couplings.parts:
-            self._see(rows, there, scaled(solver.relaxation, blocks))
+            self._see(rows, there, solver.relaxation * blocks)
         if solver.memory:
             moving = np.flatnonzero(has_neighbours(scene, place))
             self._stay(self._now, place, moving, solver.memory)
@@ -270,29 +270,37 @@ class _Assembly:
         return moved[1] - moved[0]
 
     def _see(self, rows: Integers, there: Indices, weight: Floats) -> None:
-        """Followers and leaders directly, frame points through those that they follow."""
-        kinds = self._kind[there]
-        some, numbers = kinds == LEADER, (self._unknown, self._as_leader)
-        self._led.add(rows[some], self._as_leader[there[some]], some_of(weight, some))
-        some = kinds == FOLLOWER
-        given = rows[some], there[some], numbers, some_of(weight, some)
-        self._guiding.put(self._now, self._led, *given)
-        frame, some = self._scene.frame, kinds == FRAME
-        if frame is None or not some.any():
-            return
-        point, rows, weight = self._unknown[there[some]], rows[some], some_of(weight, some)
-        first = np.searchsorted(frame.map.point, point)
-        last = np.searchsorted(frame.map.point, point + 1)
-        for e in range(int((last - first).max(initial=0))):
-            has = first + e < last
-            entry = (first + e)[has]
+        """Add what particles at flat places do to followers: frame points through those that they
+        follow, each in the place of the frame point."""
+        by_frame, frame = self._kind[there] == FRAME, self._scene.frame
+        if frame is not None and by_frame.any():
+            first, last = (
+                np.searchsorted(frame.map.point, self._unknown[there[by_frame]], side)
+                for side in ("left", "right")
+            )
+            count = np.ones(len(there), np.intp)
+            count[by_frame] = last - first
+            offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+            start = np.zeros(len(there), np.intp)
+            start[by_frame] = first
+            rows, there, weight, by_frame, entry = (
+                np.repeat(values, count, axis=0)
+                for values in (rows, there, weight, by_frame, start)
+            )
+            entry = (entry + offset)[by_frame]
             follows = frame_matrices(frame.map.weight[entry], self._scene.axes)
-            product = np.einsum("eab,ebc->eac", weight[has], follows)
-            body = frame.body_place[entry]
-            of_leader = self._kind[body] == LEADER
-            free = self._before if frame.map.lag else self._now
-            for couplings, others in ((self._led, free), (self._shown, Couplings((0, 0), 0))):
-                columns = self._as_leader[body[of_leader]]
-                couplings.add(rows[has][of_leader], columns, product[of_leader])
-                given = rows[has][~of_leader], body[~of_leader], numbers, product[~of_leader]
-                self._guiding.put(others, couplings, *given)
+            there[by_frame] = frame.body_place[entry]
+            weight[by_frame] = np.einsum("eab,ebc->eac", weight[by_frame], follows)
+        led, free = (self._kind[there] == kind for kind in (LEADER, FOLLOWER))
+        self._led.add(rows[led], self._as_leader[there[led]], weight[led])
+        shown = led & by_frame
+        self._shown.add(rows[shown], self._as_leader[there[shown]], weight[shown])
+        lags = by_frame if frame is not None and frame.map.lag else np.zeros_like(by_frame)
+        nowhere = Couplings((0, 0), 0)
+        for couplings, leads, some in (
+            (self._now, self._led, free & ~lags),
+            (self._before, self._led, free & lags),
+            (nowhere, self._shown, free & by_frame),
+        ):
+            numbers = self._unknown[there[some]], self._as_leader[there[some]]
+            self._guiding.put(couplings, leads, rows[some], there[some], numbers, weight[some])

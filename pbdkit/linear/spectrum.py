@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ class Entries:
 
     rows: NDArray[np.signedinteger[Any]]
     columns: NDArray[np.signedinteger[Any]]
-    values: NDArray[np.float64]
+    values: Floats
     shape: tuple[int, int]
 
     def plus(self, other: Entries, factor: float = 1.0) -> Entries:
@@ -51,9 +50,8 @@ class Entries:
         """Dense up to DENSE rows, else sparse."""
         if self.shape[0] > DENSE:
             return self.sparse()
-        dense = np.zeros(self.shape)
-        np.add.at(dense, (self.rows, self.columns), self.values)
-        return dense
+        place = self.rows * self.shape[1] + self.columns
+        return np.bincount(place, self.values, self.shape[0] * self.shape[1]).reshape(self.shape)
 
     def sparse(self) -> Any:
         """A scipy.sparse.csr_array."""
@@ -103,9 +101,9 @@ def connected(matrix: Any, *, strongly: bool) -> tuple[int, Indices]:
 def _touching(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
     """The same where all lead both ways: each group from its lowest unknown outwards."""
     count, label = 0, np.full(len(reach), -1)
-    for first in range(len(reach)):
-        front = np.array([first] if label[first] < 0 else [], int)
-        count += len(front)
+    while (unlabelled := label < 0).any():
+        front = np.flatnonzero(unlabelled)[:1]
+        count += 1
         while len(front):
             label[front] = count - 1
             front = np.flatnonzero(reach[front].any(axis=0) & (label < 0))
@@ -116,8 +114,7 @@ def _touching(reach: NDArray[np.bool_]) -> tuple[int, Indices]:
 class Couplings:
     """Blocks (axis, axis) at (row, column), in parts, counted in particles; those of one place add.
 
-    `shape` is in particles, `axes` how many space has. Blocks that are the same everywhere may be
-    views of one.
+    `shape` is in particles, `axes` how many space has.
     """
 
     shape: tuple[int, int]
@@ -140,60 +137,44 @@ class Couplings:
         axis."""
         to = to or range(self.axes)
         of = of or to
-        nothing = np.empty(0, np.intp)
-        found: list[tuple[Any, Any, Any]] = [(nothing, nothing, np.empty(0))]
-        for rows, columns, blocks in self.parts:
-            for (i, a), (j, b) in product(enumerate(to), enumerate(of)):
-                if not _of_one(blocks)[:, a, b].any():
-                    continue
-                value = blocks[:, a, b]
-                kept = slice(None) if is_one(blocks) else value != 0.0
-                found.append((len(to) * rows[kept] + i, len(of) * columns[kept] + j, value[kept]))
-        rows, columns, values = (np.concatenate(part) for part in zip(*found, strict=True))
-        return Entries(rows, columns, values, (len(to) * self.shape[0], len(of) * self.shape[1]))
+        shape = (len(to) * self.shape[0], len(of) * self.shape[1])
+        rows, columns, blocks = self._joined()
+        if len(to) + len(of) < 2 * self.axes:
+            blocks = blocks[:, np.array(to)[:, None], of]
+        entry, i, j = np.nonzero(blocks)
+        values = blocks[entry, i, j]
+        return Entries(len(to) * rows[entry] + i, len(of) * columns[entry] + j, values, shape)
+
+    def _joined(self) -> tuple[Indices, Indices, Floats]:
+        """Return all parts as one."""
+        if not self.parts:
+            nothing = np.empty(0, np.intp)
+            return nothing, nothing, np.empty((0, self.axes, self.axes))
+        rows, columns, blocks = (np.concatenate(values) for values in zip(*self.parts, strict=True))
+        return rows, columns, blocks
 
     def couples(self, a: int, b: int) -> bool:
         """Whether anything leads from axis b to axis a."""
-        return any(_of_one(blocks)[:, a, b].any() for _, _, blocks in self.parts)
+        return any(blocks[:, a, b].any() for _, _, blocks in self.parts)
 
     def is_isotropic(self) -> bool:
         """Whether all axes move alike."""
-        blocks = [_of_one(blocks) for _, _, blocks in self.parts]
-        first, *others = range(self.axes)
-        return all(np.array_equal(b[:, first, first], b[:, a, a]) for b in blocks for a in others)
+        return all(
+            np.array_equal(blocks[:, 0, 0], blocks[:, a, a])
+            for _, _, blocks in self.parts
+            for a in range(1, self.axes)
+        )
 
     def times(self, vectors: Floats) -> Floats:
         """The product with vectors, (particle, axis)."""
-        found = np.zeros((self.shape[0], self.axes))
-        for rows, columns, blocks in self.parts:
-            terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
-            for axis in range(self.axes):
-                found[:, axis] += np.bincount(rows, terms[:, axis], self.shape[0])
-        return found
-
-
-def some_of(blocks: Floats, chosen: NDArray[np.bool_]) -> Floats:
-    """Those chosen; still a view where all are one."""
-    return blocks[: np.count_nonzero(chosen)] if is_one(blocks) else blocks[chosen]
-
-
-def scaled(factor: float, blocks: Floats) -> Floats:
-    """The multiple; still a view where all are one."""
-    return np.broadcast_to(factor * blocks[:1], blocks.shape) if is_one(blocks) else factor * blocks
-
-
-def is_one(blocks: Floats) -> bool:
-    """Whether the blocks are views of a single one."""
-    return len(blocks) > 1 and blocks.strides[0] == 0
+        rows, columns, blocks = self._joined()
+        terms = np.einsum("eab,eb->ea", blocks, vectors[columns])
+        return np.stack([np.bincount(rows, along, self.shape[0]) for along in terms.T], axis=1)
 
 
 def frame_matrices(weights: Floats, axes: int) -> Floats:
     """(entry, axis, axis): a frame's weights as matrices."""
     return weights[:, None, None] * np.eye(axes) if weights.ndim == 1 else weights
-
-
-def _of_one(blocks: Floats) -> Floats:
-    return blocks[:1] if is_one(blocks) else blocks
 
 
 MOST_PARTICLES, MOST_ENDS, MOST_ANSWERS, MANY = 50_000, 800_000, 2e8, 42

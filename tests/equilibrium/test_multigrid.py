@@ -8,9 +8,9 @@ import pytest
 from turning_frame import Turning
 
 import pbdkit
+from pbdkit.equilibrium import linear_solver
 from pbdkit.equilibrium import linearise as linearisation
 from pbdkit.equilibrium import solve as increments
-from pbdkit.equilibrium import sparse as linear_solver
 from pbdkit.equilibrium import system as moves
 from pbdkit.equilibrium.solve import settle
 from pbdkit.plugin import FollowerRule, Vector
@@ -169,8 +169,8 @@ def test_hats_do_not_bridge_cracks(cracks):
     matrix, at = cracked(n, [(row, 0, n // 2 if cracks == "half" else n - 8) for row in rows])
     places = np.stack(np.unravel_index(at.ravel(), at.shape), axis=1).astype(float)
     led = np.array([(i, j) for i in range(n) for j in (-1.0, float(n))])
-    ground = linear_solver.Ground(1, places, led)
-    solver = linear_solver.linear_solver(matrix, "multigrid", symmetric=True, ground=ground)
+    coordinates = linear_solver.Coordinates(1, places, led)
+    solver = linear_solver.linear_solver(matrix, "multigrid", coordinates=coordinates)
     b = np.random.default_rng(0).normal(size=n * n)
     x = solver.solve(b, 1e-8)
     assert np.linalg.norm(b - matrix @ x) <= 1e-7 * np.linalg.norm(b)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.equilibrium import sparse as linear
-from pbdkit.equilibrium.sparse import Ground, linear_solver
+from pbdkit.equilibrium import linear_solver as linear
+from pbdkit.equilibrium.linear_solver import Coordinates, linear_solver
 from pbdkit.progress import StoppedError, Watch
 
 sparse = pytest.importorskip("scipy.sparse")
@@ -33,20 +33,20 @@ def solver_of(matrix, method="auto", shape=(40, 20), **more):
     """With the unknowns on a sheet of that shape, held all round."""
     place = np.stack(np.unravel_index(np.arange(matrix.shape[0]), shape), axis=1).astype(float)
     around = np.array([(i, j) for i in (-1, shape[0]) for j in range(shape[1])], float)
-    ground = Ground(1, place, around)
-    return linear_solver(
-        matrix, method, symmetric=linear.is_symmetric(matrix), ground=ground, **more
-    )
+    coordinates = Coordinates(1, place, around)
+    return linear_solver(matrix, method, coordinates=coordinates, **more)
 
 
 def test_the_method_follows_size_and_symmetry(monkeypatch):
     monkeypatch.setattr(linear, "LARGEST_LU", 700)
     small, medium, large = averaging(10, 20), averaging(30, 20), averaging(40, 20)
     assert isinstance(solver_of(small), linear.Dense)
-    assert isinstance(solver_of(medium), linear.SparseLU)
+    assert isinstance(solver_of(medium, shape=(30, 20)), linear.BandLU)
+    assert isinstance(linear_solver(medium, "lu"), linear.SparseLU)
     assert solver_of(large).name == "multigrid, conjugate-gradients"
     assert solver_of(averaging(40, 20, 0.3)).name == "multigrid, gmres"
     assert solver_of(averaging(40, 20, 0.3), "conjugate-gradients").name == "gmres"
+    monkeypatch.setattr(linear, "WIDEST_BAND", 19)
     assert isinstance(solver_of(large, "lu"), linear.SparseLU)
 
 
@@ -59,6 +59,25 @@ def test_every_method_solves(method, upwind):
     assert np.linalg.norm(b - matrix @ solver.solve(b, 1e-9)) <= 2e-9 * np.linalg.norm(b)
     assert not solver.solve(np.zeros_like(b), 1e-9).any()
     assert (solver.iterations > 0) == (method != "lu")
+
+
+@pytest.mark.parametrize("shape", [(40, 20), (20, 40)])
+def test_bands_run_across_the_shorter_side_and_solve_as_sparse_factors_do(shape):
+    matrix = averaging(*shape, 0.3)
+    band, other = solver_of(matrix, shape=shape), linear_solver(matrix, "lu")
+    assert band._half == 20
+    b = np.random.default_rng(3).normal(size=800)
+    np.testing.assert_allclose(band.solve(b, 0.0), other.solve(b, 0.0), rtol=1e-11)
+    np.testing.assert_allclose(
+        band.solve_transposed(b, 0.0), other.solve_transposed(b, 0.0), rtol=1e-11
+    )
+
+
+def test_a_singular_band_is_refused():
+    matrix = averaging(40, 20).tolil()
+    matrix[7] = 0.0
+    with pytest.raises(np.linalg.LinAlgError, match="zero"):
+        solver_of(matrix.tocsr())
 
 
 def test_a_cycle_of_the_grids_is_symmetric_and_contracts():

@@ -10,8 +10,8 @@ from finite_elements.problems import HEXAGONAL_BAR
 from scipy import sparse
 
 import pbdkit
-from pbdkit.equilibrium import sparse as linear
-from pbdkit.equilibrium.amg import FEWEST, dissected
+from pbdkit.equilibrium import linear_solver as linear
+from pbdkit.equilibrium.linear_solver import FEWEST, dissected
 from pbdkit.lattice import fill as cut_cells
 from pbdkit.linear.operator import step_operator
 from pbdkit.linear.stencil import derivative
@@ -75,7 +75,9 @@ def test_dissected_factors_solve_both_ways_and_fill_in_less(shift):
     both = sparse.csr_array(sparse.eye_array(operator.now.shape[0]) - operator.now)
     places = scene.raster.reference(operator.followers) + shift
     plain = linear.SparseLU(both, symmetric=False)
-    found = linear.SparseLU(both, symmetric=False, ground=linear.Ground(2, places, places[:0]))
+    found = linear.SparseLU(
+        both, symmetric=False, coordinates=linear.Coordinates(2, places, places[:0])
+    )
     assert found._factors.nnz < 0.7 * plain._factors.nnz
     b = np.random.default_rng(0).normal(size=2 * len(places))
     for x, of in ((found.solve(b, 0.0), both), (found.solve_transposed(b, 0.0), both.T)):
