@@ -29,7 +29,9 @@ Floats = NDArray[np.float64]
 Present = NDArray[np.bool_]
 Answer = Callable[[Contributions, Here], Any]
 AT_ONCE = 8192
-"""So many places are asked together, so that temporaries stay small."""
+"""Number of places that are evaluated together, so that temporaries stay small."""
+FEW = 200
+"""Number of places up to which each is evaluated: to find equal ones takes longer."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def respond(
     same = not scene.experiment.rule.uses_reference and not _differ(scene, state)
     at_rest = not state.u.any()
     with blaming(scene.experiment.rule, "when linearised"):
-        if same and at_rest:
+        if same and at_rest and len(place) > FEW:
             kinds, place = _alike(scene, state, sublattice, place)
         parts = []
         for some in np.split(place, range(AT_ONCE, len(place), AT_ONCE)):
