@@ -1,8 +1,9 @@
-"""Where the steps converge to, without making them, and how far from there a state can be.
+"""Equilibria of a scene: the states in which no follower moves.
 
-Linear rules whose bonds break: settling, breaking and settling again in one compiled call.
-
-Linear systems on the stencils of a lattice: multigrid, compiled, without a matrix.
+`solve` steps through the load and lets bonds break, `newton` finds one equilibrium, `certificate`
+bounds its error. The linear systems are matrices (`sparse`, `linear_solver`, `amg`) or stencils on
+the lattice (`lattice_system`, `stencil_matrix`, `krylov`, `multigrid`, `grid_kernels`); `contact`
+adds obstacles. `breaking_kernel` settles linear rules whose bonds break in one compiled call.
 """
 
 from __future__ import annotations

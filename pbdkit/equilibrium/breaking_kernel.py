@@ -1,22 +1,13 @@
-"""The matrix of small and middle bodies as a band, and its factors: loops for kernels.
+"""Equilibria of linear rules whose bonds break, in one compiled call an increment or several.
 
-A c = r with A = 1 - (step operator), an unknown a follower and axis; or, where all axes move alike
-and each by itself, an unknown a follower, for all axes at a time: `wide` is how many unknowns a
-follower has. Row i of a band holds A[i, i - half] to A[i, i + half]. Factors are L with ones on
-the diagonal and U, without exchanges, in its place. A row depends on those before it alone:
-where rows change, those before the first of them stay as they are, to the bit.
-
-Whether a kernel of its own settles a scene whose bonds break.
-
-Who moves whom in a scene, as long as the roles stay: followers in an order in which those that
-move each other are near, and the frame put in terms of the body.
-
-Writes the kernel that settles a scene, renews and breaks its bonds, and settles again.
-
-Of the matrix only the rows of particles whose bonds have changed are found anew, from the moves
-that a nudge of each neighbour by 1 makes at rest: exact for linear rules.
-
-Settles a scene whose bonds break, by a kernel of its own, one increment a call or some.
+The kernel settles the body, renews and breaks bonds, and settles again. The matrix is a band,
+A c = r with A = 1 - (step operator), one unknown a follower and axis; or, where all axes move alike
+and each by itself, one a follower, for all axes at a time: `wide` is the number of unknowns of a
+follower. Row i of a band holds A[i, i - half] to A[i, i + half]. Factors are L with ones on the
+diagonal and U, without exchanges, in its place. A row depends on those before it alone: where bonds
+have changed, only rows from the first of them on are assembled and factorised anew, from the moves
+that a nudge of each neighbour by 1 makes at rest, which is exact for linear rules. The general path
+needs 25 times as long (docs/decisions/0010).
 """
 
 from __future__ import annotations

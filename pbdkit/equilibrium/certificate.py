@@ -1,7 +1,4 @@
-"""What is known of the distance between a state and its equilibrium, and where that lies.
-
-When to look whether a run has settled: often at the length of a step, rarely at the distance.
-"""
+"""A posteriori error bound of an equilibrium, and when a run of steps looks for one."""
 
 from __future__ import annotations
 
@@ -98,9 +95,6 @@ class UnconvergedError(Exception):
 
 class RoundingError(UnconvergedError):
     """A state is as near to an equilibrium as rounding allows, and the tolerance is less."""
-
-
-"""Where a search met a body that is not stable."""
 
 
 def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:

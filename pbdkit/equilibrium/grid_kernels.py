@@ -1,13 +1,8 @@
-"""How the grids of a matrix are made, each from the finer one, compiled.
+"""Compiled loops over the rows of grids: coarsening, fields of iterations, relaxation.
 
 A grid has a `code` by (row, place), the number of the stencil in `own` or -1 where nobody is free,
 and a `kind`, 0 outside, 1 free, 2 led. `halved` tells along which axes the next grid has half the
 places: its place n lies at 2n - 1, or at n.
-
-What iterations do with whole fields, (axis, row, place), compiled. Sums are given by row, for
-whoever has some of the rows to add up with those of others.
-
-What is done on one grid of a lattice: loops over its rows, compiled.
 
 Fields are planes (axis, row, place), zero where nobody is free; the outermost ring is never free. A
 row has runs of places that share the stencil `same`, from `begin` to `end`, and single places, the
@@ -15,7 +10,7 @@ lone, with stencils of their own, `own[which]`. A stencil is 3 × 3 places of 4 
 yy, row after row.
 
 Rows are relaxed in two colours, even and odd, the places of a row from the same state; sums are
-made row by row. So what comes out does not depend on how many rows are done at a time.
+made row by row, so that the result does not depend on how many rows are done at a time.
 """
 
 from __future__ import annotations

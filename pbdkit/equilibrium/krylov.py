@@ -1,7 +1,6 @@
-"""Iterations on a lattice's stencils, preconditioned by multigrid, and what their own numbers tell
-of the error.
+"""Krylov iterations on stencils, preconditioned by multigrid, with estimates of their error.
 
-The cycle is made in single precision, all else in double; no iteration is lost by that.
+The cycle runs in single precision, all else in double; no iteration is lost by that.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.kernels import kernels
 from pbdkit.equilibrium.multigrid import Grids
+from pbdkit.equilibrium.stencil_matrix import kernels
 from pbdkit.equilibrium.system import ALL, Rows
 
 Floats = NDArray[np.floating[Any]]

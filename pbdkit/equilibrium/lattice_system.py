@@ -1,18 +1,11 @@
-"""How far the places of a lattice give way to loads.
-
-Planes of a scene's raster as fields of a matrix of stencils, (axis, row, place), and back.
-
-The slowest mode of the steps, by inverse iteration: of v ← A⁻¹ v remains what fades last.
-
-The linear system of an equilibrium solved on the stencils of its lattice.
+"""The linear system of an equilibrium solved on the stencils of its lattice.
 
 The error e of a state solves K e = r. Some iterations find most of it; for the rest conjugate
 gradients know its energy, rᵀ B r / λ at most, with the cycle B and the smallest eigenvalue λ of
-B K, of which they have seen enough to estimate it. A place moves by √(g · energy) at most, g what
-it gives way to a unit load there. That is an estimate, not a proof: λ is halved, g is
-extrapolated from coarse grids.
+B K, of which they have seen enough to estimate it. A place moves by √(g · energy) at most, where g
+is its compliance, extrapolated from coarse grids. That is an estimate, not a proof: λ is halved.
 
-Whether the stencils of its lattice serve a scene, and the system that they make.
+The slowest mode of the steps follows by inverse iteration: what remains of v ← A⁻¹ v fades last.
 """
 
 from __future__ import annotations
@@ -26,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.kernels import kernels
 from pbdkit.equilibrium.krylov import (
     BiconjugateGradients,
     ConjugateGradients,
@@ -47,6 +39,7 @@ from pbdkit.equilibrium.stencil_matrix import (
     held_components,
     inverses,
     is_held,
+    kernels,
     leads_one_way,
     stencil_matrix,
     transposed,

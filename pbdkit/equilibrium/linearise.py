@@ -1,4 +1,4 @@
-"""Which system serves a scene: stencils on its lattice, or a matrix."""
+"""Choice of the linear system of a scene: stencils on its lattice, or a matrix."""
 
 from __future__ import annotations
 

@@ -1,15 +1,11 @@
-"""One grid of stencils, the coarser one that follows from it, and what a cycle does on it.
+"""Geometric multigrid on the stencils of a lattice, in one process or several.
 
-The functions of a coarser grid are bilinear hats; its stencils are what those of the finer one do
-to them (Galerkin). Where one direction is much stiffer, only that one is made coarser.
+The functions of a coarser grid are bilinear hats; its stencils are Galerkin products. Where one
+direction is much stiffer, only that one is made coarser.
 
-Multigrid on a lattice: ever coarser grids of stencils, and one V-cycle over them.
-
-Multigrid over processes: each has some rows of the finer grids, all have the coarser ones.
-
-With so many rows around its own that a cycle goes down and up without those of others: what is
-right of a field shrinks by some rows a grid. They meet once a cycle where it begins, and once where
-what is left comes together on the first grid that all have.
+Of several processes each has some rows of the finer grids, with enough rows around its own for a
+cycle to go down and up without those of others, and all have the coarser grids: they communicate
+once where a cycle begins, and once where residuals come together on the first grid that all have.
 """
 
 from __future__ import annotations
@@ -22,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.kernels import kernels
 from pbdkit.equilibrium.stencil_matrix import (
     OUTSIDE,
     OWN,
     Held,
     coarser_held,
     inverses,
+    kernels,
     with_held,
     without_held,
 )

@@ -1,6 +1,8 @@
-"""Finds the configuration at which no follower moves, leaders and bonds being what they are.
+"""Search for the equilibrium of given roles, bonds and obstacles.
 
-Finds the configuration at which no follower moves but against an obstacle.
+Linear rules need one linearisation, at rest. Others are followed from the equilibrium before by
+Newton's iteration, bodies whose bonds have just broken by pseudo-transient continuation, and bodies
+before obstacles by an active set of held particles.
 """
 
 from __future__ import annotations

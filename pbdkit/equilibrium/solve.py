@@ -1,8 +1,7 @@
-"""The finder of equilibria that a scene asks for.
+"""Load stepping: from the initial state of a scene to the equilibrium of its last step.
 
-The way of the load, cut into increments: moments, in steps, at which a body is settled.
-
-From the start of an experiment to its equilibrium: roles, leaders, and bonds that break.
+The load is cut into increments where bonds can break or rules are not linear; in each the body
+settles, bonds that are too long break, and it settles again until nothing changes.
 """
 
 from __future__ import annotations

@@ -1,27 +1,22 @@
-"""The stencil that most of a lattice has.
-
-The particles of a scene by the primitive cells of their lattice, one a place.
-
-The matrix of an equilibrium as stencils on the primitive cells of a lattice.
+"""The stiffness of an equilibrium as stencils on the primitive cells of a lattice.
 
 K = -∂force/∂u, or -∂move/∂u, of the followers: most have the same stencil, of 3 × 3 places with a
-2 × 2 matrix each; it is kept once. What frame points show is what their body particles do.
-
-Components of particles that lead along one axis, among the stencils of a matrix: nothing moves
-them, and they move nobody.
-
-What a matrix of stencils is: symmetric, perhaps once rows are multiplied; held by leaders.
+2 × 2 matrix each, which is kept once. Frame points are replaced by the body particles that they
+follow. Components of particles that lead along one axis are constrained: nothing moves them, and
+they move nobody. Rows are scaled where that makes K symmetric.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.equilibrium.kernels import kernels
 from pbdkit.equilibrium.system import ALL, Moves, Rows, outside
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.response import Response, by_sublattice, respond
@@ -40,6 +35,16 @@ CANDIDATES = 16
 """Stencils among which it is chosen, each process's most frequent."""
 SAME = 1e-12
 """Relative difference below which two stencils count as one."""
+
+
+@cache
+def kernels() -> SimpleNamespace:
+    """Return the compiled functions of grid_kernels.py, loaded when first used."""
+    # Only here: numba is the extra `fast`, and equilibria are found without it too.
+    from pbdkit.stepping.numba_engine.cache import load_kernel
+
+    source = files("pbdkit.equilibrium").joinpath("grid_kernels.py").read_text(encoding="utf-8")
+    return SimpleNamespace(**load_kernel(source, {}, ()).__globals__)
 
 
 def most_first(

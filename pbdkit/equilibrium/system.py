@@ -1,17 +1,10 @@
-"""The moves of a scene's followers at a state, as the rule makes them.
+"""The linear system of an equilibrium, A c = move with A = 1 - (step operator), and its parts.
 
-The rows of a grid that a process has, and those of the next grid that follow from them.
-
-The rows of a lattice that a process has in the search for an equilibrium, and what several
-processes tell each other of theirs.
-
-Fields are (…, row, place). A process has some rows of its own, and around them a halo of others'.
-What is asked of the whole lattice is put together from own rows, in their order, so that the
-answer is the same in all processes, and that of one alone.
-
-The linear system of an equilibrium, A c = move with A = 1 - (step operator), and who solves it.
-
-Moves and displacements are planes, (axis, sublattice, cell, cell), as in a state.
+`Moves` evaluates the right side by the rule, `System` is the interface of the solvers. `Rows` are
+the rows of the lattice that a process has, and the collective operations among the processes that
+share one; fields are (…, row, place), and what concerns the whole lattice is summed row by row, so
+that it is the same for any number of processes. Moves and displacements are planes, (axis,
+sublattice, cell, cell), as in a state.
 """
 
 from __future__ import annotations

@@ -327,7 +327,7 @@ def test_a_rough_derivative_is_as_accurate_as_asked():
 
 def test_sensitivities_have_no_kernel_compiled_anew():
     pytest.importorskip("numba")
-    from pbdkit.equilibrium.kernels import kernels
+    from pbdkit.equilibrium.stencil_matrix import kernels
 
     resting = Resting.of(pbdkit.Experiment(**WIDE))
     resting.gradient(np.ones_like(resting.state.u), [Parameter("rule.poisson_ratio")])
