@@ -14,9 +14,9 @@ from pbdkit.plugin.registry import Registry
 
 def samples(count, **more):
     """Settings for a test that draws so many scenes where the profile draws 100, otherwise in
-    proportion, but at least three."""
+    proportion, but at least two."""
     return settings(
-        max_examples=max(3, count * settings().max_examples // 100),
+        max_examples=max(2, count * settings().max_examples // 100),
         deadline=None,
         suppress_health_check=list(HealthCheck),
         **more,

@@ -9,6 +9,7 @@ import pytest
 from property_cases import (
     HOLD_LEFT,
     LATTICES,
+    all_pairs,
     displace,
     displacements,
     experiment,
@@ -43,9 +44,10 @@ def stretched(lattice, neighbours, stretch):
     return parts, raster.body_rows, expected, leaders
 
 
-@pytest.mark.parametrize("lattice", LATTICES)
-@pytest.mark.parametrize("neighbours", ["coordination-1", "chebyshev-1"])
-@pytest.mark.parametrize("rule", ["barycentre", "mean-displacement"])
+@pytest.mark.parametrize(
+    ("lattice", "neighbours", "rule"),
+    all_pairs(LATTICES, ["coordination-1", "chebyshev-1"], ["barycentre", "mean-displacement"]),
+)
 def test_affine_leaders_all_round_make_an_affine_interior(lattice, neighbours, rule):
     parts = {"lattice": lattice, "neighbours": neighbours, "rule": rule}
     scene = scene_of(7, 7, **parts)

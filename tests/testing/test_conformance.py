@@ -27,7 +27,7 @@ ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
 NEAREST = {"neighbours": [NEIGHBOURS["coordination-1"], NEIGHBOURS["chebyshev-1"]]}
 
 test_built_in_components_conform = conformance(*FIRST)
-test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO)
+test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO, **NEAREST)
 OF_THEIR_OWN = [full_name(e) for e in FIRST if isinstance(e, (FollowerRule, FractureModel))]
 
 

@@ -135,6 +135,8 @@ COMPONENTS = {
     },
     "noise": {"initial": {"type": "noise", "amplitude": 0.1}},
     **{f"natural frame, {name}": parts for name, parts in CUT.items()},
+    "strength by bond in cut cells": CUT["square"]
+    | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
     "disc": {"body": {"type": "disc", "radius": 4.0, "centre": [3.0, 3.0]}, "leaders": []},
     "strength by bond": {"fracture": SCATTERED},
     "strength by bond, no frame": {"fracture": SCATTERED, "frame": {"type": "none"}},
@@ -180,8 +182,6 @@ COMPILED = {
         "frame": Turning(),
         "fracture": TORN | {"placement": 1.0},
     },
-    "strength by bond in cut cells": CUT["square"]
-    | {"fracture": SCATTERED, "initial": {"type": "noise", "amplitude": 0.3}},
     "damage, numbers of particles, frame spared": {
         "rule": Tiring(spread=0.1),
         "fracture": DAMAGE | {"scatter": 0.3, "frame_bonds": False},
@@ -194,7 +194,8 @@ COMPILED = {
     "found anew, numbers of particles": {"neighbours": ANEW, "rule": Tiring(spread=0.1)},
 }
 """Each kind of code that kernels are made of, several together in each; one rule that moves by
-another is compiled for threads, below, single precision in `components/test_fracture`, and the
+another is compiled for threads, below, cells that soften in
+`components/test_fracture_cohesive`, single precision in `components/test_fracture`, and the
 built-in functions in `testing/test_conformance`."""
 
 

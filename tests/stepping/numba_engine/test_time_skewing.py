@@ -212,8 +212,7 @@ def test_where_moving_leaders_go_is_known_for_many_steps(monkeypatch):
     assert counts == [9, 31]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_compiled_in_the_sizes_that_were_measured(threads, monkeypatch):
+def test_compiled_in_the_sizes_that_were_measured(monkeypatch):
     for module in (bands, passes):
         monkeypatch.setattr(module, "CACHE", 2**20)
     experiment = sheet(
@@ -223,7 +222,7 @@ def test_compiled_in_the_sizes_that_were_measured(threads, monkeypatch):
         solver=SWUNG,
     )
     scene = build_scene(pbdkit.Experiment(**experiment))
-    engine = CompiledStepper(scene, threads)
+    engine = CompiledStepper(scene, 2)
     assert engine._arrays["sizes"][0] == bands.DEEP
     assert_bitwise_equal(scene, engine, calls=(1, 2, 37, 16))
 
