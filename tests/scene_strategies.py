@@ -23,6 +23,12 @@ def samples(count, **more):
     )
 
 
+def in_turn(values, every, first=0):
+    """One in so many of the values of a parametrised test; all of them in the profile `long`."""
+    values = list(values)
+    return values if settings().max_examples > 100 else values[first::every]
+
+
 DIAGNOSTICS = [{"type": t} for t in ("pe1", "pe1-intact", "pe2", "displacement", "broken")]
 
 one_of = st.sampled_from

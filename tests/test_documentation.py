@@ -182,6 +182,7 @@ SHELL = [
 ELSEWHERE = {
     "python3 -m venv .venv": "`.ci/run` runs both of the README",
     "bash .ci/run": "it runs this test",
+    "bash .ci/nightly": "what takes too long for every change",
     "pytest": "this is a test; sessions of nox run those of plugins",
     "ruff": "the session `lint` of nox",
     "mypy": "the session `lint` of nox",

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 from property_cases import body_of
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.equilibrium.solve import equilibrium_state
@@ -21,10 +22,11 @@ from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
 MASSES = {"modelling/mass-on-a-bar"}
-BARE = [n for n in shipped_names() if not pbdkit.load(n).obstacles and n not in MASSES]
+SHIPPED = {name: pbdkit.load(name) for name in shipped_names()}
+BARE = [n for n, given in SHIPPED.items() if not given.obstacles and n not in MASSES]
 """Of obstacles `check` says nothing, and masses have no place at which they rest beforehand."""
-TORN = [n for n in BARE if pbdkit.load(n).fracture.type != "none"]
-STEPS = [n for n in TORN if pbdkit.load(n).solver.makes_steps and n != "modelling/ageing"]
+TORN = [n for n in BARE if SHIPPED[n].fracture.type != "none"]
+STEPS = [n for n in TORN if SHIPPED[n].solver.makes_steps and n != "modelling/ageing"]
 """A bar that has aged is in two halves at once, of which nothing holds one against sliding."""
 STEPPED = "solver={type: stepping, relaxation: 0.2, memory: 0.8}"
 SWINGING = "solver={type: stepping, memory: 0.9}"
@@ -83,7 +85,7 @@ def shaken(scene, state):
     return state
 
 
-@pytest.mark.parametrize("name", BARE)
+@pytest.mark.parametrize("name", in_turn(BARE, 2))
 def test_runs_settle_in_the_steps_that_check_says(call, name):
     """With bonds that hold: torn bodies have another operator, see below."""
     whole = ["fracture={type: none}"] if name in TORN else []
@@ -113,7 +115,7 @@ def test_runs_settle_in_the_steps_that_check_says(call, name):
     assert abs(math.log(excess)) < 0.05 * math.log(1e3)
 
 
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("name", in_turn(STEPS, 2))
 def test_torn_bodies_stay_stable_and_settle_more_slowly_than_whole_ones(call, name):
     """check speaks of the whole body, and says so; the operator of the torn one has the rate.
 

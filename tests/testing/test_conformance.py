@@ -27,7 +27,7 @@ ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
 NEAREST = {"neighbours": [NEIGHBOURS["coordination-1"], NEIGHBOURS["chebyshev-1"]]}
 
 test_built_in_components_conform = conformance(*FIRST)
-test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO, **NEAREST)
+test_their_further_examples_conform = conformance(*FURTHER, **ONE_SITE_AND_TWO)
 OF_THEIR_OWN = [full_name(e) for e in FIRST if isinstance(e, (FollowerRule, FractureModel))]
 
 
@@ -173,7 +173,7 @@ def test_the_faulty_ones_are_sound_but_for_their_fault(component):
     ("faulty", "name", "words"), FAULTS, ids=lambda v: getattr(v, "__name__", "")
 )
 def test_every_fault_is_found_and_named(faulty, name, words):
-    report = examine(made(faulty), **ONE_SITE_AND_TWO, **NEAREST)
+    report = examine(made(faulty), **ONE_SITE_AND_TWO)
     assert [outcome.property for outcome in report.failed] == [name], str(report)
     assert words in report.failed[0].reason
 

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from browser import until, until_page
+from scene_strategies import in_turn
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -106,7 +107,7 @@ def something(session, dice):
         do(session, do="rewind", step=dice.randrange(session.end + 1))
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", in_turn(shipped_names(), 3))
 def test_what_is_saved_repeats_what_was_seen_bit_for_bit(name, tmp_path):
     session, said = session_of(name, tmp_path, CHANGED.get(name, ()))
     at_random(session, name, 40 if session.camera.rows.size < 300 else 8)
