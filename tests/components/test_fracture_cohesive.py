@@ -255,21 +255,19 @@ TORN = {
 }
 
 
-@pytest.mark.parametrize(
-    ("lattice", "rule", "threads"), [("square", ELASTIC, 1), ("hexagonal", SPRINGS, 2)]
-)
-def test_kernels_soften_as_numpy_does(lattice, rule, threads):
+def test_kernels_soften_as_numpy_does():
+    """One kernel, which takes a minute to compile."""
     pytest.importorskip("numba")
     fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01}
     found, known = (
         pbdkit.run(
             body(
-                1.0, rule, lattice, fracture=fracture, **TORN,
+                1.0, ELASTIC, "square", fracture=fracture, **TORN,
                 solver={"type": "stepping", "engine": engine, "relaxation": 0.6} | more,
             ),
             progress=False,
         )
-        for engine, more in (("compiled", {"threads": threads}), ("numpy", {}))
+        for engine, more in (("compiled", {"threads": 1}), ("numpy", {}))
     )  # fmt: skip
     damage = known.damage_left.values[-1]
     assert ((damage > 0.0) & (damage < 1.0)).sum() > 3

@@ -79,6 +79,7 @@ def test_kernels_cut_as_numpy_does(precision):
     pulled = [moved("bottom", -0.9), moved("top", 0.9)]
     parts = {"cuts": [*cut(20), CUT | {"to": [5.0, 3.5], "at": 26}], "leaders": pulled}
     parts["fracture"] = {"type": "strain", "failure": 0.25}
+    parts |= {"rule": {"type": "barycentre"}, "frame": {"type": "mean"}}
     with nullcontext() if precision == "float64" else interpreting():
         found = run(**parts, solver={"type": "stepping"} | some)
     known = run(**parts, solver={"type": "stepping", "precision": precision, "engine": "numpy"})
