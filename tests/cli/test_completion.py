@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.cli import program
@@ -64,7 +65,7 @@ def test_settings(offered: Offered, words: list[str], expected: list[str]) -> No
     assert offered(*words) == expected
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", in_turn(shipped_names(), 3))
 def test_every_path_that_is_offered_can_be_set(name: str) -> None:
     source, defaults = read_experiment(name), pbdkit.Experiment.defaults()
     schema = experiment_schema(Registry(), installed=False)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.fitting.schema import fit_schema
@@ -33,7 +34,7 @@ def test_committed_schema_is_current(name, schema):
     jsonschema.Draft202012Validator.check_schema(schema)
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", in_turn(shipped_names(), 2))
 def test_shipped_experiments_and_their_datasets_are_described(name):
     of_experiment.validate(read_experiment(name).data)
     uncut = ["cuts=[]"] if "cuts" in read_experiment(name).data else []  # they come later

@@ -12,6 +12,7 @@ from faulty import directions, others, remembering, rules
 from faulty.kagome import Kagome, OnKagome
 from interpreted_kernels import interpreting
 from pydantic import Field
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.components import pbdkit_components
@@ -22,7 +23,7 @@ from pbdkit.testing.subject import LATTICES, NEIGHBOURS, full_name
 
 BUILT_IN = [(e, n) for c in pbdkit_components() for n, e in enumerate(examples_of(c))]
 FIRST = [example for example, n in BUILT_IN if n == 0]
-FURTHER = [example for example, n in BUILT_IN if n > 0]
+FURTHER = in_turn([example for example, n in BUILT_IN if n > 0], 3)
 ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
 NEAREST = {"neighbours": [NEIGHBOURS["coordination-1"], NEIGHBOURS["chebyshev-1"]]}
 
