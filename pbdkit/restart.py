@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.checkpoint import (
     Arrays,
@@ -35,7 +36,7 @@ from pbdkit.model.shipped import read_experiment
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Driver, Processes, Report, Run, record
+from pbdkit.simulation import Driver, Execution, Report, Run, record
 from pbdkit.stability.relaxation import with_solver
 from pbdkit.stepping.state import State
 
@@ -46,20 +47,20 @@ def take_up(
     driver: Driver,
     recorder: Recorder,
     standing: Standing | None,
-    processes: Processes,
+    communicator: Communicator,
     recorded: int | None = None,
 ) -> None:
     """Lets a run that has not begun go on from a standing that the first process has; `recorded` is
     the last step recorded, where that is another one than was kept. Raises StorageError for the
     standing of another scene."""
     own, parts = driver.standing(), dict[str, Any]()
-    with processes.agreeing():
+    with communicator.raise_together():
         if standing:
             parts = _parts(driver.scene, own, standing)
             _refuse_unfit(driver.scene, own["state"], parts)
             if recorded is not None:
                 parts["kept"] = parts["seen"].recorded = recorded
-    recorder.seen = processes.told(parts.get("seen"))
+    recorder.seen = communicator.bcast(parts.get("seen"))
     driver.take_up(parts)
 
 
@@ -321,21 +322,21 @@ def resumption(
     *,
     steps: int | None = None,
     anyway: bool = False,
-    processes: Processes | None = None,
+    execution: Execution | None = None,
 ) -> Resumption | None:
     """The unfinished run of an output, or its result to be continued to so many steps; None where
-    all was done but to give the result its name, which it has now. Several `processes` share what
-    is left, however many have begun it.
+    all was done but to give the result its name, which it has now. With the `execution`
+    of several processes they share what is left, however many have begun it.
 
     Raises ExperimentError where there is nothing to go on with, and, unless told to go on `anyway`,
     where the experiment, pbdkit or a plugin changed since; StorageError for what is damaged.
     """
-    together = processes or Processes()
-    with together.agreeing():
-        unfinished = together.first and _is_unfinished(output, steps)
-    if together.told(unfinished):
-        return _unfinished(output, watch, steps, anyway, together)
-    return _continued(output, watch, steps or 0, anyway, together)
+    execution = execution or Execution()
+    with execution.communicator.raise_together():
+        unfinished = execution.communicator.is_root and _is_unfinished(output, steps)
+    if execution.communicator.bcast(unfinished):
+        return _unfinished(output, watch, steps, anyway, execution)
+    return _continued(output, watch, steps or 0, anyway, execution)
 
 
 def _is_unfinished(output: Path, steps: int | None) -> bool:
@@ -362,37 +363,38 @@ def _damage_named(output: Path) -> Iterator[None]:
 
 
 def _unfinished(
-    output: Path, watch: Watch, steps: int | None, anyway: bool, together: Processes
+    output: Path, watch: Watch, steps: int | None, anyway: bool, execution: Execution
 ) -> Resumption | None:
+    communicator = execution.communicator
     left: UnfinishedRun | None = None
     standing, source, origin = None, None, dict[str, Any]()
     chosen, is_same = tuple[str, ...](), True
     try:
-        with together.agreeing():
-            if together.first:
+        with communicator.raise_together():
+            if communicator.is_root:
                 left = UnfinishedRun.open(output, writing=True, anyway=anyway)
                 source, origin = asked(left, output, steps, anyway)
                 chosen = chosen_parameters(left.facts)
                 is_same = steps in (None, left.about.get("steps"))
-        source, origin, chosen, is_same = together.told((source, origin, chosen, is_same))
+        source, origin, chosen, is_same = communicator.bcast((source, origin, chosen, is_same))
         sink = NetcdfSink(output, replace=origin.get("replace") is True, origin=origin)
-        with together.agreeing(), _damage_named(output):
+        with communicator.raise_together(), _damage_named(output):
             if left and source is None:
                 sink.conclude(left)
             elif left:
-                standing = left.standing(on_disk=together.size > 1)
+                standing = left.standing(on_disk=communicator.size > 1)
         if source is None:
             return None
         experiment = Experiment.build(source)
-        scene = together.scene(experiment)
+        scene = execution.scene(experiment)
         if not (is_same or anyway):
-            _refuse_other_weights(f"{output}: ", scene, chosen, together)
-        run = together.run(scene, watch)
+            _refuse_other_weights(f"{output}: ", scene, chosen, execution)
+        run = execution.run(scene, watch)
         run.driver.chosen = chosen
         recorder = run.recorder(run.sink(sink))
         with _damage_named(output):
-            take_up(run.driver, recorder, standing, together)
-        with together.agreeing(), _damage_named(output):
+            take_up(run.driver, recorder, standing, communicator)
+        with communicator.raise_together(), _damage_named(output):
             if left and standing:
                 columns = columns_of(run.scene)
                 sink.go_on(left, standing, columns, experiment.record.compression)
@@ -404,34 +406,35 @@ def _unfinished(
 
 
 def _continued(
-    output: Path, watch: Watch, steps: int, anyway: bool, together: Processes
+    output: Path, watch: Watch, steps: int, anyway: bool, execution: Execution
 ) -> Resumption:
     """The result stays as it is until the longer one takes its place."""
+    communicator = execution.communicator
     with ExitStack() as open_until_read:
         source, standing, dataset, chosen = None, None, None, tuple[str, ...]()
-        with together.agreeing():
-            if together.first:
+        with communicator.raise_together():
+            if communicator.is_root:
                 dataset = open_until_read.enter_context(reading(output))
-                kept = open_until_read if together.size > 1 else None
+                kept = open_until_read if communicator.size > 1 else None
                 source, standing = longer(dataset, output, steps, anyway, kept)
                 chosen = chosen_parameters(standing.facts)
-        source, chosen = together.told((source, chosen))
+        source, chosen = communicator.bcast((source, chosen))
         experiment = Experiment.build(source)
-        scene = together.scene(experiment)
+        scene = execution.scene(experiment)
         if not anyway:
-            _refuse_other_weights("", scene, chosen, together)
-        run = together.run(scene, watch)
+            _refuse_other_weights("", scene, chosen, execution)
+        run = execution.run(scene, watch)
         run.driver.chosen = chosen
         sink = NetcdfSink(output, True, experiment.record.compression)
         recorder, recorded = run.recorder(run.sink(sink)), None
         try:
             before: Iterable[Values] = ()
             if dataset is not None:
-                columns, pieced = columns_of(run.scene), together.size > 1
+                columns, pieced = columns_of(run.scene), communicator.size > 1
                 before = history(dataset, columns, experiment, pieced=pieced)
                 recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)][-1]
             recorder.begin(before)
-            take_up(run.driver, recorder, standing, together, recorded)
+            take_up(run.driver, recorder, standing, communicator, recorded)
         except BaseException:
             recorder.sink.abandon()
             raise
@@ -439,13 +442,13 @@ def _continued(
 
 
 def _refuse_other_weights(
-    place: str, scene: Scene, chosen: tuple[str, ...], together: Processes
+    place: str, scene: Scene, chosen: tuple[str, ...], execution: Execution
 ) -> None:
     """Raises ExperimentError where a run of the scene, which has another number of steps, would
     choose other numbers in place of `auto`; they follow from the roles of the last step."""
     before = scene.experiment.stepping
     auto = before.model_copy(update={f"asked_{name}": "auto" for name in chosen})
-    now = together.tuned(with_solver(scene, auto)).experiment.stepping if chosen else before
+    now = execution.tuned(with_solver(scene, auto)).experiment.stepping if chosen else before
     for name in chosen:
         old, new = getattr(before, name), getattr(now, name)
         if not math.isclose(old, new, rel_tol=SAME_WEIGHT, abs_tol=SAME_WEIGHT):

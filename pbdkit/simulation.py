@@ -7,7 +7,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.io.checkpoint import Arrays, Standing, taken_apart
 from pbdkit.io.recorder import Outcome, Recorder
@@ -512,38 +513,29 @@ def _located(scene: Scene) -> Iterator[None]:
         raise scene.experiment.located(error) from None
 
 
-class Processes:
-    """One process, which has nobody to talk to. Each call is made by all of several processes."""
+class Execution:
+    """Where runs are carried out: by one process, or, in `pbdkit.mpi.run`, by all processes of a
+    communicator, which make each call together."""
 
-    first: bool = True
-    """Whether this one speaks for all: it reads, writes and talks to the user."""
-    size: int = 1
-
-    def told(self, value: Any) -> Any:
-        """The value that the first process has."""
-        return value
-
-    def agreeing(self) -> AbstractContextManager[None]:
-        """What is raised in the block, in any process, is raised in all of them at its end."""
-        return nullcontext()
+    def __init__(self, communicator: Communicator = SERIAL) -> None:
+        self.communicator = communicator
 
     def scene(self, experiment: Experiment) -> Scene:
-        """What this one needs of an experiment's scene: here all."""
+        """Return what this process needs of an experiment's scene."""
         from pbdkit.scene.scene import build_scene
 
         return build_scene(experiment)
 
     def tuned(self, scene: Scene) -> Scene:
-        """The scene with numbers in place of `auto`."""
+        """Return the scene with numbers in place of `auto`."""
         from pbdkit.stability.relaxation import tuned
 
         return tuned(scene)
 
-    def by_first(self, work: Callable[[], int]) -> int:
-        """What the first process alone comes to."""
+    def by_root(self, work: Callable[[], int]) -> int:
+        """Return what the root alone comes to."""
         return work()
 
     def run(self, scene: Scene, watch: Watch) -> Run:
-        """The run of a scene that they make together."""
-
+        """Return the run of a scene."""
         return Run(scene, watch=watch)

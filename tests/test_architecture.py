@@ -11,6 +11,7 @@ ORDER = [
     "errors",
     "memory",
     "progress",
+    "communicator",
     "plugin",
     "untrusted_files",
     "components",

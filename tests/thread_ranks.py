@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
 
-from pbdkit.mpi.run import SharingRanks
+from pbdkit.mpi.run import DistributedExecution
 
 PATIENCE_S = 120.0
 
@@ -61,12 +61,12 @@ class Request:
         self.Wait = wait
 
 
-def on_ranks(size: int, work: Callable[[SharingRanks], Any]) -> list[Any]:
+def on_ranks(size: int, work: Callable[[DistributedExecution], Any]) -> list[Any]:
     """What the work comes to in each of so many processes; raises what the first of them raises."""
     boxes: dict[tuple[int, int], Queue[Any]] = {
         (a, b): Queue() for a in range(size) for b in range(size)
     }
     with ThreadPoolExecutor(size) as threads:
         comms = [ThreadComm(rank, size, boxes) for rank in range(size)]
-        every = [threads.submit(work, SharingRanks(comm)) for comm in comms]
+        every = [threads.submit(work, DistributedExecution(comm)) for comm in comms]
         return [one.result() for one in every]

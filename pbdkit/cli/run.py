@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.io.recorder import Outcome
     from pbdkit.progress import Watch
-    from pbdkit.simulation import Processes, Report, Run
+    from pbdkit.simulation import Execution, Report, Run
 
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -99,39 +99,39 @@ def run(
     from pbdkit.model.loading import load_experiment
     from pbdkit.mpi.launch import launched
 
-    with launched() as processes:
-        with processes.agreeing():
+    with launched() as execution:
+        with execution.communicator.raise_together():
             with folder_kept(), warnings.catch_warnings():
-                if quiet or not processes.first:
+                if quiet or not execution.communicator.is_root:
                     warnings.simplefilter("ignore", PbdkitWarning)
                 loaded = load_experiment(experiment, settings)
                 path = output or Path(loaded.name.replace("/", "-") + ".nc")
-            if processes.first:
+            if execution.communicator.is_root:
                 refuse_output(path, force=force, experiment=Path(experiment))
         given = str(Path(experiment).absolute()) if Path(experiment).is_file() else experiment
         origin = {"experiment": given, "settings": list(settings)}
-        quiet = quiet or not processes.first
+        quiet = quiet or not execution.communicator.is_root
 
-        def run_by(those: Processes, again: bool) -> int:
+        def run_by(chosen: Execution, again: bool) -> int:
             from pbdkit.io.netcdf import NetcdfSink
             from pbdkit.simulation import record
 
-            scene = those.scene(loaded)
-            with those.agreeing():
-                if those.first:
+            scene = chosen.scene(loaded)
+            with chosen.communicator.raise_together():
+                if chosen.communicator.is_root:
                     refuse_unfinished(path, force=force or again)
             file = NetcdfSink(path, force, loaded.record.compression, origin=origin)
             _warn(disk_warnings(path, scene), quiet)
             with _watched(path, quiet or as_json, file) as (stop, watch):
-                one = those.run(scene, watch)
+                one = chosen.run(scene, watch)
                 del scene  # of which each of several processes goes on with its part alone
                 _warn([*one.warnings, *([] if quiet else one.outlook())], quiet)
                 report = record(one, one.sink(file))
-            if those.first:
+            if chosen.communicator.is_root:
                 _tell(one, report, file, path, quiet, as_json)
             return _exit_status(report.outcome, stop)
 
-        return _shared(processes, quiet, run_by)
+        return _shared(execution, quiet, run_by)
 
 
 @click.command()
@@ -149,12 +149,12 @@ def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: 
     from pbdkit.mpi.launch import launched
     from pbdkit.restart import resumption
 
-    with launched() as processes:
-        quiet = quiet or not processes.first
+    with launched() as execution:
+        quiet = quiet or not execution.communicator.is_root
 
-        def resume_by(those: Processes, _: bool) -> int:
+        def resume_by(chosen: Execution, _: bool) -> int:
             with _watched(output, quiet or as_json) as (stop, watch):
-                found = resumption(output, watch, steps=steps, anyway=anyway, processes=those)
+                found = resumption(output, watch, steps=steps, anyway=anyway, execution=chosen)
                 if found is None:
                     if not quiet:
                         click.echo(f"{output}: was finished, and is whole")
@@ -162,25 +162,25 @@ def resume(output: Path, steps: int | None, anyway: bool, quiet: bool, as_json: 
                 _warn(found.run.warnings, quiet)
                 with _told_what_is_kept(output, found.sink):
                     report = found.record()
-            if those.first:
+            if chosen.communicator.is_root:
                 _tell(found.run, report, found.sink, output, quiet, as_json)
             return _exit_status(report.outcome, stop)
 
-        return _shared(processes, quiet, resume_by)
+        return _shared(execution, quiet, resume_by)
 
 
-def _shared(processes: Processes, quiet: bool, work: Callable[[Processes, bool], int]) -> int:
+def _shared(execution: Execution, quiet: bool, work: Callable[[Execution, bool], int]) -> int:
     """Done by all processes together; where they cannot share it, again by the first of them."""
     try:
-        return work(processes, False)
+        return work(execution, False)
     except NotSharedError as error:
         told = str(error).replace("; run it in one process", "; the first of them runs it alone")
         _warn([told], quiet)
-    from pbdkit.simulation import Processes
+    from pbdkit.simulation import Execution
 
     # A signal that all of them get must not end those who wait.
-    with nullcontext() if processes.first else asked_to_stop():
-        return processes.by_first(lambda: work(Processes(), True))
+    with nullcontext() if execution.communicator.is_root else asked_to_stop():
+        return execution.by_root(lambda: work(Execution(), True))
 
 
 @contextmanager

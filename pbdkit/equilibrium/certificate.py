@@ -101,7 +101,7 @@ def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
     """The largest prescribed displacement: of the leaders, or of the start; where nothing is
     prescribed but rest the largest that loads make, and without any the lattice's spacing."""
     ways = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    prescribed = rows.most(max([rows.largest(start.u), *ways]))
+    prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *ways]))
     return prescribed or _way_under_loads(scene, start, rows) or spacing_of(scene)
 
 
@@ -114,13 +114,13 @@ def _way_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
     moments = {*scene.loads.changes(steps), *bends_of(scene)} if scene.loads else ()
     pushes = [moves.at(rest, moment) for moment in sorted(moments)]
     if scene.barriers:
-        ways += [rows.largest(moves.free(rest, moment)) for moment in moments]
-    if rows.any(any(push.any() for push in pushes)):
+        ways += [rows.max_norm(moves.free(rest, moment)) for moment in moments]
+    if rows.communicator.any(any(push.any() for push in pushes)):
         with suppress(ExperimentError, StuckError), one_thread():
             system = linearised(scene, rest, steps, "auto", Watch(), rows=rows)
             for push in pushes:
                 found = solved(system, push, spacing_of(scene), rows)
-                ways.append(rows.largest(found))
+                ways.append(rows.max_norm(found))
     return max(ways)
 
 

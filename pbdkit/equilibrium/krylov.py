@@ -190,7 +190,7 @@ class BiconjugateGradients(Krylov):
             way = step * p_smooth + weight * r_smooth
             found.x += way
             r -= weight * t
-            found.jumps.append(self._rows.largest(way))
+            found.jumps.append(self._rows.max_norm(way))
             if done(found) or not weight:
                 break
             before, rho = rho, self.dot(shadow, r)

@@ -236,7 +236,7 @@ class LatticeSystem(System):
         start = best_of(self._solver, near, b)
 
         def is_near(d: Found) -> bool:
-            return d.ahead <= share * self._rows.largest(start + d.x)
+            return d.ahead <= share * self._rows.max_norm(start + d.x)
 
         found = self._found(b, is_near)
         if found.jumps and not is_near(found):
@@ -277,7 +277,7 @@ class LatticeSystem(System):
             left = SAFETY * found.ahead if found.jumps else 0.0
             if not math.isfinite(left):
                 raise StuckError
-        return left, math.sqrt(self._rows.largest((found.x * found.x).sum(axis=0)))
+        return left, math.sqrt(self._rows.max_norm((found.x * found.x).sum(axis=0)))
 
     def refuse_moving_floats(self, moves: Floats, rounding: float) -> None:
         """All is held."""
@@ -297,7 +297,7 @@ class LatticeSystem(System):
             found = self._found(self._pull(v), lambda d: d.ahead <= NEAR * d.jumps[0])
             before, v = (
                 v,
-                self._planes(found.x / (self._rows.largest(found.x) or 1.0)),
+                self._planes(found.x / (self._rows.max_norm(found.x) or 1.0)),
             )
         return self._solver.dot(*(field_of(self._matrix, each) for each in (v, before))) > 0.0
 

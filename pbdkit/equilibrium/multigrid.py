@@ -315,7 +315,7 @@ class PartedGrids(Grids):
 
     def _unknowns(self) -> int:
         own, code = self._strips[-1].own, self._levels[-1].grid.code
-        return int(2 * sum(self._rows.every(int(np.count_nonzero(code[own] >= 0)))))
+        return 2 * int(self._rows.communicator.sum(int(np.count_nonzero(code[own] >= 0))))
 
     def _joined(self) -> Grid:
         """The coarsest of the parted grids, with the rows of all."""
@@ -323,8 +323,8 @@ class PartedGrids(Grids):
         code = grid.code[own]
         used, number = np.unique(code, return_inverse=True)
         some = used > 0
-        stencils = self._rows.every(grid.stencils[used[some]])
-        before = sum(map(len, stencils[: self._rows.rank]))
+        stencils = self._rows.communicator.allgather(grid.stencils[used[some]])
+        before = sum(map(len, stencils[: self._rows.communicator.rank]))
         renumbered = np.where(some, before + np.cumsum(some), used).astype(code.dtype)
         held = None if grid.held is None else self._together(grid.held[:, own], 1)
         return Grid(
@@ -335,7 +335,7 @@ class PartedGrids(Grids):
         )
 
     def _together(self, own: Array, axis: int) -> Array:
-        return np.concatenate(self._rows.every(own), axis)
+        return np.concatenate(self._rows.communicator.allgather(own), axis)
 
     def __len__(self) -> int:
         """With those that all have."""
@@ -348,13 +348,13 @@ class PartedGrids(Grids):
     def is_definite(self) -> bool:
         """In all processes."""
         alone = self._levels[0].grid.is_definite_alone()
-        return not self._rows.any(not alone) and self.whole.is_definite()
+        return not self._rows.communicator.any(not alone) and self.whole.is_definite()
 
     def cycle(self, r: Floats, depth: int = 0) -> Floats:
         """From the finest grid; renews the halo of r. What comes out is right in own rows and in
         the one before and after them."""
         assert depth == 0
-        self._rows.meet(r)
+        self._rows.exchange_halo(r)
         given = [r, *(level.b for level in self._levels[1:])]
         for b, (level, below) in zip(given, pairwise(self._levels), strict=False):
             level.down(b, below)

@@ -195,7 +195,7 @@ class Search(ABC):
 
     def _is_rounding(self, share: float) -> bool:
         """Whether rounding by that share is what keeps the tolerance from being reached."""
-        finite = math.isfinite(self._finder.rows.largest(self._left))
+        finite = math.isfinite(self._finder.rows.max_norm(self._left))
         return (
             finite
             and not self._system.is_stuck
@@ -207,7 +207,7 @@ class Search(ABC):
             method=self._system.methods,
             iterations=self._linearisations,
             inner_iterations=self._inner + self._system.iterations,
-            residual=self._finder.rows.largest(self._left),
+            residual=self._finder.rows.max_norm(self._left),
             distance=distance,
             share=distance / self._finder.scale,
             bound=self._system.how,
@@ -216,7 +216,7 @@ class Search(ABC):
 
     def _why(self, best: float) -> str:
         finder = self._finder
-        if not math.isfinite(finder.rows.largest(self._left)):
+        if not math.isfinite(finder.rows.max_norm(self._left)):
             return "it left the finite numbers"
         if self._system.is_stuck:
             return (
@@ -238,11 +238,11 @@ class Search(ABC):
 
     def _shift(self, correction: Floats) -> None:
         self._state.u += correction
-        self._finder.rows.meet(self._state.u)
+        self._finder.rows.exchange_halo(self._state.u)
         self._left = self._moves()
 
     def _moves(self) -> Floats:
-        with self._finder.rows.agreeing():
+        with self._finder.rows.communicator.raise_together():
             return self._finder.moves.at(self._state, self._moment)
 
     def _distance(self) -> float:
@@ -259,7 +259,9 @@ class Search(ABC):
 
     def _rounding(self) -> float:
         finder, own = self._finder, self._state.u[..., self._finder.rows.own, :]
-        return self._system.amplification * finder.rows.most(finder.moves.rounding(own))
+        return self._system.amplification * finder.rows.communicator.largest(
+            finder.moves.rounding(own)
+        )
 
 
 def _reachable(share: float) -> str:
@@ -294,7 +296,7 @@ class _Linear(Search):
         """Corrects until the tolerance is reached."""
         self._linear = True
         start = self._left, self._state.u, self._state.previous
-        if self._finder.rows.any(any(planes.any() for planes in start)):
+        if self._finder.rows.communicator.any(any(planes.any() for planes in start)):
             self._correct()  # else nothing is prescribed but rest
         return self._certified()
 
@@ -410,7 +412,7 @@ class _Relaxing(Search):
 
     def _is_near(self) -> bool:
         """Whether the tolerance is reached but for motions that cost next to nothing."""
-        most, tolerance = self._finder.rows.largest(self._left), self._finder.tolerance
+        most, tolerance = self._finder.rows.max_norm(self._left), self._finder.tolerance
         if most > MUCH * NEXT_TO_NOTHING * tolerance:
             return False
         self._damping = NEXT_TO_NOTHING

@@ -75,7 +75,8 @@ def _most(own: Integers, tables: tuple[Floats, Floats], rows: Rows) -> tuple[Flo
     some = np.argsort(-counts, kind="stable")[:CANDIDATES].tolist()
     votes: dict[bytes, int] = {}
     found: dict[bytes, tuple[Floats, Floats]] = {}
-    for each in rows.every([(int(counts[n]), *(table[n] for table in tables)) for n in some]):
+    own_votes = [(int(counts[n]), *(table[n] for table in tables)) for n in some]
+    for each in rows.communicator.allgather(own_votes):
         for count, stencil, scale in each:
             key = stencil.tobytes() + scale.tobytes()
             votes[key] = votes.get(key, 0) + count
@@ -261,12 +262,12 @@ class _Assembly:
         known = material_of(self._scene.experiment.rule) is not None
         answers = ("move", "force") if known else ("move",)
         fits, every = True, by_sublattice(self._scene, self._followers)
-        with rows.agreeing():
+        with rows.communicator.raise_together():
             for s, some in every:
                 place = self._followers[some]
                 responses = respond(self._scene, self._state, s, place, answers)
                 fits = fits and self._add(place, responses)
-        if rows.any(not fits) or not rows.any(len(self._followers) > 0):
+        if rows.communicator.any(not fits) or not rows.communicator.any(len(self._followers) > 0):
             return None
         code, stencils, scale = most_first(
             self._code.reshape(self._scene.raster.shape),
@@ -362,7 +363,7 @@ Held = NDArray[np.bool_]
 def held_components(scene: Scene, step: int, rows: Rows = ALL) -> Held | None:
     """Those of a step; None where nobody is guided."""
     guided, grid = guided_at(scene.raster, scene.leading, step), PrimitiveRaster.of(scene)
-    if grid is None or not rows.any(len(guided.place) > 0):
+    if grid is None or not rows.communicator.any(len(guided.place) > 0):
         return None
     held = np.zeros((2, *grid.shape), bool)
     held.reshape(2, -1)[:, grid.places(guided.place)] = guided.led
@@ -436,8 +437,10 @@ DIGITS = 13
 
 def is_symmetric(matrix: StencilMatrix, alike: float = EXACT, rows: Rows = ALL) -> bool:
     """Up to a share of its largest entry."""
-    largest = rows.most(max(float(matrix.stencils.max()), -float(matrix.stencils.min())))
-    return rows.most(kernels().asymmetry(matrix.code, matrix.stencils)) <= alike * largest
+    own = max(float(matrix.stencils.max()), -float(matrix.stencils.min()))
+    largest = rows.communicator.largest(own)
+    asymmetry = kernels().asymmetry(matrix.code, matrix.stencils)
+    return rows.communicator.largest(asymmetry) <= alike * largest
 
 
 def balanced(
@@ -477,10 +480,10 @@ def _factors(matrix: StencilMatrix, rows: Rows) -> Floats | None:
     factor = (matrix.code == 0).astype(float)
     while True:
         left, before = kernels().balance(matrix.code, matrix.stencils, factor)
-        if not rows.any(left < before):
-            return None if rows.any(left > 0) else factor
+        if not rows.communicator.any(left < before):
+            return None if rows.communicator.any(left > 0) else factor
         told = factor.copy()
-        rows.meet(told)
+        rows.exchange_halo(told)
         np.copyto(factor, told, where=told > 0.0)
 
 
@@ -502,7 +505,7 @@ def transposed(matrix: StencilMatrix) -> StencilMatrix:
 def leads_one_way(matrix: StencilMatrix, rows: Rows = ALL) -> bool:
     """Whether one axis moves the other and not the reverse: they are better solved in turn."""
     ways = matrix.stencils[..., 1], matrix.stencils[..., 2]
-    return len({rows.any(bool(way.any())) for way in ways}) > 1
+    return len({rows.communicator.any(bool(way.any())) for way in ways}) > 1
 
 
 def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: Rows = ALL) -> bool:
@@ -512,8 +515,8 @@ def is_held(matrix: StencilMatrix, held: NDArray[np.bool_] | None = None, rows: 
     from scipy.ndimage import binary_dilation, label
 
     bonds = np.logical_or.reduce([matrix.stencils[..., e] != 0.0 for e in range(4)])
-    known = np.logical_or.reduce(rows.every(bonds.any(axis=0)))
-    if rows.any(any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist())):
+    known = np.logical_or.reduce(rows.communicator.allgather(bonds.any(axis=0)))
+    if rows.communicator.any(any(_apart(matrix, bonds, s) for s in np.flatnonzero(known).tolist())):
         return False
     pattern = (known | known[::-1]).reshape(3, 3)
     parts, count = label(matrix.kind == FREE, structure=pattern)
@@ -532,13 +535,13 @@ def _reached(parts: Any, count: int, led: Any, rows: Rows) -> bool:
         reached = np.zeros(count + 1, bool)
         reached[parts[led]] = True
         reached[0] = False
-        if not rows.any(not reached[1:].all()):
+        if not rows.communicator.any(not reached[1:].all()):
             return True
         here = reached[parts]
         there = here.copy()
-        rows.meet(there)
-        if not rows.any(bool((there > here).any())):
-            return not rows.any(bool((here < (parts > 0))[rows.own].any()))
+        rows.exchange_halo(there)
+        if not rows.communicator.any(bool((there > here).any())):
+            return not rows.communicator.any(bool((here < (parts > 0))[rows.own].any()))
         led = here | there
 
 

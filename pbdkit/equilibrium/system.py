@@ -13,7 +13,7 @@ import math
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.motions import Hold
@@ -200,13 +201,15 @@ Array = NDArray[Any]
 Floats = NDArray[np.floating[Any]]
 
 
-class Rows(ABC):
-    """Those of one process among all. Each call is made by all processes, in the same order."""
+class Rows:
+    """The rows of a grid that this process has: all of them, or, in `pbdkit.mpi.driver`, a strip
+    of those that the processes of a communicator share."""
 
     strip: Strip | None = None
     """Which rows those are; None of all."""
-    rank: int = 0
-    """How many processes have rows before them."""
+
+    def __init__(self, communicator: Communicator = SERIAL) -> None:
+        self.communicator = communicator
 
     @property
     def own(self) -> slice:
@@ -218,74 +221,38 @@ class Rows(ABC):
         """Those of its arrays with known stencils."""
         return self.strip.known if self.strip else slice(None)
 
-    @abstractmethod
-    def every(self, value: Any) -> list[Any]:
-        """The values of all processes, in the order of their rows."""
-
-    @abstractmethod
-    def agreeing(self) -> AbstractContextManager[None]:
-        """What is raised in the block, in any process, is raised in all of them at its end."""
-
-    @abstractmethod
-    def meet(self, field: Array) -> None:
-        """Renews the halo of a field, in place."""
-
-    @abstractmethod
-    def random(self, shape: tuple[int, ...]) -> Floats:
-        """A field of numbers from [-1, 1), always the same for the same lattice."""
-
-    def whole(self, numbers: Array, axis: int = -1) -> Array:
-        """Of all rows, from numbers of the rows that are here, along an axis."""
-        own = np.moveaxis(numbers, axis, 0)[self.own]
-        return np.concatenate(self.every(np.moveaxis(own, 0, axis)), axis)
-
-    def total(self, numbers: Array) -> float:
-        """The sum of one number a row."""
-        return float(self.whole(numbers).sum())
-
-    def most(self, value: float) -> float:
-        """The largest of all processes; not a number where one is none."""
-        return float(np.max(self.every(value)))
-
-    def any(self, value: bool) -> bool:
-        """Whether it is so in any process."""
-        return any(self.every(bool(value)))
-
-    def size(self, field: Array) -> int:
-        """How many numbers a field has."""
-        return sum(self.every(field[..., self.own, :].size))
-
-    def largest(self, field: Floats) -> float:
-        """Its largest magnitude; 0 of none."""
-        return self.most(float(np.abs(field[..., self.own, :]).max(initial=0.0)))
-
-    def norm(self, field: Floats) -> float:
-        """The root of the sum of squares."""
-        with np.errstate(over="ignore"):
-            each = self.every(float(np.linalg.norm(field[..., self.own, :])))
-        return math.hypot(*each)
-
-
-class AllRows(Rows):
-    """One process has all."""
-
-    def every(self, value: Any) -> list[Any]:
-        """Its own alone."""
-        return [value]
-
-    def agreeing(self) -> AbstractContextManager[None]:
-        """With itself."""
-        return nullcontext()
-
-    def meet(self, field: Array) -> None:
-        """There is no halo."""
+    def exchange_halo(self, field: Array) -> None:
+        """Update the halo of a field, in place."""
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """From one generator."""
+        """Return a field of numbers from [-1, 1), always the same for the same lattice."""
         return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
+    def whole(self, numbers: Array, axis: int = -1) -> Array:
+        """Return the numbers of all rows from those of the rows that are here, along an axis."""
+        own = np.moveaxis(numbers, axis, 0)[self.own]
+        return np.concatenate(self.communicator.allgather(np.moveaxis(own, 0, axis)), axis)
 
-ALL: Final = AllRows()
+    def total(self, numbers: Array) -> float:
+        """Return the sum of one number a row."""
+        return float(self.whole(numbers).sum())
+
+    def size(self, field: Array) -> int:
+        """Return how many numbers a field has."""
+        return int(self.communicator.sum(field[..., self.own, :].size))
+
+    def max_norm(self, field: Floats) -> float:
+        """Return the largest magnitude; 0 of none."""
+        return self.communicator.largest(float(np.abs(field[..., self.own, :]).max(initial=0.0)))
+
+    def norm(self, field: Floats) -> float:
+        """Return the root of the sum of squares."""
+        with np.errstate(over="ignore"):
+            own = float(np.linalg.norm(field[..., self.own, :]))
+        return math.hypot(*self.communicator.allgather(own))
+
+
+ALL: Final = Rows()
 
 
 @cache
@@ -404,7 +371,7 @@ def solved(system: System, moves: Floats, size: float, rows: Rows = ALL) -> Floa
     """A⁻¹ moves, taken to come to that size, to a share of what it comes to."""
     found = system.solve(moves, ACCURACY * size)
     for _ in range(TURNS):
-        most = rows.largest(found)
+        most = rows.max_norm(found)
         if most * FAR >= size:
             break
         size = most

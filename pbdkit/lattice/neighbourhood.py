@@ -353,7 +353,7 @@ def missing_segments(
     return [
         f"{field}: it crosses no bond of the body; look where it goes from and to"
         for field, segment in segments.items()
-        if not raster.others.any(
+        if not raster.communicator.any(
             any(found.any() for *_, found in crossed_bonds(raster, neighbourhood, [segment]))
         )
     ]
@@ -370,7 +370,7 @@ def body_box(raster: Raster) -> tuple[Components, Components]:
     """(lower, upper) of the body's reference configuration, from the lattice's site (0, 0)."""
     ends = (raster.ends_of_rows(s) for s in range(raster.shape[0]))
     at = [positions(raster.lattice.cell(), s, *cells) for s, cells in enumerate(ends)]
-    lower, upper = raster.others.hull(
+    lower, upper = raster.hull_of_all(
         (tuple(x.min() for x in here), tuple(x.max() for x in here)) for here in at if here[0].size
     )
     return vector(map(float, lower)), vector(map(float, upper))

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import add, lt, sub
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.plugin import Cell, Lattice, Offset, Slot
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import Index
@@ -162,47 +163,14 @@ class Stretch:
     left_out: LeftOut
 
 
-class Others:
-    """Here there is nobody: one process has all rows. Each call is made by all processes, in the
-    same order, and comes to the same in all of them."""
+@dataclass(frozen=True)
+class RowRange:
+    """The part of a lattice that one of several processes builds: a `stretch` of it, of which the
+    lines of sites in `own` are its own, and those in `framed` have frame points that it needs."""
 
-    size: int = 1
-    """How many processes there are in all."""
-    on_machine: int = 1
-    """Of which so many share the memory of this machine."""
-    stretch: Stretch | None = None
-    """What this process builds of the scene; None of all."""
-
-    def every(self, value: Any) -> list[Any]:
-        """The values of all processes, in the order of their rows."""
-        return [value]
-
-    def least(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """The smallest of all processes, place by place of arrays of one shape."""
-        return numbers
-
-    def is_own(self, lines: Indices) -> Mask:
-        """Which lines of sites are of its own rows; of each line that is so in one process."""
-        return np.ones(len(lines), bool)
-
-    def sees_frame(self, lines: Indices) -> Mask:
-        """Of which lines of sites it has to know whom frame points follow."""
-        return np.ones(len(lines), bool)
-
-    def any(self, value: Any) -> bool:
-        """Whether it is so in any process."""
-        return any(self.every(bool(value)))
-
-    def first(self, value: Any) -> Any:
-        """What the first process has that has not None; None where none has."""
-        return next((one for one in self.every(value) if one is not None), None)
-
-    def hull(self, boxes: Iterable[Box]) -> Box:
-        """The smallest and the largest number along each axis, over the boxes of all."""
-        return hull(box for own in self.every(list(boxes)) for box in own)
-
-
-ALONE: Final = Others()
+    stretch: Stretch
+    own: tuple[int, int]
+    framed: tuple[int, int]
 
 
 EMPTY, LEADER, FOLLOWER, FRAME = -1, 0, 1, 2
@@ -234,7 +202,7 @@ class Raster:
     at each place with EMPTY where no particle is (leaders count as followers here). `sites` is the
     same by site index (i, j) from `low` on; its particles, i then j, are the rows of the table in
     the order of their numbers, which count from 1 and those `before` the first row. Where it has
-    some rows of a lattice alone, `extent` tells of the whole, and `others` have the rest.
+    some rows of a lattice alone, `extent` is that of the whole, and `row_range` what is built.
     """
 
     lattice: Lattice
@@ -245,7 +213,8 @@ class Raster:
     sites: NDArray[np.int8]
     before: int = 0
     extent: Extent | None = None
-    others: Others = ALONE
+    communicator: Communicator = SERIAL
+    row_range: RowRange | None = None
 
     @cached_property
     def count(self) -> int:
@@ -270,6 +239,21 @@ class Raster:
             return self.extent.rows
         others = (0, *range(2, self.kind.ndim))
         return np.asarray(np.count_nonzero(self.kind != EMPTY, axis=others))
+
+    def is_own(self, lines: Indices) -> Mask:
+        """Return which lines of sites are this process's own; each is that of one process."""
+        low, high = self.row_range.own if self.row_range else (-NOWHERE, NOWHERE)
+        return (lines >= low) & (lines < high)
+
+    def sees_frame(self, lines: Indices) -> Mask:
+        """Return on which lines of sites this process needs to know whom frame points follow."""
+        low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
+        return (lines >= low) & (lines < high)
+
+    def hull_of_all(self, boxes: Iterable[Box]) -> Box:
+        """Return the smallest and the largest number along each axis, over the boxes of all
+        processes."""
+        return hull(box for own in self.communicator.allgather(list(boxes)) for box in own)
 
     @cached_property
     def _full(self) -> bool:
@@ -296,7 +280,7 @@ class Raster:
         """X, (end, axis), of the first and the last of them, without a table of all."""
         body = self.table_kind == FOLLOWER
         ends = self.reference(np.array([body.argmax(), len(body) - 1 - body[::-1].argmax()]))
-        every = self.others.every(ends)
+        every = self.communicator.allgather(ends)
         return np.stack([every[0][0], every[-1][1]])
 
     def chunks(self) -> Iterator[Indices]:
@@ -387,9 +371,9 @@ class Raster:
         body = np.moveaxis(self.sites == FOLLOWER, axis, 0)
         end = (body[::-1] if last else body).argmax(axis=0)
         end = self.low[axis] + (len(body) - 1 - end if last else end)
-        if axis == 0:  # others have other places on these lines
+        if axis == 0:  # other processes have other places on these lines
             far = np.where(body.any(axis=0), -end if last else end, NOWHERE)
-            far = self.others.least(far)
+            far = self.communicator.smallest(far)
             some, end = far < NOWHERE, -far if last else far
         else:
             some = body.any(axis=0)

@@ -7,15 +7,14 @@ import pickle
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from platform import node
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.communicator import Communicator
 from pbdkit.errors import PbdkitError
 from pbdkit.io.paged_file import Bytes
-from pbdkit.simulation import Processes
 
 NUMBERS_AT_ONCE = 2**20
 """So many of all processes together are compared at a time."""
@@ -25,29 +24,24 @@ FAILED = 1
 """The exit status of a run that is given up because one process failed."""
 
 
-class Ranks(Processes):
-    """The processes of a communicator, of which this one is `rank` of `size`. All but `agreeing`
-    raise nothing; each call is made by all of them, in the same order."""
+class MPICommunicator(Communicator):
+    """The processes of a communicator of mpi4py. All operations but `raise_together` and `scatter`
+    raise nothing."""
 
     def __init__(self, comm: Any) -> None:
         self._comm = comm
         self.rank, self.size = int(comm.rank), int(comm.size)
-        self.first = self.rank == 0
 
-    def told(self, value: Any) -> Any:
-        """The first process's value, to all."""
+    def bcast(self, value: Any) -> Any:
+        """Return the value of the root."""
         return self._comm.bcast(value)
 
-    def every(self, value: Any) -> list[Any]:
-        """The values of all processes, by rank, to all."""
+    def allgather(self, value: Any) -> list[Any]:
+        """Return the values of all processes, by rank."""
         return list(self._comm.allgather(value))
 
-    def most(self, value: float) -> float:
-        """The largest number of all; not a number where one is none."""
-        return float(np.max(self.every(value)))
-
-    def least(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """The smallest of all, place by place of arrays of one shape."""
+    def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the elementwise minimum over arrays of one shape."""
         flat = np.ascontiguousarray(numbers).ravel()
         found, some = np.empty_like(flat), max(1, NUMBERS_AT_ONCE // self.size)
         for at in range(0, len(flat), some):
@@ -57,14 +51,9 @@ class Ranks(Processes):
             every.min(axis=0, out=found[at : at + some])
         return found.reshape(numbers.shape)
 
-    def on_machine(self) -> int:
-        """How many processes share the machine of this one."""
-        name = node()
-        return self.every(name).count(name)
-
-    def any(self, value: bool) -> bool:
-        """Whether it is so in any process."""
-        mine, found = np.array([value], np.uint8), np.empty(self.size, np.uint8)
+    def any(self, value: Any) -> bool:
+        """Return whether the value is true in any process."""
+        mine, found = np.array([bool(value)], np.uint8), np.empty(self.size, np.uint8)
         self._comm.Allgather(mine, found)
         return bool(found.any())
 
@@ -76,11 +65,11 @@ class Ranks(Processes):
         """From one process, as many bytes as there is room for."""
         self._comm.Recv(into, rank)
 
-    def dealt(self, each: Iterable[Any] | None) -> Any:
-        """To each process what the first has for it, made one after the other. What is raised in
+    def scatter(self, each: Iterable[Any] | None) -> Any:
+        """Return what the root has for this process, made one after the other. What is raised in
         making it is raised in all."""
         own: Any = None
-        with self.agreeing():
+        with self.raise_together():
             if each is None:
                 own = self._comm.recv(source=0)
             else:
@@ -105,9 +94,9 @@ class Ranks(Processes):
             request.Wait()
 
     @contextmanager
-    def agreeing(self) -> Iterator[None]:
-        """What is raised in the block, in any process, is raised in all of them at its end: the
-        error of the lowest rank."""
+    def raise_together(self) -> Iterator[None]:
+        """Raise what the block raises in any process in all of them, at its end: the error of the
+        lowest rank."""
         error: Exception | None = None
         try:
             yield
@@ -119,14 +108,14 @@ class Ranks(Processes):
         """Raises the error of the lowest rank that has one, in all processes."""
         if not self.any(error is not None):
             return
-        errors = self.every(error and _carried(error))
+        errors = self.allgather(error and _carried(error))
         first = next(n for n, one in enumerate(errors) if one is not None)
         raised: Exception = error if first == self.rank and error else errors[first]
         raise raised
 
-    def by_first(self, work: Callable[[], int]) -> int:
-        """The others sleep meanwhile."""
-        if not self.first:
+    def by_root(self, work: Callable[[], int]) -> int:
+        """Return what the root alone comes to; the other processes sleep meanwhile."""
+        if not self.is_root:
             while not self._comm.iprobe(source=0):
                 time.sleep(PAUSE_S)
             return int(self._comm.recv(source=0))
@@ -142,13 +131,13 @@ class Ranks(Processes):
         return status
 
     @contextmanager
-    def speaking(self) -> Iterator[None]:
+    def root_speaks(self) -> Iterator[None]:
         """The first process alone says what ends the block. After what is no PbdkitError this one
         ends all processes when it ends: others would wait for it for ever."""
         try:
             yield
         except PbdkitError as error:
-            error.told = not self.first
+            error.told = not self.is_root
             raise
         except BaseException:
             atexit.register(self._comm.Abort, FAILED)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
@@ -19,7 +18,7 @@ from pbdkit.equilibrium.solve import Way
 from pbdkit.equilibrium.system import Rows, Strip, StuckError
 from pbdkit.errors import NotSharedError
 from pbdkit.model.solver import Settle
-from pbdkit.mpi.communicator import Ranks
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.partition import (
     MOST_STEPS,
     Halo,
@@ -47,7 +46,9 @@ class DividedStepper(Engine):
     """Makes as many steps at once as the halo serves for, and as no leaders begin to lead in: where
     they begin is taken from a state that is whole."""
 
-    def __init__(self, ranks: Ranks, scene: Scene, engine: Engine, halo: Halo, steps: int) -> None:
+    def __init__(
+        self, ranks: MPICommunicator, scene: Scene, engine: Engine, halo: Halo, steps: int
+    ) -> None:
         self.name, self.threads = engine.name, engine.threads
         self._ranks, self._scene, self._engine = ranks, scene, engine
         self._halo, self._steps = halo, steps
@@ -70,9 +71,9 @@ class DividedStepper(Engine):
         return state
 
 
-def whole_of(ranks: Ranks, scene: Scene) -> Scene | None:
+def whole_of(ranks: MPICommunicator, scene: Scene) -> Scene | None:
     """The scene that processes have parts of, in the first of them."""
-    if not ranks.first:
+    if not ranks.is_root:
         return None
     return build_scene(scene.experiment) if scene.raster.extent else scene
 
@@ -81,14 +82,14 @@ class Division:
     """A scene cut up among processes: this one's part, and how a state of it is put together with
     those of the others. The first process keeps the `whole` scene where somebody looks at that."""
 
-    def __init__(self, ranks: Ranks, scene: Scene, parts: list[Subdomain]) -> None:
+    def __init__(self, ranks: MPICommunicator, scene: Scene, parts: list[Subdomain]) -> None:
         self.ranks, self.count, self.subdomains = ranks, scene.raster.total, parts
         self.part = part_of(scene, self.subdomains[ranks.rank])
         self.scene, experiment = self.part.scene, scene.experiment
         self.halo = Halo(ranks, self.subdomains, self.part)
         self.whole: Scene | None = None
         measured = any(not each.local for each in experiment.diagnostics)
-        with ranks.agreeing():
+        with ranks.raise_together():
             if measured or experiment.stepping.settle:
                 self.whole = self.whole_of(scene)
 
@@ -106,22 +107,22 @@ class Division:
             if not at_rest:
                 self.halo.renew(state)
             return state, at_rest
-        with self.ranks.agreeing():
+        with self.ranks.raise_together():
             if found := self.whole_of(scene):
                 whole = initial_state(found)
         return self.dealt(whole), False
 
     def dealt(self, whole: State | None) -> State:
         """The part of a state that the first process has."""
-        members = self.ranks.every(self.halo.members)
-        if whole is None or not self.ranks.first:
+        members = self.ranks.allgather(self.halo.members)
+        if whole is None or not self.ranks.is_root:
             return self._state(None)
         axes = self.scene.axes
         parts = zip(self.subdomains, members, strict=True)
         return self._state(part_of_state(whole, axes, own, some) for own, some in parts)
 
     def _state(self, each: Iterable[State] | None) -> State:
-        found: State = self.ranks.dealt(each)
+        found: State = self.ranks.scatter(each)
         return found
 
     def gathered(self, state: State) -> State | None:
@@ -134,15 +135,15 @@ class Division:
 
     def taken_up(self, standing: Mapping[str, Any]) -> dict[str, Any]:
         """For the part, where the first process has that of the whole."""
-        rest = self.ranks.told({key: part for key, part in standing.items() if key != "state"})
-        state = self.dealt(standing.get("state") if self.ranks.first else None)
+        rest = self.ranks.bcast({key: part for key, part in standing.items() if key != "state"})
+        state = self.dealt(standing.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
         """Of the part: a thread a process, unless more are asked for."""
         if self.scene.experiment.stepping.threads == "auto":
             choice = replace(choice, threads=1)
-        with self.ranks.agreeing():
+        with self.ranks.raise_together():
             engine, choice = make_engine(self.scene, choice)
         steps = self.part.subdomain.steps
         return DividedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
@@ -151,7 +152,7 @@ class Division:
 class DividedWatch(Watch):
     """All stop where one is asked to; the first shows how far the run is."""
 
-    def __init__(self, ranks: Ranks, watch: Watch) -> None:
+    def __init__(self, ranks: MPICommunicator, watch: Watch) -> None:
         super().__init__(lambda: ranks.any(watch.stopping()), watch.show)
 
 
@@ -159,15 +160,15 @@ class DividedWatch(Watch):
 class DividedGuard(Guard):
     """Looks at all parts."""
 
-    ranks: Ranks
+    ranks: MPICommunicator
 
     def most(self, state: State) -> float:
         """The largest of all."""
-        return self.ranks.most(super().most(state))
+        return self.ranks.largest(super().most(state))
 
     def worst(self, scene: Scene, state: State) -> int:
         """That of the part with the largest, the first on ties."""
-        found = self.ranks.every((super().most(state), super().worst(scene, state)))
+        found = self.ranks.allgather((super().most(state), super().worst(scene, state)))
         return int(found[int(np.argmax([most for most, _ in found]))][1])  # NaN is largest
 
 
@@ -183,7 +184,7 @@ class DividedSettling(Settling):
     def _agree(self, found: Certificate | None) -> Certificate | None:
         """On what the first process has found."""
         own = self._settling
-        told = self._division.ranks.told(own and (found, own.pace, own.obstacle))
+        told = self._division.ranks.bcast(own and (found, own.pace, own.obstacle))
         certificate: Certificate | None = told[0]
         self.pace, self.obstacle = told[1:]
         return certificate
@@ -217,9 +218,9 @@ class DividedStepwise(Stepwise):
         )
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
-        self._engine, self.choice = division.stepper(ranks.told(choose(scene)))
+        self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
         self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
-        size = size_of(scene) + ranks.most(most_of(start))
+        size = size_of(scene) + ranks.largest(most_of(start))
         self.guard = DividedGuard(size, 0, EVERY, None if anew else start.copy(), ranks)
         self.settling, self.kept = None, -1
         if asked := scene.experiment.stepping.settle:
@@ -227,7 +228,7 @@ class DividedStepwise(Stepwise):
 
     def _steps_in(self, seconds_a_step: float) -> int:
         """As the first process finds it."""
-        return int(self._division.ranks.told(super()._steps_in(seconds_a_step)))
+        return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
     def standing(self) -> dict[str, Any]:
         """With the state of the whole, as it is joined."""
@@ -258,22 +259,14 @@ on the way down, and by 2 on the way up."""
 
 
 class DividedRows(Rows):
-    """Those of one of some ranks."""
+    """The rows of one of the processes that share a grid."""
 
-    def __init__(self, ranks: Ranks, halo: Halo, strip: Strip) -> None:
-        self._ranks, self._halo = ranks, halo
-        self.strip, self.rank = strip, ranks.rank
+    def __init__(self, ranks: MPICommunicator, halo: Halo, strip: Strip) -> None:
+        super().__init__(ranks)
+        self._halo, self.strip = halo, strip
 
-    def every(self, value: Any) -> list[Any]:
-        """By rank."""
-        return self._ranks.every(value)
-
-    def agreeing(self) -> AbstractContextManager[None]:
-        """As the ranks do."""
-        return self._ranks.agreeing()
-
-    def meet(self, field: NDArray[Any]) -> None:
-        """From other parts."""
+    def exchange_halo(self, field: NDArray[Any]) -> None:
+        """Update the halo of a field, in place, from the other parts."""
         self._halo.meet(field)
 
     def random(self, shape: tuple[int, ...]) -> Floats:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.simulation import Processes
+from pbdkit.simulation import Execution
 
 SIZES = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
 """How many processes launchers of MPI programs say in the environment that there are."""
@@ -16,7 +16,7 @@ RANK = "PMIX_RANK"
 
 
 @contextmanager
-def launched() -> Iterator[Processes]:
+def launched() -> Iterator[Execution]:
     """The processes that were started together, as by `mpiexec -n 4`, of which the first speaks;
     and this one alone where it was not.
 
@@ -25,7 +25,7 @@ def launched() -> Iterator[Processes]:
     """
     size = max(int(os.environ.get(name, 1)) for name in SIZES)
     if RANK not in os.environ and size == 1:
-        yield Processes()
+        yield Execution()
         return
     refuse_without("mpi4py", "mpi", "a run on several processes needs mpi4py")
     try:
@@ -41,10 +41,10 @@ def launched() -> Iterator[Processes]:
                 f"{size} processes were started, and mpi4py finds each alone: it loads the MPI of "
                 "another launcher; start them by that one's mpiexec"
             )
-        yield Processes()
+        yield Execution()
         return
-    from pbdkit.mpi.run import SharingRanks
+    from pbdkit.mpi.run import DistributedExecution
 
-    ranks = SharingRanks(MPI.COMM_WORLD)
-    with ranks.speaking():
-        yield ranks
+    execution = DistributedExecution(MPI.COMM_WORLD)
+    with execution.communicator.root_speaks():
+        yield execution

@@ -19,24 +19,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.io.paged_file import Bytes, PiecedArray, as_bytes
 from pbdkit.lattice.cells import WeighedCells
 from pbdkit.lattice.fill import Lines, framed, window
 from pbdkit.lattice.raster import (
-    ALONE,
     EMPTY,
     FOLLOWER,
     FRAME,
     Extent,
     LeftOut,
     Mask,
-    Others,
     Raster,
     Stretch,
     hull,
 )
-from pbdkit.mpi.communicator import Ranks
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.lattice import Index
 from pbdkit.scene.constants import SceneConstants
@@ -61,22 +60,24 @@ class Share:
         self.nbytes = part.nbytes
         self._part, self._axis = part, axis
 
-    def send(self, ranks: Ranks) -> None:
+    def send(self, ranks: MPICommunicator) -> None:
         """To the first process."""
         for block in _blocks(self._part, self._axis):
             ranks.send(block, 0)
 
 
-def joined(ranks: Ranks, part: Array, axis: int, lengths: Sequence[int]) -> Any:
+def joined(ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]) -> Any:
     """An array of which each process has a part, so many long along an axis, in the order of ranks:
     in the first process a PiecedArray, in the others their share of it."""
-    if not ranks.first:
+    if not ranks.is_root:
         return Share(part, axis)
     shape = (*part.shape[:axis], sum(lengths), *part.shape[axis + 1 :])
     return PiecedArray(shape, part.dtype, _received(ranks, part, axis, lengths))
 
 
-def _received(ranks: Ranks, part: Array, axis: int, lengths: Sequence[int]) -> Iterator[Array]:
+def _received(
+    ranks: MPICommunicator, part: Array, axis: int, lengths: Sequence[int]
+) -> Iterator[Array]:
     for lead in np.ndindex(part.shape[:axis]):
         yield part[lead]
         for rank, length in enumerate(lengths[1:], 1):
@@ -164,7 +165,7 @@ def reaches(scene: Scene) -> tuple[int, int]:
 
 def farthest_apart(scene: Scene) -> int:
     """How many rows at most a frame point lies apart from those whom it follows."""
-    return int(max(scene.raster.others.every(Skew(scene).axes[0].apart)))
+    return int(max(scene.raster.communicator.allgather(Skew(scene).axes[0].apart)))
 
 
 def subdomains(scene: Scene, parts: int) -> list[Subdomain]:
@@ -273,7 +274,8 @@ class _Window:
             sites=sites,
             before=raster.before + int(counts[line(seen[0])]),
             extent=Extent(raster.row_counts, before + subdomain.low),
-            others=ALONE,
+            communicator=SERIAL,
+            row_range=None,
         )
         ends = (subdomain.begin, subdomain.end)
         begin, end = (counts[line(row)] - counts[line(seen[0])] for row in ends)
@@ -378,10 +380,10 @@ def _others(sites: Array) -> Sequence[int]:
 class Halo:
     """The halo of a part: what other parts have of their own rows."""
 
-    def __init__(self, ranks: Ranks, parts: Sequence[Subdomain], part: Part) -> None:
+    def __init__(self, ranks: MPICommunicator, parts: Sequence[Subdomain], part: Part) -> None:
         self._ranks, self._part, self._axes = ranks, part, part.scene.axes
         self._parts = parts
-        sizes = ranks.every([int(ours.sum()) for ours in part.ours])
+        sizes = ranks.allgather([int(ours.sum()) for ours in part.ours])
         self._counts = list(zip(*sizes, strict=True))
         before = [sum(counts[: ranks.rank]) for counts in self._counts]
         self.members = tuple(
@@ -475,7 +477,7 @@ class Halo:
     def gathered(self, state: State) -> State | None:
         """The state of the whole, in the first process; None in the others."""
         shares = self.joined(state)
-        if self._ranks.first:
+        if self._ranks.is_root:
             starts = (None if start is None else np.asarray(start) for start in shares.starts)
             # In the order in which the others send.
             found = _each(shares, np.asarray, ())
@@ -528,7 +530,7 @@ SITES_AT_ONCE = 2**22
 
 
 @dataclass(frozen=True)
-class Survey:
+class RowCount:
     """What all processes know of a lattice: the body's box of sites, from `low` to below `high`;
     how many particles each line of sites has, frame included, from the first on that has any; how
     many indices a repeat cell has, and how many cells neighbours reach, along the first axis; the
@@ -579,16 +581,17 @@ class Survey:
         return min(max(line, self._start), self._start + len(self.lines))
 
 
-def survey(ground: Ground, others: Others, rank: int) -> Survey | None:
-    """Of a body, and of its frame; None where there is no body. Each process looks at as many lines
-    as the others."""
+def count_rows(ground: Ground, communicator: Communicator) -> RowCount | None:
+    """Count the particles of a body and its frame in each row; None where there is no body. Each
+    process counts on an equal number of lines."""
+    rank = communicator.rank
     lattice, layers = ground.experiment.lattice, ground.layers
     (first, *_), (last, *_) = low, high = window(ground.experiment.body, lattice)
     spill = layers + ground.spill
-    cuts = np.linspace(first - spill, last + 1 + spill, others.size + 1).astype(int).tolist()
+    cuts = np.linspace(first - spill, last + 1 + spill, communicator.size + 1).astype(int).tolist()
     across = math.prod(b - a + 1 for a, b in zip(low[1:], high[1:], strict=True))
     found = [_counted(ground, some) for some in _bands(cuts[rank : rank + 2], across)]
-    every = [one for own in others.every(found) for one in own]
+    every = [one for own in communicator.allgather(found) for one in own]
     boxes = [box for box, _, _ in every if box]
     if not boxes:
         return None
@@ -599,7 +602,7 @@ def survey(ground: Ground, others: Others, rank: int) -> Survey | None:
     lines = lines[begin : high[0] + layers - cuts[0]]
     period = ground.cell.period[0]
     reach = ground.neighbourhood.reach_in_cells[0]
-    return Survey(low, high, lines, period, reach, layers, left_out)
+    return RowCount(low, high, lines, period, reach, layers, left_out)
 
 
 def _bands(lines: list[int], across: int) -> Iterator[Lines]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.io.checkpoint import Standing
 from pbdkit.io.layout import Column, Values, When, when_measured
@@ -19,11 +20,11 @@ from pbdkit.io.paged_file import PiecedArray
 from pbdkit.io.recorder import Measured, Recorder, columns_of
 from pbdkit.io.sinks import KeepingSink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
-from pbdkit.lattice.raster import Floats, Mask, Others, Stretch
+from pbdkit.lattice.raster import Floats, RowRange, Stretch
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
-from pbdkit.mpi.communicator import Ranks
+from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.driver import (
     DividedStepwise,
     DividedStraight,
@@ -36,18 +37,17 @@ from pbdkit.mpi.partition import (
     Share,
     Subdomain,
     bounds_of,
+    count_rows,
     joined,
     subdomains,
-    survey,
     widest_halo,
 )
 from pbdkit.plugin import AppliesTwice, Cell, Diagnostic, FollowerRule
 from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.frame import Indices
 from pbdkit.progress import Watch
 from pbdkit.scene.memory_estimate import TooLargeError
 from pbdkit.scene.scene import Ground, Scene, build_scene
-from pbdkit.simulation import Driver, Run
+from pbdkit.simulation import Driver, Execution, Run
 from pbdkit.stability.forecast import prediction, quick_warnings
 from pbdkit.stability.relaxation import tuned, with_solver
 from pbdkit.stepping.state import State
@@ -72,62 +72,49 @@ class ElsewhereError(PbdkitError):
     """Another process has given up."""
 
 
-class OtherRanks(Others):
-    """The other processes. Where one gives up, all others do at their next call."""
+class BuildCommunicator(Communicator):
+    """The communicator while a scene is built: where one process gives up, all others do at their
+    next call."""
 
-    def __init__(self, ranks: Ranks) -> None:
-        self._ranks, self.size, self.on_machine = ranks, ranks.size, ranks.on_machine()
-        self._own = self._framed = 0, 0
+    def __init__(self, communicator: MPICommunicator) -> None:
+        self._inner = communicator
+        self.rank, self.size = communicator.rank, communicator.size
 
-    def at(self, stretch: Stretch, own: tuple[int, int], framed: tuple[int, int]) -> None:
-        """What this process builds, and of which lines of sites it counts what it finds, and knows
-        whom frame points follow."""
-        self.stretch, self._own, self._framed = stretch, own, framed
-
-    def every(self, value: Any) -> list[Any]:
-        """By rank."""
-        found = self._ranks.every((True, value))
+    def allgather(self, value: Any) -> list[Any]:
+        """Return the values of all processes, by rank."""
+        found = self._inner.allgather((True, value))
         if not all(goes_on for goes_on, _ in found):
             raise ElsewhereError("another process has given up")
         return [one for _, one in found]
 
-    def least(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """By rank."""
-        self.every(None)
-        return self._ranks.least(numbers)
-
-    def is_own(self, lines: Indices) -> Mask:
-        """As it was told."""
-        return (lines >= self._own[0]) & (lines < self._own[1])
-
-    def sees_frame(self, lines: Indices) -> Mask:
-        """As it was told."""
-        return (lines >= self._framed[0]) & (lines < self._framed[1])
+    def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the elementwise minimum over arrays of one shape."""
+        self.allgather(None)
+        return self._inner.smallest(numbers)
 
     @contextmanager
-    def together(self) -> Iterator[None]:
-        """What is raised in the block, in any process, ends it in all of them: by ElsewhereError
-        where it is not this one's."""
+    def raise_together(self) -> Iterator[None]:
+        """End the block in all processes where one raises: by ElsewhereError in the others."""
         try:
             yield
         except ElsewhereError:
             raise
         except BaseException:
-            self._ranks.every((False, None))
+            self._inner.allgather((False, None))
             raise
-        self.every(None)
+        self.allgather(None)
 
 
-def built(ranks: Ranks, experiment: Experiment) -> Scene:
+def built(ranks: MPICommunicator, experiment: Experiment) -> Scene:
     """The scene of a process's own rows and what is near; of the whole where parts cannot be built
     alone: where frame points follow particles far away, and to say what is wrong as one process
     does. Raises what `build_scene` does, in all processes."""
     if experiment.frame.local:
         error: Exception | None = None
         try:
-            others = OtherRanks(ranks)
-            with others.together():
-                return _built(ranks, experiment, others)
+            building = BuildCommunicator(ranks)
+            with building.raise_together():
+                return _built(experiment, building)
         except Exception as raised:
             error = None if isinstance(raised, ElsewhereError) else raised
         bug = error is not None and not isinstance(error, PbdkitError)
@@ -135,7 +122,7 @@ def built(ranks: Ranks, experiment: Experiment) -> Scene:
             if isinstance(error, ExperimentError):
                 error = experiment.located(error)
             ranks.raise_first(error)
-    with ranks.agreeing():
+    with ranks.raise_together():
         return build_scene(experiment)
 
 
@@ -150,9 +137,9 @@ def _is_too_large(experiment: Experiment) -> bool:
     return False
 
 
-def _built(ranks: Ranks, experiment: Experiment, others: OtherRanks) -> Scene:
-    ground = Ground(experiment, others)
-    if not (known := survey(ground, others, ranks.rank)):
+def _built(experiment: Experiment, ranks: Communicator) -> Scene:
+    ground = Ground(experiment, ranks)
+    if not (known := count_rows(ground, ranks)):
         raise ground.nothing()
     bounds = bounds_of(known.rows, ranks.size)
     begin, end = bounds[ranks.rank : ranks.rank + 2]
@@ -164,8 +151,8 @@ def _built(ranks: Ranks, experiment: Experiment, others: OtherRanks) -> Scene:
     def around(rows: int) -> Stretch:
         return known.stretch(begin - rows, end + rows)
 
-    others.at(around(halo + search + reach), around(0).lines, around(halo).lines)
-    scene = build_scene(experiment, others)
+    build = RowRange(around(halo + search + reach), around(0).lines, around(halo).lines)
+    scene = build_scene(experiment, ranks, build)
     if any(
         p.low < p.begin - halo or p.high > p.end + halo for p in cut.subdomains(scene, ranks.size)
     ):
@@ -226,7 +213,7 @@ class DividedRecorder(Recorder):
             self._whole = self._division.gathered(state)
         if measured & self._local:
             self._division.halo.look_back(state)
-        with self._ranks.agreeing(), np.errstate(all="ignore"):
+        with self._ranks.raise_together(), np.errstate(all="ignore"):
             values = self._taken(state, last)
         self._put(state, values)
 
@@ -265,13 +252,13 @@ class PartSink(KeepingSink):
 
     def __init__(self, division: Division, inner: KeepingSink) -> None:
         self._ranks = division.ranks
-        self._inner = inner if self._ranks.first else None
+        self._inner = inner if self._ranks.is_root else None
         self._own = {"particle": division.part.rows}
         if division.scene.experiment.shows_bonds:
             rows, ends = division.part.rows, division.scene.bonds.ends[:, 0]
             self._own["bond"] = slice(*np.searchsorted(ends, (rows.start, rows.stop)).tolist())
         counts = {dim: own.stop - own.start for dim, own in self._own.items()}
-        self._lengths = {dim: self._ranks.every(count) for dim, count in counts.items()}
+        self._lengths = {dim: self._ranks.allgather(count) for dim, count in counts.items()}
         self._sizes = {dim: sum(lengths) for dim, lengths in self._lengths.items()}
         diagnostics = division.scene.experiment.diagnostics
         self._not_local = {v.name for d in diagnostics if not d.local for v in d.variables()}
@@ -313,7 +300,7 @@ class PartSink(KeepingSink):
 
     def due(self) -> bool:
         """As the first process finds it."""
-        return bool(self._ranks.told(self._inner is not None and self._inner.due()))
+        return bool(self._ranks.bcast(self._inner is not None and self._inner.due()))
 
     def keep(self, standing: Standing) -> None:
         """One for all, with the state of the whole."""
@@ -341,7 +328,7 @@ class PartSink(KeepingSink):
     ) -> None:
         """Calls the sink, in the first process; what goes wrong there is raised in all. Others send
         their shares of what is joined meanwhile."""
-        with self._ranks.agreeing():
+        with self._ranks.raise_together():
             if self._inner:
                 try:
                     call(self._inner)
@@ -366,10 +353,10 @@ class DividedRun(Run):
     """One run that several processes share: each has its part of the scene. What it gives out are
     states of the part. Raises what any run does, in all processes."""
 
-    def __init__(self, ranks: Ranks, scene: Scene, watch: Watch) -> None:
+    def __init__(self, ranks: MPICommunicator, scene: Scene, watch: Watch) -> None:
         chosen = scene.experiment.stepping.open_parameters
         scene, kind = _tuned(ranks, scene), type(scene.experiment.solver)
-        with ranks.agreeing():
+        with ranks.raise_together():
             parts = CUTS[kind].subdomains(scene, ranks.size)
         self.division = Division(ranks, scene, parts)
         self.scene, self.outcome, self.processes = self.division.scene, None, ranks.size
@@ -382,7 +369,7 @@ class DividedRun(Run):
         """Whether masses are too light the first process finds, of the whole."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
-        with self.division.ranks.agreeing():
+        with self.division.ranks.raise_together():
             whole = self.division.whole_of(scene)
             return quick_warnings(whole, bound) if whole else ()
 
@@ -405,28 +392,37 @@ class DividedRun(Run):
         return PartSink(self.division, inner)
 
 
-def _tuned(ranks: Ranks, scene: Scene) -> Scene:
+def _tuned(ranks: MPICommunicator, scene: Scene) -> Scene:
     """With numbers in place of `auto`, which the first process finds, of the whole."""
     if not scene.experiment.stepping.is_open:
         return scene
     found = None
-    with ranks.agreeing():
+    with ranks.raise_together():
         if whole := whole_of(ranks, scene):
             found = tuned(whole).experiment.stepping
-    return with_solver(scene, ranks.told(found))
+    return with_solver(scene, ranks.bcast(found))
 
 
-class SharingRanks(Ranks):
-    """Processes that share every run."""
+class DistributedExecution(Execution):
+    """Every run is shared by the processes of an MPI communicator."""
+
+    communicator: MPICommunicator
+
+    def __init__(self, communicator: Any) -> None:
+        super().__init__(MPICommunicator(communicator))
 
     def scene(self, experiment: Experiment) -> Scene:
-        """Each what it needs for its part."""
-        return built(self, experiment)
+        """Return the part of the scene that this process needs."""
+        return built(self.communicator, experiment)
 
     def tuned(self, scene: Scene) -> Scene:
-        """Each its part of the scene, with the numbers that are found for the whole."""
-        return _tuned(self, scene)
+        """Return the part with the numbers that are found for the whole."""
+        return _tuned(self.communicator, scene)
+
+    def by_root(self, work: Callable[[], int]) -> int:
+        """Return what the root alone comes to; the other processes sleep meanwhile."""
+        return self.communicator.by_root(work)
 
     def run(self, scene: Scene, watch: Watch) -> Run:
-        """Each its part."""
-        return DividedRun(self, scene, watch)
+        """Return the run of this process's part."""
+        return DividedRun(self.communicator, scene, watch)

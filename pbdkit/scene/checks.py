@@ -58,7 +58,7 @@ def doubts_of(
             "neighbours: they lie along one line only, so that rows do not feel each other; "
             "more shells, or chebyshev neighbours, connect them"
         )
-    if layers and raster.others.any(has_narrow_slot(raster.sites == FOLLOWER, layers)):
+    if layers and raster.communicator.any(has_narrow_slot(raster.sites == FOLLOWER, layers)):
         doubts.append(
             f"body: a slot is narrower than {2 * layers + 1} sites, so that frame points in it "
             "belong to both faces; widen it, or take fewer layers"
@@ -122,7 +122,7 @@ def without_effect(experiment: Experiment, raster: Raster) -> Iterator[str]:
         near = max(float(np.hypot(*vector)) for vector in cell.vectors)
         if name not in named:
             yield f"regions.{name}: nothing names it, so that it changes nothing"
-        elif not raster.others.any((signed_distance(region, cell, x, y) <= near).any()):
+        elif not raster.communicator.any((signed_distance(region, cell, x, y) <= near).any()):
             yield f"regions.{name}: lies outside of the body, so that it changes nothing"
     for place, course in experiment.courses.items():
         if course.bends and course.bends[-1] > experiment.steps:
@@ -149,7 +149,7 @@ def carried_by_leaders(
             if group.group.from_ <= load.from_ and group.group.last(steps) >= load.last(steps):
                 for axis in free.keys() & {*group.axes}:
                     free[axis] = free[axis] & ~np.isin(loading.rows, group.rows)
-        if along and not raster.others.any(any(each.any() for each in free.values())):
+        if along and not raster.communicator.any(any(each.any() for each in free.values())):
             yield f"loads.{n}: acts on leaders alone, which carry it, so that it moves nothing"
 
 
@@ -197,7 +197,7 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
     for name, (x, y) in islice(compress(points, far), SHOWN):
         rows = body.nearest([(x, y)])
         own = (raster.before + rows[0] + 1, *raster.reference(rows)[0]) if len(rows) else None
-        number, at_x, at_y = raster.others.first(own)
+        number, at_x, at_y = raster.communicator.first(own)
         yield (
             f"{name}.select.nearest: ({x:g}, {y:g}) lies {math.hypot(x - at_x, y - at_y):.4g} away "
             f"from the body; the particle nearest to it is {number}, at ({at_x:.6g}, {at_y:.6g})"

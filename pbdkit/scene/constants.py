@@ -99,7 +99,7 @@ def check_diagnostics(
         with blaming(diagnostic, "when asked what it measures", "diagnostics", n):
             diagnostic.check(raster.total, len(experiment.leaders))
             diagnostic.coordinates()
-            if "cells" in diagnostic.needs and not raster.others.any(
+            if "cells" in diagnostic.needs and not raster.communicator.any(
                 patches(raster, neighbourhood.tiling)
             ):
                 raise ExperimentError(
@@ -122,7 +122,7 @@ def check_diagnostics(
 
 
 def _doubts(experiment: Experiment, raster: Raster) -> list[str]:
-    has_frame = raster.others.any((raster.table_kind == FRAME).any())
+    has_frame = raster.communicator.any((raster.table_kind == FRAME).any())
     return [
         f"diagnostics.{n}: '{diagnostic.type}' counts what frame points pull at leaders, which at "
         "the corners of held edges is no force of the body (the reaction of a clamped cantilever "
@@ -476,7 +476,7 @@ def _by_particle(
     place, found = raster.place_of(rows), {}
     for name, own in _asked(rule, values, lambda part: part.parameters(setting)).items():
         base = getattr(constants.rule, name)
-        if raster.others.any((own != base).any()):
+        if raster.communicator.any((own != base).any()):
             planes = np.full(raster.shape, base)
             planes.reshape(-1)[place] = own
             found[name] = planes
@@ -529,7 +529,7 @@ def _by_bond(
         name: any((own != b[name]).any() for own, b in zip(planes, base, strict=True))
         for name, planes in found.items()
     }
-    return {name: v for name, v in found.items() if raster.others.any(apart[name])}
+    return {name: v for name, v in found.items() if raster.communicator.any(apart[name])}
 
 
 def _rules_at(

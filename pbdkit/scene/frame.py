@@ -61,12 +61,12 @@ def build_frame(raster: Raster, policy: FramePolicy, rule: FollowerRule) -> Fram
 
 def sites_of_frame(raster: Raster, rule: FollowerRule) -> RasterFrame | None:
     """The frame points of a raster as a policy sees them; None where there are none."""
-    rows, others = np.flatnonzero(raster.table_kind == FRAME), raster.others
+    rows = np.flatnonzero(raster.table_kind == FRAME)
     body = bounds(raster.sites == FOLLOWER)
     assert body
     low, high = (tuple(map(add, raster.low, end)) for end in body)
-    low, high = others.hull([(low, tuple(n - 1 for n in high))])
-    rows = rows[others.sees_frame(raster.site_of(rows)[:, 0])]
+    low, high = raster.hull_of_all([(low, tuple(n - 1 for n in high))])
+    rows = rows[raster.sees_frame(raster.site_of(rows)[:, 0])]
     if not len(rows):
         return None
     site = raster.site_of(rows).astype(np.int32)

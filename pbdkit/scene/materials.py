@@ -145,7 +145,7 @@ def weighed(
         weight *= share
         for of_name in mixed.values():
             of_name *= share
-    used = [name for name, planes in mixed.items() if raster.others.any(planes.any())]
+    used = [name for name, planes in mixed.items() if raster.communicator.any(planes.any())]
     slots = [slot for own in setting.slots for slot in own]
     weights = tuple(_weights(experiment, setting, slots, name) for name in used)
     planes = tuple(mixed[name] for name in used)

@@ -13,9 +13,9 @@ from importlib.util import find_spec
 
 import numpy as np
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.neighbourhood import Neighbourhood
-from pbdkit.lattice.raster import ALONE, Others
 from pbdkit.memory import machine_memory
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import AppliesTwice, Diagnostic, RenewsBonds, RenewsParticles
@@ -207,7 +207,7 @@ def refuse_too_large(
     neighbourhood: Neighbourhood,
     window: Index,
     layers: int,
-    others: Others = ALONE,
+    communicator: Communicator = SERIAL,
 ) -> None:
     """Raises ExperimentError where the scene, or the parts of it that processes of this machine
     have, cannot fit into its memory, if the body fills its window of site indices; with Python's
@@ -215,11 +215,11 @@ def refuse_too_large(
     cell = neighbourhood.cell
     share = len(cell.sites) / math.prod(cell.period)
     particles = math.ceil(math.prod(n + 2 * layers for n in window) * share)
-    needed = sizes_of(experiment, neighbourhood, math.ceil(particles / others.size)).memory
-    available = machine_memory(others.on_machine)
+    needed = sizes_of(experiment, neighbourhood, math.ceil(particles / communicator.size)).memory
+    available = machine_memory(communicator.processes_on_machine())
     if needed > available:
         each, fewer = "", "make it smaller"
-        if others.size > 1:
+        if communicator.size > 1:
             each, fewer = " in each process", "make it smaller, or start more on other machines"
         raise TooLargeError(
             f"{particles:.3g} particles need about {needed / 2**30:.3g} GiB{each}, and "

@@ -553,9 +553,10 @@ def collisions(
                 gap = outline.facing(*places)[0]
                 if len(led.axes) < len(places):
                     gap = np.where(_makes_way(outline, places, led.axes[0]), np.inf, gap)
-                deepest = float(raster.others.least(np.array([gap.min(initial=np.inf)]))[0])
+                own = np.array([gap.min(initial=np.inf)])
+                deepest = float(raster.communicator.smallest(own)[0])
                 if deepest < -slack:
-                    number = raster.others.first(_number(raster, led.rows, gap == deepest))
+                    number = raster.communicator.first(_number(raster, led.rows, gap == deepest))
                     found.append(
                         f"leaders.{k}: drives particle {number} into obstacles.{n} by step {step}; "
                         "obstacles stop followers, not leaders"

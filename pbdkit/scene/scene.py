@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.lattice.cells import Patch, WeighedCells, patches, whole_cells
 from pbdkit.lattice.fill import (
@@ -31,7 +32,7 @@ from pbdkit.lattice.neighbourhood import (
     missing_segments,
     setting_of,
 )
-from pbdkit.lattice.raster import ALONE, Extent, LeftOut, Others, Raster, distinct
+from pbdkit.lattice.raster import Extent, LeftOut, Raster, RowRange, distinct
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
@@ -72,9 +73,15 @@ class Ground:
     Raises ExperimentError where parts do not go together, and for bodies too large for the memory.
     """
 
-    def __init__(self, experiment: Experiment, others: Others = ALONE) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        communicator: Communicator = SERIAL,
+        row_range: RowRange | None = None,
+    ) -> None:
         self.left_out = LeftOut()
-        self.experiment, self._others, lattice = experiment, others, experiment.lattice
+        self.experiment, lattice = experiment, experiment.lattice
+        self._communicator, self._row_range = communicator, row_range
         neighbours, fracture, frame = experiment.neighbours, experiment.fracture, experiment.frame
         with blaming(lattice, "when asked for its cell", "lattice"):
             self.cell = checked_cell(lattice)
@@ -86,7 +93,7 @@ class Ground:
             self.layers = frame.depth(self.neighbourhood.reach)
         low, high = window(experiment.body, lattice)
         extent = tuple(b - a + 1 for a, b in zip(low, high, strict=True))
-        refuse_too_large(experiment, self.neighbourhood, extent, self.layers, others)
+        refuse_too_large(experiment, self.neighbourhood, extent, self.layers, communicator)
 
     @property
     def spill(self) -> int:
@@ -103,7 +110,7 @@ class Ground:
 
     def raster(self) -> tuple[Raster, WeighedCells | None]:
         """The raster, and the cells where the frame weighs them."""
-        lattice, stretch = self.experiment.lattice, self._others.stretch
+        lattice, stretch = self.experiment.lattice, self._row_range and self._row_range.stretch
         filling = self.filled((stretch.low[0], stretch.high[0]) if stretch else None)
         self.left_out = stretch.left_out if stretch else filling.left_out_on()
         box = (stretch.low, stretch.high) if stretch else filling.box
@@ -117,7 +124,13 @@ class Ground:
         raster = build_raster(lattice, low, sites, self.neighbourhood.reach_in_cells)
         if stretch:
             extent = Extent(stretch.rows, raster.first[0] - stretch.first)
-            raster = replace(raster, before=stretch.before, extent=extent, others=self._others)
+            raster = replace(
+                raster,
+                before=stretch.before,
+                extent=extent,
+                communicator=self._communicator,
+                row_range=self._row_range,
+            )
         cells, tiling = filling.on(raster, self.neighbourhood.tiling), self.neighbourhood.tiling
         # Without frame points a cell that misses a corner is none: what the other corners exert on
         # each other would not balance.
@@ -262,11 +275,16 @@ class Scene:
         return patches(self.raster, self.neighbourhood.tiling)
 
 
-def build_scene(experiment: Experiment, others: Others = ALONE) -> Scene:
-    """The scene, or of the rows that others have not; ExperimentError, with file and line where
-    they are known, if there is none."""
+def build_scene(
+    experiment: Experiment,
+    communicator: Communicator = SERIAL,
+    row_range: RowRange | None = None,
+) -> Scene:
+    """Return the scene of an experiment, or of a range of its rows, which the processes of a
+    `communicator` build together. Raises ExperimentError, with file and line where they are known,
+    if there is none."""
     try:
-        return _build(experiment, Ground(experiment, others))
+        return _build(experiment, Ground(experiment, communicator, row_range))
     except ExperimentError as error:
         raise experiment.located(error) from None
 
@@ -292,7 +310,7 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
         )
     leading = build_leading(raster, experiment)
     following = _frame_of(raster, experiment)
-    check_directions(experiment, has_frame=raster.others.any(following is not None))
+    check_directions(experiment, has_frame=raster.communicator.any(following is not None))
     cells = weighed(experiment, raster, setting, cells)
     loads = build_loads(raster, neighbourhood.tiling, cells, experiment)
     barriers = build_obstacles(raster, experiment)

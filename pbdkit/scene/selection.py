@@ -25,8 +25,8 @@ STRAIGHT = 1e-9
 
 def shares_of(raster: Raster, rows: Indices) -> Floats:
     """(particle,): the parts of a force on all that are selected, of those that a raster has."""
-    own = raster.others.is_own(raster.site_of(rows)[:, 0])
-    every = raster.others.every((raster.before + rows[own], raster.reference(rows[own])))
+    own = raster.is_own(raster.site_of(rows)[:, 0])
+    every = raster.communicator.allgather((raster.before + rows[own], raster.reference(rows[own])))
     numbers, at = (np.concatenate(part) for part in zip(*every, strict=True))
     return np.asarray(shares(at)[np.searchsorted(numbers, raster.before + rows)])
 
@@ -77,7 +77,7 @@ class Selecting:
             rows = self._region(selection.region, (*where, "region"))
         else:
             rows = self.nearest(selection.nearest or ())
-        if not self.raster.others.any(len(rows)):
+        if not self.raster.communicator.any(len(rows)):
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
             text = f"selects no particle; the body reaches from {low} to {high}"
             raise ExperimentError(text, where)
@@ -110,13 +110,13 @@ class Selecting:
             ties = self.distance(point) <= least[n] * (1 + 1e-9) + 1e-12 * spacing(raster)
             if ties.any():
                 numbers[n] = raster.before + self._body[np.argmax(ties)]
-        rows = raster.others.least(numbers) - raster.before
+        rows = raster.communicator.smallest(numbers) - raster.before
         return rows[(rows >= 0) & (rows < raster.count)].astype(np.intp)
 
     def least_distances(self, points: Iterable[Pair]) -> Floats:
         """(point,): how far each point is from the body."""
         own = [self.distance(point).min(initial=np.inf) for point in points]
-        return np.asarray(self.raster.others.least(np.array(own)))
+        return np.asarray(self.raster.communicator.smallest(np.array(own)))
 
 
 def spacing(raster: Raster) -> float:

@@ -223,7 +223,7 @@ def _doubts(scene: Scene) -> list[str]:
     sizes = sizes_of(scene.experiment, scene.neighbourhood, scene.raster.total)
     warnings = list(scene.warnings)
     followers = kinds_of_places(scene.raster, scene.leading, 1) == FOLLOWER
-    if not scene.raster.others.any(followers.any()):
+    if not scene.raster.communicator.any(followers.any()):
         warnings.append("leaders: everybody leads in step 1, nobody follows")
     for n, leading in enumerate(scene.leading):
         if leading.group.from_ > scene.experiment.steps:

@@ -97,7 +97,7 @@ def size_of(scene: Scene) -> float:
     ends = scene.raster.body_ends()
     spacing = max(sum(map(abs, s.rest)) for s in scene.neighbourhood.slots[0])
     own = [way_of(leading, scene.experiment.steps) for leading in scene.driven]
-    ways: list[float] = np.max(scene.raster.others.every(own), axis=0).tolist()
+    ways: list[float] = np.max(scene.raster.communicator.allgather(own), axis=0).tolist()
     width = float(np.abs(ends[1] - ends[0]).max())
     return width + float(spacing) + sum(ways)
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbdkit.communicator import SERIAL
 from pbdkit.errors import ExperimentError
 from pbdkit.io.checkpoint import Standing
 from pbdkit.io.recorder import Recorder
@@ -32,7 +33,7 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
 from pbdkit.restart import take_up
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import Processes, Run, record, standing_of
+from pbdkit.simulation import Run, record, standing_of
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
@@ -165,7 +166,7 @@ def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -
     facts = json.loads(json.dumps(kept.facts))
     rest, recorder = Run(again), Recorder(again, sink)
     standing = Standing(kept.about, facts, kept.copied().arrays)
-    take_up(rest.driver, recorder, standing, Processes())
+    take_up(rest.driver, recorder, standing, SERIAL)
     record(rest, sink, recorder=recorder)
     return sink.dataset()
 

@@ -17,7 +17,7 @@ from sheets import Running, moving, scene_of
 
 from pbdkit.mpi.driver import DividedStepper, Division
 from pbdkit.mpi.partition import MOST_STEPS, subdomains
-from pbdkit.mpi.run import SharingRanks
+from pbdkit.mpi.run import DistributedExecution
 from pbdkit.simulation import peak_memory
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 
@@ -58,9 +58,11 @@ def _on(size: int, what: str) -> list[Any]:
 class Sharing:
     """A sheet under way on all ranks; a call makes so many steps more."""
 
-    def __init__(self, ranks: SharingRanks, parts: dict[str, Any]) -> None:
+    def __init__(self, ranks: DistributedExecution, parts: dict[str, Any]) -> None:
         scene = scene_of(parts)
-        self.division = Division(ranks, scene, subdomains(scene, ranks.size))
+        self.division = Division(
+            ranks.communicator, scene, subdomains(scene, ranks.communicator.size)
+        )
         part, self.halo = self.division.scene, self.division.halo
         engine, steps = CompiledStepper(part, 1), self.division.part.subdomain.steps
         self.steps, self.sent = steps, 0
@@ -73,10 +75,14 @@ class Sharing:
         self.state = self._stepper.advance(self.state, STEPS)
 
 
-def speed(ranks: SharingRanks) -> dict[str, float]:
+def speed(ranks: DistributedExecution) -> dict[str, float]:
     """Best seconds of so many steps, in turns; while one process works the others sleep."""
     shared = Sharing(ranks, moving(SIZE))
-    alone = [Running(moving(SIZE), STEPS, threads=n) for n in (1, 2)] if ranks.first else []
+    alone = (
+        [Running(moving(SIZE), STEPS, threads=n) for n in (1, 2)]
+        if ranks.communicator.is_root
+        else []
+    )
     seconds: dict[str, list[float]] = {"shared": [], "exchange": [], "1": [], "2": []}
     works = {"shared": shared, "exchange": lambda: shared.halo.renew(shared.state)}
     for turn in range(TURNS + 1):
@@ -92,32 +98,32 @@ def speed(ranks: SharingRanks) -> dict[str, float]:
 
 
 def _timed(
-    ranks: SharingRanks,
+    ranks: DistributedExecution,
     works: dict[str, Callable[[], Any]],
     seconds: dict[str, list[float]],
     turn: int,
 ) -> None:
     """Notes what each takes in all processes at once; not of the first turn."""
     for name, work in works.items():
-        ranks.any(False)
+        ranks.communicator.any(False)
         begun = time.perf_counter()
         work()
-        ranks.any(False)
+        ranks.communicator.any(False)
         seconds[name] += [time.perf_counter() - begun] * (turn > 0)
 
 
-def weak(ranks: SharingRanks) -> list[dict[str, float]]:
+def weak(ranks: DistributedExecution) -> list[dict[str, float]]:
     """Of parts of a million particles with a neighbour on either side: what their steps between two
     exchanges take, an exchange with one neighbour, and as many steps of such a body alone."""
     return [_weak(ranks, rows, MILLION // rows) for rows in ROWS]
 
 
-def _weak(ranks: SharingRanks, rows: int, places: int) -> dict[str, float]:
+def _weak(ranks: DistributedExecution, rows: int, places: int) -> dict[str, float]:
     def sheet(count: int) -> dict[str, Any]:
         body = {"type": "grid", "columns": count, "rows": places}
         return moving(0, body=body, frame={"type": "none"})
 
-    shared = Sharing(ranks, sheet(ranks.size * rows))
+    shared = Sharing(ranks, sheet(ranks.communicator.size * rows))
     own = shared.division.part.subdomain
     halo = max(own.begin - own.low, own.high - own.end)
     works = {
@@ -133,23 +139,23 @@ def _weak(ranks: SharingRanks, rows: int, places: int) -> dict[str, float]:
     return best | {"rows": rows, "places": places, "steps": shared.steps}
 
 
-def _wait(ranks: SharingRanks) -> None:
+def _wait(ranks: DistributedExecution) -> None:
     """For the first process, asleep."""
-    if ranks.first:
-        for rank in range(1, ranks.size):
-            ranks._comm.send(None, rank)
+    if ranks.communicator.is_root:
+        for rank in range(1, ranks.communicator.size):
+            ranks.communicator._comm.send(None, rank)
     else:
-        while not ranks._comm.iprobe(source=0):
+        while not ranks.communicator._comm.iprobe(source=0):
             time.sleep(PAUSE_S)
-        ranks._comm.recv(source=0)
+        ranks.communicator._comm.recv(source=0)
 
 
-def memory(ranks: SharingRanks | None) -> float:
+def memory(ranks: DistributedExecution | None) -> float:
     """Bytes that a run of a large body takes in this process beyond one of a small body."""
     from pbdkit.io.netcdf import NetcdfSink
     from pbdkit.model.experiment import Experiment
     from pbdkit.progress import Watch
-    from pbdkit.simulation import Processes, record
+    from pbdkit.simulation import Execution, record
 
     held = []
     for size in (SMALL, HELD):
@@ -157,7 +163,7 @@ def memory(ranks: SharingRanks | None) -> float:
             parts = moving(size, initial={"type": "reference"}, steps=20, record={"every": 20})
             solver = {"type": "stepping", "engine": "compiled", "threads": 1}
             experiment = Experiment.model_validate(parts | {"solver": solver})
-            together = ranks or Processes()
+            together = ranks or Execution()
             run = together.run(together.scene(experiment), Watch())
             record(run, run.sink(NetcdfSink(Path(folder) / "out.nc")))
             held.append(peak_memory())
@@ -174,7 +180,7 @@ def main() -> None:
     if comm.size == 1:
         found = memory(None)
     else:
-        found = {"speed": speed, "memory": memory, "weak": weak}[what](SharingRanks(comm))
+        found = {"speed": speed, "memory": memory, "weak": weak}[what](DistributedExecution(comm))
     (Path(folder) / str(comm.rank)).write_text(json.dumps(found))
 
 

@@ -21,7 +21,7 @@ from pbdkit.mpi.driver import deep_subdomains, strip_of
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Processes
+from pbdkit.simulation import Execution
 from tests.equilibrium.test_multigrid import Skew
 from tests.mpi.test_run import (
     assert_same,
@@ -314,7 +314,7 @@ def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path)
         return written(given_, several, ranks, stopping_after(3)).status
 
     def go_on(ranks):
-        return resumption(several, Watch(), processes=ranks).record().outcome.status
+        return resumption(several, Watch(), execution=ranks).record().outcome.status
 
     assert set(on(sizes[0], begin)) == {"interrupted"}
     assert set(on(sizes[1], go_on)) == {"complete"}
@@ -338,7 +338,7 @@ def test_no_process_holds_the_whole(monkeypatch):
         finally:
             tracemalloc.stop()
 
-    alone = peak(lambda: steps(Processes()))
+    alone = peak(lambda: steps(Execution()))
     assert peak(lambda: on_ranks(3, steps)) < 1.5 * alone
 
 

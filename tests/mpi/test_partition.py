@@ -19,7 +19,17 @@ from pbdkit.plugin.frame import FrameMap, FramePolicy
 from pbdkit.scene.scene import build_scene
 from tests.mpi.test_run import CASES, OTHERS, assert_same, sheet, written
 
-LEFT_OUT = {"experiment", "neighbourhood", "others", "extent", "lattice", "rule", "group", "tiling"}
+LEFT_OUT = {
+    "experiment",
+    "neighbourhood",
+    "communicator",
+    "row_range",
+    "extent",
+    "lattice",
+    "rule",
+    "group",
+    "tiling",
+}
 """Of scenes: what both take from the same experiment."""
 
 
@@ -67,7 +77,7 @@ def assert_built_as_cut(given_, size):
         scene = ranks.scene(experiment)
         assert scene.raster.extent is not None
         found = cut(scene, size)
-        return found, part_of(scene, found[ranks.rank]), scene.warnings
+        return found, part_of(scene, found[ranks.communicator.rank]), scene.warnings
 
     for rank, (found, part, warnings) in enumerate(on_ranks(size, built)):
         assert found == parts

@@ -31,7 +31,7 @@ from pbdkit.mpi.partition import subdomains
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Processes, record
+from pbdkit.simulation import Execution, record
 from tests.test_restart import contents
 
 BESIDE = Path(sys.executable).parent
@@ -42,7 +42,7 @@ NUMPY = {"type": "stepping", "engine": "numpy"}
 
 def written(given_, path, processes=None, watch=None):
     """How a run into a file ended."""
-    together = processes or Processes()
+    together = processes or Execution()
     scene = together.scene(pbdkit.Experiment.model_validate(given_))
     run = together.run(scene, watch or Watch())
     return record(run, run.sink(NetcdfSink(path, replace=True))).outcome
@@ -312,7 +312,7 @@ def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
         return written(given_, several, ranks, stopping_after(3)).status
 
     def go_on(ranks):
-        found = resumption(several, Watch(), processes=ranks)
+        found = resumption(several, Watch(), execution=ranks)
         return found.record().outcome.status
 
     assert set(on(sizes[0], begin)) == {"interrupted"}
@@ -320,7 +320,7 @@ def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     assert_same(one, several)
 
     def longer(ranks):
-        return resumption(several, Watch(), steps=60, processes=ranks).record().outcome.steps
+        return resumption(several, Watch(), steps=60, execution=ranks).record().outcome.steps
 
     written(given_ | {"steps": 60}, one)
     assert set(on(sizes[0], longer)) == {60}
@@ -331,7 +331,7 @@ def test_what_is_damaged_of_a_state_is_said_in_all_processes(tmp_path):
     """Also where the first process comes upon it while others wait for their parts."""
     path = tmp_path / "out.nc"
     begin = partial(written, sheet(), path, watch=stopping_after(3))
-    assert on_ranks(3, lambda ranks: begin(processes=ranks).status)[0] == "interrupted"
+    assert on_ranks(3, lambda ranks: begin(execution=ranks).status)[0] == "interrupted"
     with closing(sqlite3.connect(f"{path}.run")) as store:
         changed = store.execute("UPDATE pieces SET data = x'00' WHERE key LIKE 'array/%.u/0'")
         assert changed.rowcount == 1
@@ -339,14 +339,14 @@ def test_what_is_damaged_of_a_state_is_said_in_all_processes(tmp_path):
 
     def go_on(ranks):
         with pytest.raises(pbdkit.StorageError, match="is damaged"):
-            resumption(path, Watch(), processes=ranks)
+            resumption(path, Watch(), execution=ranks)
         return True
 
     assert on_ranks(3, go_on) == [True] * 3
 
 
 def on(size, work):
-    return on_ranks(size, work) if size > 1 else [work(Processes())]
+    return on_ranks(size, work) if size > 1 else [work(Execution())]
 
 
 def test_a_lattice_with_too_few_rows_says_so(tmp_path):

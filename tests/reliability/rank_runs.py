@@ -25,9 +25,9 @@ from scene_strategies import calibrated_experiments, experiments, pulled_apart  
 from pbdkit.errors import PbdkitError
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.model.experiment import Experiment
-from pbdkit.mpi.run import SharingRanks
+from pbdkit.mpi.run import DistributedExecution
 from pbdkit.progress import Watch
-from pbdkit.simulation import Processes, record
+from pbdkit.simulation import Execution, record
 
 Parts = dict[str, Any]
 ENGINES = st.sampled_from(["numpy", "numpy", "numpy", "compiled"])
@@ -56,7 +56,7 @@ def drawn(count: int, number: int) -> list[Parts]:
     return found
 
 
-def ran(parts: Parts, output: Path, processes: Processes) -> str:
+def ran(parts: Parts, output: Path, processes: Execution) -> str:
     """Runs it into a file; what was refused, and in whose words."""
     try:
         scene = processes.scene(Experiment.model_validate(parts))
@@ -67,15 +67,19 @@ def ran(parts: Parts, output: Path, processes: Processes) -> str:
     return ""
 
 
-def tried(parts: Parts, folder: Path, ranks: SharingRanks) -> tuple[str, list[str]]:
+def tried(parts: Parts, folder: Path, ranks: DistributedExecution) -> tuple[str, list[str]]:
     """What came of it, and in what the file of several processes differs."""
-    alone = ranks.told(ran(parts, folder / "one.nc", Processes()) if ranks.first else "")
+    alone = ranks.communicator.bcast(
+        ran(parts, folder / "one.nc", Execution()) if ranks.communicator.is_root else ""
+    )
     several = ran(parts, folder / "several.nc", ranks)
     if alone or several:
         shared = "several processes" in several or "too few for" in several
         differs = [] if shared or alone == several else [alone, several]
         return ("not shared" if shared else "refused"), differs
-    return "compared", differences(folder / "one.nc", folder / "several.nc") if ranks.first else []
+    return "compared", differences(
+        folder / "one.nc", folder / "several.nc"
+    ) if ranks.communicator.is_root else []
 
 
 def main() -> None:
@@ -85,22 +89,27 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", type=int)
     asked = parser.parse_args()
-    ranks = SharingRanks(MPI.COMM_WORLD)
-    with ranks.speaking():
-        every = ranks.told(drawn(asked.trials, asked.seed) if ranks.first else None)
+    ranks = DistributedExecution(MPI.COMM_WORLD)
+    with ranks.communicator.root_speaks():
+        every = ranks.communicator.bcast(
+            drawn(asked.trials, asked.seed) if ranks.communicator.is_root else None
+        )
         chosen = range(len(every)) if asked.only is None else [asked.only]
         counts, wrong = Counter[str](), 0
         with tempfile.TemporaryDirectory() as folder:
             for number in chosen:
-                outcome, found = ranks.told(tried(every[number], Path(folder), ranks))
+                outcome, found = ranks.communicator.bcast(tried(every[number], Path(folder), ranks))
                 counts[outcome] += 1
                 wrong += bool(found)
-                if found and ranks.first:
+                if found and ranks.communicator.is_root:
                     print(f"number {number}: {'; '.join(found)}", file=sys.stderr, flush=True)
-                if asked.only is not None and ranks.first:
+                if asked.only is not None and ranks.communicator.is_root:
                     print(every[number])
-        if ranks.first:
-            row(f"random scenes on {ranks.size} processes {dict(counts)}: that differ", str(wrong))
+        if ranks.communicator.is_root:
+            row(
+                f"random scenes on {ranks.communicator.size} processes {dict(counts)}: that differ",
+                str(wrong),
+            )
     sys.exit(bool(wrong))
 
 

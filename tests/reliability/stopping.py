@@ -12,6 +12,7 @@ from typing import Any
 from trials import differences, often
 
 from pbdkit import simulation as drivers
+from pbdkit.communicator import SERIAL
 from pbdkit.io.checkpoint import UnfinishedRun, is_unfinished
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.recorder import Recorder, columns_of
@@ -22,7 +23,7 @@ from pbdkit.plugin import Component
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.restart import take_up
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Processes, Report, Run, record
+from pbdkit.simulation import Report, Run, record
 
 Components = Iterable[type[Component]]
 MOST_STOPS = 4
@@ -71,7 +72,7 @@ def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any])
         scene, standing = build_scene(experiment), left.standing()
         sink = NetcdfSink(output)
         run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
-        take_up(run.driver, recorder, standing, Processes())
+        take_up(run.driver, recorder, standing, SERIAL)
         sink.go_on(left, standing, columns_of(scene), compression_of(experiment))
     except BaseException:
         left.close()

@@ -1,0 +1,90 @@
+"""Collective operations among the processes that share a run.
+
+Every operation is called by all processes in the same order, and returns the same in all of them.
+`SERIAL` is the communicator of a process that runs alone; `pbdkit.mpi.communicator` has that of
+MPI.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
+from platform import node
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Communicator(ABC):
+    """The processes that share a run, of which this one is `rank` of `size`."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def is_root(self) -> bool:
+        """Whether this process reads, writes and prints for all."""
+        return self.rank == 0
+
+    @abstractmethod
+    def allgather(self, value: Any) -> list[Any]:
+        """Return the values of all processes, by rank."""
+
+    @abstractmethod
+    def raise_together(self) -> AbstractContextManager[None]:
+        """Raise what the block raises in any process in all of them, at its end: the error of the
+        lowest rank."""
+
+    def bcast(self, value: Any) -> Any:
+        """Return the value of the root."""
+        return self.allgather(value)[0]
+
+    def any(self, value: Any) -> bool:
+        """Return whether the value is true in any process."""
+        return any(self.allgather(bool(value)))
+
+    def first(self, value: Any) -> Any:
+        """Return the value of the lowest rank that has not None; None where all have."""
+        return next((one for one in self.allgather(value) if one is not None), None)
+
+    def sum(self, value: Any) -> Any:
+        """Return the sum over all processes."""
+        return sum(self.allgather(value))
+
+    def largest(self, value: float) -> float:
+        """Return the largest number of all processes; not a number where one is none."""
+        return float(np.max(self.allgather(value)))
+
+    def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the elementwise minimum over arrays of one shape."""
+        return np.asarray(np.min(self.allgather(numbers), axis=0))
+
+    def processes_on_machine(self) -> int:
+        """Return how many processes share the machine of this one."""
+        name = node()
+        return self.allgather(name).count(name)
+
+
+class SerialCommunicator(Communicator):
+    """One process alone."""
+
+    def allgather(self, value: Any) -> list[Any]:
+        """Return the value, in a list."""
+        return [value]
+
+    def raise_together(self) -> AbstractContextManager[None]:
+        """Change nothing."""
+        return nullcontext()
+
+    def smallest(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return the numbers."""
+        return numbers
+
+    def processes_on_machine(self) -> int:
+        """Return 1."""
+        return 1
+
+
+SERIAL: Final = SerialCommunicator()
+"""The default wherever a communicator is taken."""
