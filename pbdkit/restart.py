@@ -15,20 +15,13 @@ from typing import Any
 
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
-from pbdkit.io.checkpoint import (
-    Arrays,
-    Standing,
-    UnfinishedRun,
-    is_unfinished,
-    make_room,
-    put_together,
-    taken_apart,
-)
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import SCHEMA_VERSION, Column, Values, When
 from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
 from pbdkit.io.open import reading, refuse_other_file, refuse_store
 from pbdkit.io.paged_file import PiecedArray
-from pbdkit.io.recorder import Recorder, Seen, columns_of
+from pbdkit.io.recorder import Recorder, columns_of
+from pbdkit.io.run_store import UnfinishedRun, is_unfinished, make_room
 from pbdkit.io.seal import opened
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source, with_settings
@@ -38,91 +31,31 @@ from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.simulation import Driver, Execution, Report, Run, record
 from pbdkit.stability.relaxation import with_solver
-from pbdkit.stepping.state import State
-
-KINDS: dict[str, type] = {"State": State, "Seen": Seen}
 
 
-def take_up(
+def restore(
     driver: Driver,
     recorder: Recorder,
-    standing: Standing | None,
+    checkpoint: Checkpoint | None,
     communicator: Communicator,
     recorded: int | None = None,
 ) -> None:
-    """Lets a run that has not begun go on from a standing that the first process has; `recorded` is
-    the last step recorded, where that is another one than was kept. Raises StorageError for the
-    standing of another scene."""
-    own, parts = driver.standing(), dict[str, Any]()
+    """Let a run that has not begun continue from the checkpoint that the root has; `recorded` is
+    the last step recorded, where that is another one than was kept. Raises StorageError for a
+    checkpoint that is damaged or of another scene."""
+    own, parts = driver.state_dict(), dict[str, Any]()
     with communicator.raise_together():
-        if standing:
-            parts = _parts(driver.scene, own, standing)
-            _refuse_unfit(driver.scene, own["state"], parts)
+        if checkpoint:
+            experiment, classes = driver.scene.experiment, dict[str, type]()
+            if experiment.stepping.settle:
+                from pbdkit.equilibrium.certificate import Pace
+
+                classes["Pace"] = Pace
+            parts = checkpoint.parts(own, experiment.steps, classes)
             if recorded is not None:
                 parts["kept"] = parts["seen"].recorded = recorded
     recorder.seen = communicator.bcast(parts.get("seen"))
-    driver.take_up(parts)
-
-
-def _refuse_unfit(scene: Scene, like: State, parts: dict[str, Any]) -> None:
-    state, seen = parts.get("state"), parts.get("seen")
-    if not isinstance(seen, Seen) or not isinstance(state, State) or not state.fits(like):
-        raise StorageError("the state that was kept is not one of this experiment")
-    if not _is_possible(scene, state, seen, parts):
-        raise StorageError("the state that was kept is damaged: it is none that a run comes to")
-
-
-def _is_possible(scene: Scene, state: State, seen: Seen, parts: dict[str, Any]) -> bool:
-    """Whether steps follow each other, so that a run that goes on comes to its end."""
-    now, steps = state.step, scene.experiment.steps
-    guard, pace = parts.get("guard", {"good_step": 0, "next_look": now + 1}), parts.get("pace")
-    try:
-        past = [seen.step, seen.recorded, parts.get("kept", -1), guard["good_step"]]
-        coming = [guard["next_look"], pace.next_look if pace else now, steps]
-        whole = all(isinstance(step, int) for step in (now, *past[2:], *coming))
-        # An equilibrium may be recorded within a step, and that of steps that are yet to be made.
-        latest = max(now, parts.get("moment", 0.0))
-        in_order = min(past) >= -1 and max(past) <= latest and now <= min(coming)
-        in_order = in_order and 0.0 <= parts.get("moment", 0.0) <= steps
-        return whole and in_order and (now < guard["next_look"] or now == steps)
-    except (KeyError, TypeError, AttributeError):
-        return False
-
-
-def _is_like(found: Any, own: Any) -> bool:
-    """Whether facts are of the kinds of a run's own; what it does not know yet may be a number, an
-    array, or numbers."""
-    if isinstance(own, dict) and "array" not in own:
-        same = isinstance(found, dict) and found.keys() == own.keys()
-        return same and all(_is_like(found[key], part) for key, part in own.items())
-    if isinstance(found, list):
-        return (own is None or isinstance(own, list)) and all(
-            _is_like(part, None) for part in found
-        )
-    if isinstance(found, dict):
-        return found.keys() == {"array"} and (own is None or isinstance(own, dict))
-    if isinstance(own, str) or isinstance(found, str):
-        return isinstance(own, str) and isinstance(found, str)
-    if isinstance(found, float):
-        return not isinstance(own, int)  # infinite is what a run may find, and no step
-    return found is None or (isinstance(found, int) and abs(found) < 2**63)
-
-
-def _parts(scene: Scene, own_standing: dict[str, Any], standing: Standing) -> dict[str, Any]:
-    kinds = dict(KINDS)
-    own = taken_apart(own_standing, "run", Arrays())
-    if scene.experiment.stepping.settle:
-        from pbdkit.equilibrium.certificate import Pace
-
-        kinds["Pace"] = Pace
-    try:
-        facts = {**standing.facts["run"], "seen": standing.facts["seen"]}
-    except (KeyError, TypeError) as error:
-        raise StorageError(f"the state that was kept is damaged: {error}") from None
-    if not _is_like(standing.facts["run"], own):
-        raise StorageError("the state that was kept is damaged: it is of other kinds")
-    found: dict[str, Any] = put_together(facts, standing.arrays, kinds)
-    return found
+    driver.load_state_dict(parts)
 
 
 ENDED = ("complete", "settled", "interrupted")
@@ -163,7 +96,7 @@ def chosen_parameters(facts: Mapping[str, Any]) -> tuple[str, ...]:
 
 def longer(
     dataset: Any, output: Path, steps: int, anyway: bool, kept: ExitStack | None = None
-) -> tuple[Source, Standing]:
+) -> tuple[Source, Checkpoint]:
     """The experiment of a result, of more steps, and where it stands; its arrays stay in the file
     until `kept` is closed, where that is given. Raises ExperimentError where it is to be run anew.
     """
@@ -175,8 +108,8 @@ def longer(
             f"is of schema_version {made_as}, and what is recorded now is laid out as "
             f"{SCHEMA_VERSION}; run it anew with --set steps={steps}"
         )
-    standing = _final_state(output, kept)
-    source = _source(about, str(output), steps, standing.facts.get("step"))
+    checkpoint = _final_state(output, kept)
+    source = _source(about, str(output), steps, checkpoint.facts.get("step"))
     experiment = Experiment.build(source)
     if not experiment.solver.makes_steps:
         raise ExperimentError(
@@ -186,7 +119,7 @@ def longer(
     if not anyway:
         made = {"pbdkit": about.get("pbdkit_version"), "plugins": _map(about, "plugins")}
         _refuse_versions(output, made, experiment)
-    return source, standing
+    return source, checkpoint
 
 
 def history(
@@ -229,7 +162,7 @@ def _entry(variable: Any, pieced: bool) -> Any:
     return PiecedArray(variable.shape, variable.dtype, pieces)
 
 
-def _final_state(output: Path, kept: ExitStack | None) -> Standing:
+def _final_state(output: Path, kept: ExitStack | None) -> Checkpoint:
     content = opened(output)
     with ExitStack() as closing:
         closing.callback(content.close)
@@ -242,7 +175,7 @@ def _final_state(output: Path, kept: ExitStack | None) -> Standing:
             arrays = {name: variable[...] for name, variable in arrays.items()}
         else:
             kept.push(closing.pop_all())
-        return Standing({}, facts, arrays)
+        return Checkpoint({}, facts, arrays)
 
 
 def _source(about: Mapping[str, Any], name: str, steps: int | None, done: Any) -> Source:
@@ -367,7 +300,7 @@ def _unfinished(
 ) -> Resumption | None:
     communicator = execution.communicator
     left: UnfinishedRun | None = None
-    standing, source, origin = None, None, dict[str, Any]()
+    checkpoint, source, origin = None, None, dict[str, Any]()
     chosen, is_same = tuple[str, ...](), True
     try:
         with communicator.raise_together():
@@ -382,7 +315,7 @@ def _unfinished(
             if left and source is None:
                 sink.conclude(left)
             elif left:
-                standing = left.standing(on_disk=communicator.size > 1)
+                checkpoint = left.checkpoint(on_disk=communicator.size > 1)
         if source is None:
             return None
         experiment = Experiment.build(source)
@@ -393,11 +326,11 @@ def _unfinished(
         run.driver.chosen = chosen
         recorder = run.recorder(run.sink(sink))
         with _damage_named(output):
-            take_up(run.driver, recorder, standing, communicator)
+            restore(run.driver, recorder, checkpoint, communicator)
         with communicator.raise_together(), _damage_named(output):
-            if left and standing:
+            if left and checkpoint:
                 columns = columns_of(run.scene)
-                sink.go_on(left, standing, columns, experiment.record.compression)
+                sink.go_on(left, checkpoint, columns, experiment.record.compression)
     except BaseException:
         if left:
             left.close()
@@ -411,13 +344,13 @@ def _continued(
     """The result stays as it is until the longer one takes its place."""
     communicator = execution.communicator
     with ExitStack() as open_until_read:
-        source, standing, dataset, chosen = None, None, None, tuple[str, ...]()
+        source, checkpoint, dataset, chosen = None, None, None, tuple[str, ...]()
         with communicator.raise_together():
             if communicator.is_root:
                 dataset = open_until_read.enter_context(reading(output))
                 kept = open_until_read if communicator.size > 1 else None
-                source, standing = longer(dataset, output, steps, anyway, kept)
-                chosen = chosen_parameters(standing.facts)
+                source, checkpoint = longer(dataset, output, steps, anyway, kept)
+                chosen = chosen_parameters(checkpoint.facts)
         source, chosen = communicator.bcast((source, chosen))
         experiment = Experiment.build(source)
         scene = execution.scene(experiment)
@@ -434,7 +367,7 @@ def _continued(
                 before = history(dataset, columns, experiment, pieced=pieced)
                 recorded = [t for t in dataset["time"].values.tolist() if experiment.records(t)][-1]
             recorder.begin(before)
-            take_up(run.driver, recorder, standing, communicator, recorded)
+            restore(run.driver, recorder, checkpoint, communicator, recorded)
         except BaseException:
             recorder.sink.abandon()
             raise

@@ -10,7 +10,6 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ import numpy as np
 
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
-from pbdkit.io.checkpoint import Arrays, Standing, taken_apart
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.recorder import Outcome, Recorder
 from pbdkit.io.sinks import KeepingSink, MemorySink, OverlappingSink, Sink
 from pbdkit.linear.stencil import Bound, wave_bound
@@ -72,11 +71,11 @@ class Driver(ABC):
         how it ended. Raises ExperimentError where there is no way."""
 
     @abstractmethod
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """All that decides how it goes on from a state just given out."""
 
     @abstractmethod
-    def take_up(self, standing: Mapping[str, Any]) -> None:
+    def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Goes on from there, before the first state was asked for."""
 
 
@@ -103,22 +102,22 @@ class Stepwise(Driver):
         self.kept = -1
         """The last step that was given out to be recorded, and was not rejected."""
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """The state, and what the guard and whoever looks whether it has settled remember."""
         settling = self.settling
         pace = {"pace": settling.pace, "obstacle": settling.obstacle} if settling else {}
         guard = {"good_step": self.guard.good_step, "next_look": self.guard.next_look}
         return {"state": self.state, "guard": guard, "kept": self.kept, **pace}
 
-    def take_up(self, standing: Mapping[str, Any]) -> None:
+    def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """What follows from the scene is its own: the size of the body, and when to look whether
         it has settled, where a run of so many steps has not looked by then."""
-        self.state, self.kept = standing["state"], standing["kept"]
-        is_good = standing["guard"]["good_step"] == self.state.step
+        self.state, self.kept = parts["state"], parts["kept"]
+        is_good = parts["guard"]["good_step"] == self.state.step
         kept = self.state.copy() if is_good else self.guard.kept
-        self.guard = replace(self.guard, kept=kept, **standing["guard"])
-        if self.settling and "pace" in standing:
-            self._take_up_settling(self.settling, standing["pace"], standing["obstacle"])
+        self.guard = replace(self.guard, kept=kept, **parts["guard"])
+        if self.settling and "pace" in parts:
+            self._take_up_settling(self.settling, parts["pace"], parts["obstacle"])
 
     def _take_up_settling(self, settling: Settling, pace: Pace, obstacle: str) -> None:
         step, own = self.state.step, settling.pace
@@ -240,13 +239,13 @@ class Straight(Driver):
     moment = 0.0
     """What of the load's way has been reached, in steps."""
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """The state and the moment: each increment begins anew from them."""
         return {"state": self.state, "moment": self.moment}
 
-    def take_up(self, standing: Mapping[str, Any]) -> None:
+    def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """From the last that was reached."""
-        self.state, self.moment = standing["state"], float(standing["moment"])
+        self.state, self.moment = parts["state"], float(parts["moment"])
 
     def states(self) -> States:
         """Interrupted, or without an equilibrium, it gives out how far it had come."""
@@ -305,26 +304,11 @@ class Straight(Driver):
                 raise self.rejection
 
 
-def standing_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Standing:
-    """All that decides how the run goes on, its arrays as they are, not copied; `rate` is told to
-    those who ask how far it is, in steps a second."""
-    arrays, experiment = Arrays(), driver.scene.experiment
-    facts = {
-        "run": taken_apart(driver.standing(), "run", arrays),
-        "seen": taken_apart(recorder.seen, "seen", arrays),
-        "chosen": list(driver.chosen),
-        "step": driver.state.step,
-        "rate": rate,
-        "at": time.time(),
-    }
-    about = {
-        "name": experiment.name,
-        "steps": experiment.steps,
-        "experiment": experiment.model_dump_json(by_alias=True),
-        "plugins": experiment.distributions(),
-        "pbdkit": version("pbdkit"),
-    }
-    return Standing(about, facts, arrays)
+def checkpoint_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Checkpoint:
+    """Return the checkpoint of a run, its arrays not copied; `rate` is in steps a second."""
+    experiment, step = driver.scene.experiment, driver.state.step
+    run = driver.state_dict()
+    return Checkpoint.of(experiment, run, recorder.seen, step, driver.chosen, rate)
 
 
 DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
@@ -468,7 +452,7 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
                 recorder.begin()
         for state in run:
             if keeping and run.driver.stopped:
-                keeping.suspend(standing_of(run.driver, recorder))
+                keeping.suspend(checkpoint_of(run.driver, recorder))
                 return report(run.driver.stopped)
             try:
                 with _located(scene):
@@ -482,10 +466,10 @@ def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
             ends = ends or state.step >= scene.experiment.steps
             if keeping and not ends and keeping.due():
                 rate = (state.step - first) / (time.perf_counter() - begun)
-                keeping.keep(standing_of(run.driver, recorder, rate))
+                keeping.keep(checkpoint_of(run.driver, recorder, rate))
         assert run.outcome is not None
         if keeping:
-            keeping.note_end(standing_of(run.driver, recorder))
+            keeping.note_end(checkpoint_of(run.driver, recorder))
         with _located(scene):
             recorder.finish(run.state, run.outcome, run.prediction)
     except BaseException:

@@ -444,7 +444,7 @@ def test_a_distance_that_is_infinite_can_be_gone_on_with(tmp_path: Path) -> None
     record(Run(scene_of(given | {"steps": 90})), NetcdfSink(whole))
     run = Run(scene_of(given))
     record(run, NetcdfSink(part))
-    assert run.driver.standing()["pace"].bounded[1] == np.inf
+    assert run.driver.state_dict()["pace"].bounded[1] == np.inf
     found = resumption(part, Watch(), steps=90)
     assert found is not None
     found.record()

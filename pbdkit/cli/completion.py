@@ -72,7 +72,7 @@ def _shipped(context: click.Context, begun: str) -> Iterable[str]:
 
 def _results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
     """The results in a folder, those of runs that are not finished, and the folders in it."""
-    from pbdkit.io.checkpoint import STORE
+    from pbdkit.io.run_store import STORE
 
     folder = begun[: begun.rfind("/") + 1]
     start, found = begun[len(folder) :], False

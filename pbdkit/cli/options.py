@@ -207,7 +207,7 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
 def refuse_unfinished(path: Path, *, force: bool) -> None:
     """Raises ExperimentError beside an unfinished run, which `force` discards, unless another
     process is writing it."""
-    from pbdkit.io.checkpoint import make_room
+    from pbdkit.io.run_store import make_room
 
     if not make_room(path, discard=force):
         raise ExperimentError(

@@ -85,8 +85,8 @@ def _refuse_elsewhere(file: Path) -> None:
 def status(output: Path, as_json: bool) -> None:
     """Say of an unfinished run how far it is, at which rate, and when it will end."""
     from pbdkit.errors import ExperimentError
-    from pbdkit.io.checkpoint import status_of
     from pbdkit.io.open import refuse_other_file, refuse_store
+    from pbdkit.io.run_store import status_of
 
     refuse_store(output)
     found = status_of(output)

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError, WriteError
 from pbdkit.io.atomic_file import FULL, Destination, is_full
-from pbdkit.io.checkpoint import Standing, UnfinishedRun, damaged
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When
 from pbdkit.io.paged_file import PagedFile, PiecedArray
+from pbdkit.io.run_store import UnfinishedRun, damaged
 from pbdkit.io.seal import is_whole
 from pbdkit.io.sinks import KeepingSink
 from pbdkit.scene.memory_estimate import CHUNK_BYTES, OPEN_CHUNK
@@ -287,7 +288,11 @@ class NetcdfSink(KeepingSink):
         self._next = time.perf_counter() + self._first_s
 
     def go_on(
-        self, unfinished: UnfinishedRun, standing: Standing, columns: list[Column], compression: str
+        self,
+        unfinished: UnfinishedRun,
+        checkpoint: Checkpoint,
+        columns: list[Column],
+        compression: str,
     ) -> None:
         """Takes up an unfinished run instead of beginning."""
         self.unfinished, self._temporary = unfinished, unfinished.records
@@ -295,7 +300,7 @@ class NetcdfSink(KeepingSink):
         file.verify()
         with self._storing():
             file.forget()
-            self._file = reopened(file, columns, standing, compress=compression == "zlib")
+            self._file = reopened(file, columns, checkpoint, compress=compression == "zlib")
         self._next = time.perf_counter() + EVERY_S
 
     def conclude(self, unfinished: UnfinishedRun) -> None:
@@ -317,7 +322,7 @@ class NetcdfSink(KeepingSink):
         """After a second, and then about once a second."""
         return time.perf_counter() >= self._next
 
-    def keep(self, standing: Standing) -> None:
+    def keep(self, checkpoint: Checkpoint) -> None:
         """One commit: what it returns from outlives the process and the machine."""
         begun = time.perf_counter()
         with self._storing() as file:
@@ -326,21 +331,20 @@ class NetcdfSink(KeepingSink):
                 self.unfinished = UnfinishedRun.begin(output, self._temporary, disk)
                 self._temporary = self.unfinished.records
             file.flush()
-            about = standing.about | {"origin": self._origin}
-            said = Standing(about, standing.facts, standing.arrays)
-            self.unfinished.keep(said, file.file, file.waiting, file.written)
+            checkpoint = checkpoint.with_origin(self._origin)
+            self.unfinished.keep(checkpoint, file.file, file.waiting, file.written)
         now = time.perf_counter()
         self._next = now + max(EVERY_S, SHARE * (now - begun))
 
-    def suspend(self, standing: Standing) -> None:
+    def suspend(self, checkpoint: Checkpoint) -> None:
         """Keeps it and leaves it."""
-        self.keep(standing)
+        self.keep(checkpoint)
         self.abandon()
 
-    def note_end(self, standing: Standing) -> None:
+    def note_end(self, checkpoint: Checkpoint) -> None:
         """As a group of the file."""
         with self._storing() as file:
-            file.add_group(FINAL_STATE, json.dumps(standing.facts), standing.arrays)
+            file.add_group(FINAL_STATE, json.dumps(checkpoint.facts), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """Completes the file, seals and syncs it, reads it back, and gives it its name; then the
@@ -405,16 +409,16 @@ class NetcdfSink(KeepingSink):
 
 
 def reopened(
-    file: PagedFile, columns: list[Column], standing: Standing, *, compress: bool
+    file: PagedFile, columns: list[Column], checkpoint: Checkpoint, *, compress: bool
 ) -> NetcdfFile:
     """The dataset in the file of an unfinished run, with what waited."""
     found = NetcdfFile(file, columns, compress=compress)
     waiting = {
         name.removeprefix(WAITING): list(array)
-        for name, array in standing.arrays.items()
+        for name, array in checkpoint.arrays.items()
         if name.startswith(WAITING)
     }
-    written = standing.facts.get("written")
+    written = checkpoint.facts.get("written")
     if not isinstance(written, dict) or not {*waiting} <= {*written} == {*found.waiting}:
         raise StorageError("the store holds another dataset than the experiment makes")
     try:

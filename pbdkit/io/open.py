@@ -18,9 +18,9 @@ from pbdkit.errors import (
     WriteError,
     one_line,
 )
-from pbdkit.io.checkpoint import STORE, has_committed
 from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
 from pbdkit.io.members import SWEEP, choices, member
+from pbdkit.io.run_store import STORE, has_committed
 from pbdkit.io.seal import BrokenSealError, SealedFile, opened, seal_of
 from pbdkit.model.reading import EXPERIMENT, kind_of, read_file, what_takes
 from pbdkit.model.shipped import shipped_names

@@ -17,6 +17,7 @@ import numpy as np
 
 from pbdkit.errors import PluginError
 from pbdkit.io import layout
+from pbdkit.io.checkpoint import RecordedSteps
 from pbdkit.io.layout import Column, Values, When
 from pbdkit.io.physical import Physical, Twins
 from pbdkit.io.sinks import Sink
@@ -199,14 +200,6 @@ class Outcome:
     certificate: dict[str, Any] | None = None
 
 
-@dataclass
-class Seen:
-    """The last moments, in steps, of which anything was taken, and of which a record was made."""
-
-    step: float = -1
-    recorded: float = -1
-
-
 class Recorder:
     """Records the run of one scene into a sink; `seen` decides how it goes on."""
 
@@ -215,7 +208,7 @@ class Recorder:
         self._tables, self._measured = Tables(scene), Measured(scene)
         self._columns = columns_of(scene)
         self._twins = Twins(self._columns)
-        self.seen = Seen()
+        self.seen = RecordedSteps()
         self.warnings: tuple[str, ...] = ()
 
     def begin(self, history: Iterable[Values] | None = None) -> None:
@@ -270,7 +263,7 @@ class Recorder:
         if values:
             self.sink.put(self._twins.beside(values))
         now = values.get("time", state.step)
-        self.seen = Seen(now, now if "time" in values else self.seen.recorded)
+        self.seen = RecordedSteps(now, now if "time" in values else self.seen.recorded)
 
     def _taken(self, state: State, last: bool, within: float | None = None) -> Values:
         """What is wanted of a step."""

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from pbdkit.errors import ExperimentError
 from pbdkit.io.atomic_file import kind_of, written
-from pbdkit.io.checkpoint import make_room
 from pbdkit.io.open import fault_of
 from pbdkit.io.paged_file import PagedFile
+from pbdkit.io.run_store import make_room
 
 if TYPE_CHECKING:
     import xarray

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbdkit.io.checkpoint import Standing
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values
 
 if TYPE_CHECKING:
@@ -49,15 +49,15 @@ class KeepingSink(Sink):
         """Whether it is time to."""
 
     @abstractmethod
-    def keep(self, standing: Standing) -> None:
+    def keep(self, checkpoint: Checkpoint) -> None:
         """After what was put; what is kept outlives `abandon`."""
 
     @abstractmethod
-    def suspend(self, standing: Standing) -> None:
+    def suspend(self, checkpoint: Checkpoint) -> None:
         """Keeps it; nothing more comes for now."""
 
     @abstractmethod
-    def note_end(self, standing: Standing) -> None:
+    def note_end(self, checkpoint: Checkpoint) -> None:
         """Before `finish`: from there the run can be continued to more steps."""
 
 
@@ -136,19 +136,19 @@ class OverlappingSink(KeepingSink):
         """Not while the last one is being kept."""
         return (self._keeping is None or self._keeping.done()) and self._inner.due()
 
-    def keep(self, standing: Standing) -> None:
+    def keep(self, checkpoint: Checkpoint) -> None:
         """Beside the run, from a copy."""
-        self._keeping = self._hand_over(True, self._inner.keep, standing.copied())
+        self._keeping = self._hand_over(True, self._inner.keep, checkpoint.copied())
 
-    def suspend(self, standing: Standing) -> None:
+    def suspend(self, checkpoint: Checkpoint) -> None:
         """When all is written."""
         self._end()
-        self._inner.suspend(standing)
+        self._inner.suspend(checkpoint)
 
-    def note_end(self, standing: Standing) -> None:
+    def note_end(self, checkpoint: Checkpoint) -> None:
         """When all is written; what is known at the end only comes after it."""
         self._wait()
-        self._inner.note_end(standing)
+        self._inner.note_end(checkpoint)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """When all is written."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pbdkit.errors import StorageError
-from pbdkit.io.checkpoint import UnfinishedRun, put_together
 from pbdkit.io.layout import Column, Values
 from pbdkit.io.netcdf import NetcdfFile, reopened
-from pbdkit.io.recorder import Outcome, Recorder, Seen, columns_of
+from pbdkit.io.recorder import Outcome, Recorder, columns_of
+from pbdkit.io.run_store import UnfinishedRun
 from pbdkit.io.seal import opened_in
 from pbdkit.io.sinks import Sink
 from pbdkit.model.experiment import Experiment
@@ -53,13 +53,11 @@ def unfinished_dataset(output: Path) -> Any:
     if "finished" in facts:
         left.release()
         return opened_in(file)
-    standing = left.standing()
+    checkpoint = left.checkpoint()
     left.release()
     try:
-        parts = json.loads(standing.about["experiment"])
-        kinds: dict[str, type] = {"State": State, "Seen": Seen}
-        state = put_together(facts["run"]["state"], standing.arrays, kinds)
-        seen = put_together(facts["seen"], standing.arrays, kinds)
+        parts = json.loads(checkpoint.about["experiment"])
+        state, seen = checkpoint.state(State)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise StorageError(f"{output}: its store is damaged: {error}") from None
     refuse_retired(parts, f"{output}, which is unfinished,")
@@ -67,7 +65,7 @@ def unfinished_dataset(output: Path) -> Any:
     if not isinstance(state, State) or not state.fits(initial_state(scene)):
         raise StorageError(f"{output}: its store holds a state of another experiment")
     compress = scene.experiment.record.compression == "zlib"
-    making = reopened(file, columns_of(scene), standing, compress=compress)
+    making = reopened(file, columns_of(scene), checkpoint, compress=compress)
     recorder = Recorder(scene, Overlay(making))
     recorder.seen = seen
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"

@@ -129,14 +129,14 @@ class Division:
         """The whole state, in the first process."""
         return self.halo.gathered(state)
 
-    def standing(self, own: dict[str, Any]) -> dict[str, Any]:
+    def state_dict(self, own: dict[str, Any]) -> dict[str, Any]:
         """That of a driver of the part with the state of the whole, as it is joined."""
         return own | {"state": self.halo.joined(own["state"])}
 
-    def taken_up(self, standing: Mapping[str, Any]) -> dict[str, Any]:
+    def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
         """For the part, where the first process has that of the whole."""
-        rest = self.ranks.bcast({key: part for key, part in standing.items() if key != "state"})
-        state = self.dealt(standing.get("state") if self.ranks.is_root else None)
+        rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
+        state = self.dealt(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
@@ -230,13 +230,13 @@ class DividedStepwise(Stepwise):
         """As the first process finds it."""
         return int(self._division.ranks.bcast(super()._steps_in(seconds_a_step)))
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """With the state of the whole, as it is joined."""
-        return self._division.standing(super().standing())
+        return self._division.state_dict(super().state_dict())
 
-    def take_up(self, standing: Mapping[str, Any]) -> None:
+    def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """From the state of the whole, which the first process has."""
-        super().take_up(self._division.taken_up(standing))
+        super().load_state_dict(self._division.scattered(parts))
 
 
 CHANGING_FRAME = "a frame whose map follows numbers of the rule that change in time"
@@ -336,13 +336,13 @@ class DividedStraight(Straight):
         strip = strip_of(scene, division.part.subdomain, ranks.size)
         self._rows = DividedRows(ranks, division.halo, strip)
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """With the state of the whole, as it is joined."""
-        return self._division.standing(super().standing())
+        return self._division.state_dict(super().state_dict())
 
-    def take_up(self, standing: Mapping[str, Any]) -> None:
+    def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """From the state of the whole, which the first process has."""
-        super().take_up(self._division.taken_up(standing))
+        super().load_state_dict(self._division.scattered(parts))
 
     def _way(self, state: State) -> Way:
         from pbdkit.equilibrium.solve import finder_of, increments

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbdkit.communicator import Communicator
 from pbdkit.errors import ExperimentError, PbdkitError
-from pbdkit.io.checkpoint import Standing
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When, when_measured
 from pbdkit.io.paged_file import PiecedArray
 from pbdkit.io.recorder import Measured, Recorder, columns_of
@@ -302,17 +302,17 @@ class PartSink(KeepingSink):
         """As the first process finds it."""
         return bool(self._ranks.bcast(self._inner is not None and self._inner.due()))
 
-    def keep(self, standing: Standing) -> None:
+    def keep(self, checkpoint: Checkpoint) -> None:
         """One for all, with the state of the whole."""
-        self._first(lambda inner: inner.keep(standing), standing.arrays)
+        self._first(lambda inner: inner.keep(checkpoint), checkpoint.arrays)
 
-    def suspend(self, standing: Standing) -> None:
+    def suspend(self, checkpoint: Checkpoint) -> None:
         """As it is kept."""
-        self._first(lambda inner: inner.suspend(standing), standing.arrays)
+        self._first(lambda inner: inner.suspend(checkpoint), checkpoint.arrays)
 
-    def note_end(self, standing: Standing) -> None:
+    def note_end(self, checkpoint: Checkpoint) -> None:
         """As it is kept."""
-        self._first(lambda inner: inner.note_end(standing), standing.arrays)
+        self._first(lambda inner: inner.note_end(checkpoint), checkpoint.arrays)
 
     def finish(self, attributes: dict[str, str]) -> None:
         """Says on how many processes it was run."""

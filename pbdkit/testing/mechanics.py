@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pbdkit.communicator import SERIAL
 from pbdkit.errors import ExperimentError
-from pbdkit.io.checkpoint import Standing
+from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.recorder import Recorder
 from pbdkit.io.sinks import MemorySink
 from pbdkit.model.experiment import Experiment
@@ -31,9 +31,9 @@ from pbdkit.plugin import Component, FollowerRule, FramePolicy, StoresEnergy
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
-from pbdkit.restart import take_up
+from pbdkit.restart import restore
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import Run, record, standing_of
+from pbdkit.simulation import Run, checkpoint_of, record
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
@@ -162,11 +162,11 @@ def resumed(scene: Scene, again: Scene, step: int, start: State | None = None) -
         recorder.observe(state)
         if state.step >= step:
             break
-    kept = standing_of(left.driver, recorder)
+    kept = checkpoint_of(left.driver, recorder)
     facts = json.loads(json.dumps(kept.facts))
     rest, recorder = Run(again), Recorder(again, sink)
-    standing = Standing(kept.about, facts, kept.copied().arrays)
-    take_up(rest.driver, recorder, standing, SERIAL)
+    checkpoint = Checkpoint(kept.about, facts, kept.copied().arrays)
+    restore(rest.driver, recorder, checkpoint, SERIAL)
     record(rest, sink, recorder=recorder)
     return sink.dataset()
 

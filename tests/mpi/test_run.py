@@ -25,8 +25,8 @@ from scene_strategies import calibrated_experiments, experiments, pulled_apart, 
 from thread_ranks import on_ranks
 
 import pbdkit
-from pbdkit.io.checkpoint import has_committed, status_of
 from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.run_store import has_committed, status_of
 from pbdkit.mpi.partition import subdomains
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption

@@ -202,7 +202,7 @@ def _each_step() -> None:
 
 def _unfinished() -> None:
     """A run that is killed at its second commit."""
-    from pbdkit.io.checkpoint import UnfinishedRun
+    from pbdkit.io.run_store import UnfinishedRun
 
     _experiment()
     keep, left = UnfinishedRun.keep, [2]

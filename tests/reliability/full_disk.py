@@ -16,7 +16,7 @@ from pathlib import Path
 from trials import BASE, BREAKING, OUTPUT, debris, differences, done, reference, row
 
 from pbdkit.errors import PbdkitError
-from pbdkit.io.checkpoint import status_of
+from pbdkit.io.run_store import status_of
 
 LOG = Path("/dev/shm/pbdkit-full-disk-log")
 PARTS = BASE | BREAKING | {"body": {"type": "grid", "columns": 40, "rows": 30}, "steps": 16}

@@ -38,10 +38,10 @@ from trials import (
 )
 
 from pbdkit.errors import PbdkitError
-from pbdkit.io import checkpoint as run_store
-from pbdkit.io import checkpoint as unfinished
+from pbdkit.io import run_store
+from pbdkit.io import run_store as unfinished
 from pbdkit.io.atomic_file import is_local
-from pbdkit.io.checkpoint import status_of
+from pbdkit.io.run_store import status_of
 
 KINDS = tuple(EXPERIMENTS)
 MOST_KILLS = 4

@@ -46,7 +46,7 @@ from trials import (
 
 import pbdkit
 from pbdkit.errors import PbdkitError
-from pbdkit.io.checkpoint import RunStore, UnfinishedRun, store_of
+from pbdkit.io.run_store import RunStore, UnfinishedRun, store_of
 from pbdkit.io.sinks import OverlappingSink
 
 KINDS = ("breaking", "settling", "increments", "large")

@@ -23,7 +23,7 @@ from trials import BASE, BREAKING, OUTPUT, debris, differences, often, reference
 from trials import write_experiment as written
 
 from pbdkit.cli import main as program
-from pbdkit.io.checkpoint import is_unfinished
+from pbdkit.io.run_store import is_unfinished
 
 EXPERIMENTS = {
     "breaking": BASE | BREAKING | {"steps": 300},

@@ -13,15 +13,15 @@ from trials import differences, often
 
 from pbdkit import simulation as drivers
 from pbdkit.communicator import SERIAL
-from pbdkit.io.checkpoint import UnfinishedRun, is_unfinished
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.recorder import Recorder, columns_of
+from pbdkit.io.run_store import UnfinishedRun, is_unfinished
 from pbdkit.io.sinks import OverlappingSink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
 from pbdkit.plugin import Component
 from pbdkit.progress import StoppedError, Watch
-from pbdkit.restart import take_up
+from pbdkit.restart import restore
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Report, Run, record
 
@@ -69,11 +69,11 @@ def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any])
     try:
         parts = with_engine(json.loads(left.about["experiment"]), engine)
         experiment = Experiment.build(Source("stored", parts), own)
-        scene, standing = build_scene(experiment), left.standing()
+        scene, checkpoint = build_scene(experiment), left.checkpoint()
         sink = NetcdfSink(output)
         run, recorder = Run(scene, watch=watch), Recorder(scene, OverlappingSink(sink))
-        take_up(run.driver, recorder, standing, SERIAL)
-        sink.go_on(left, standing, columns_of(scene), compression_of(experiment))
+        restore(run.driver, recorder, checkpoint, SERIAL)
+        sink.go_on(left, checkpoint, columns_of(scene), compression_of(experiment))
     except BaseException:
         left.close()
         raise

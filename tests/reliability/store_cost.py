@@ -21,8 +21,8 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from pairing import wait_for_quiet
 from sheets import Running, moving, scene_of
 
-from pbdkit.io.checkpoint import store_of
 from pbdkit.io.netcdf import FIRST_S, NetcdfSink
+from pbdkit.io.run_store import store_of
 from pbdkit.io.sinks import OverlappingSink
 from pbdkit.simulation import Run, record
 

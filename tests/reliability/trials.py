@@ -25,8 +25,8 @@ import xarray  # noqa: F401  # as above
 
 import pbdkit
 import pbdkit.cli.run
-import pbdkit.io.checkpoint
 import pbdkit.io.open
+import pbdkit.io.run_store
 import pbdkit.restart
 import pbdkit.stability.forecast
 from pbdkit.cli import main

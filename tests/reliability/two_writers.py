@@ -36,8 +36,8 @@ from trials import (
 )
 
 from pbdkit.io import atomic_file as destination
-from pbdkit.io import checkpoint as unfinished
-from pbdkit.io.checkpoint import has_committed
+from pbdkit.io import run_store as unfinished
+from pbdkit.io.run_store import has_committed
 
 PARTS = {"small": BASE | BREAKING, "large": BASE | LARGE}
 KINDS = tuple(PARTS)

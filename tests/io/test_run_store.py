@@ -23,11 +23,11 @@ from hypothesis import strategies as st
 from scene_strategies import experiments, pulled_apart, samples
 
 import pbdkit
-from pbdkit.io import checkpoint as run_store
 from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io import run_store as run_store
 from pbdkit.io.atomic_file import is_local
-from pbdkit.io.checkpoint import RunStore, UnfinishedRun, status_of, store_of
 from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.run_store import RunStore, UnfinishedRun, status_of, store_of
 from pbdkit.io.sinks import OverlappingSink
 
 FOLDER = Path(__file__).parents[1] / "reliability"
