@@ -19,7 +19,7 @@ from pbdkit.plugin import Component
 from pbdkit.plugin.registry import GIVEN, Registry
 from pbdkit.progress import Watch, progress_bar
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import FAILED, Report, Run, record
+from pbdkit.simulation import FAILED, Run, RunReport, record
 from pbdkit.stability.forecast import refuse_too_much_output
 from pbdkit.stability.relaxation import tuned
 
@@ -139,14 +139,14 @@ def _run_into(output: Path, experiment: Experiment, progress: bool, force: bool)
     return _finished(report, open(file.written))
 
 
-def _recorded(scene: Scene, sink_of: Callable[[Run], Sink], progress: bool) -> Report:
+def _recorded(scene: Scene, sink_of: Callable[[Run], Sink], progress: bool) -> RunReport:
     with progress_bar(progress) as show:
         run = Run(scene, watch=Watch(show=show))
         _warn(run.warnings)
         return record(run, sink_of(run))
 
 
-def _finished(report: Report, dataset: xarray.Dataset) -> xarray.Dataset:
+def _finished(report: RunReport, dataset: xarray.Dataset) -> xarray.Dataset:
     if report.outcome.status in FAILED:
         raise DivergedError(report.outcome.stop_reason, dataset)
     _warn(report.warnings)

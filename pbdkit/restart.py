@@ -29,7 +29,7 @@ from pbdkit.model.shipped import read_experiment
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene
-from pbdkit.simulation import Driver, Execution, Report, Run, record
+from pbdkit.simulation import Driver, Execution, Run, RunReport, record
 from pbdkit.stability.relaxation import with_solver
 
 
@@ -244,7 +244,7 @@ class Resumption:
     sink: NetcdfSink
     recorder: Recorder
 
-    def record(self) -> Report:
+    def record(self) -> RunReport:
         """To its end. Raises what any run does."""
         return record(self.run, self.recorder.sink, recorder=self.recorder)
 

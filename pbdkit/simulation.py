@@ -19,7 +19,7 @@ import numpy as np
 from pbdkit.communicator import SERIAL, Communicator
 from pbdkit.errors import ExperimentError
 from pbdkit.io.checkpoint import Checkpoint
-from pbdkit.io.recorder import Outcome, Recorder
+from pbdkit.io.recorder import Recorder, RunOutcome
 from pbdkit.io.sinks import KeepingSink, MemorySink, OverlappingSink, Sink
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from pbdkit.model.experiment import Experiment
 
 
-States = Generator[State, None, Outcome]
+States = Generator[State, None, RunOutcome]
 
 
 class Driver(ABC):
@@ -55,7 +55,7 @@ class Driver(ABC):
     def __init__(self, scene: Scene, state: State, watch: Watch) -> None:
         self.scene, self.state, self.watch = scene, state, watch
         self.ending = self.is_over = False
-        self.stopped: Outcome | None = None
+        self.stopped: RunOutcome | None = None
         self.chosen: tuple[str, ...] = ()
         """The parameters of the solver that were `auto`, and are numbers now."""
         self.within: float | None = None
@@ -85,7 +85,7 @@ MOST_STEPS = 100_000
 """A call."""
 
 
-class Stepwise(Driver):
+class SteppingDriver(Driver):
     """The driver of the solver `stepping`: gives out a state at every step of which something is
     wanted, and some between."""
 
@@ -143,7 +143,7 @@ class Stepwise(Driver):
 
     def _stepped(self) -> States:
         steps = self.scene.experiment.steps
-        outcome: Outcome | None = None
+        outcome: RunOutcome | None = None
         try:
             yield from self._given_out()
             while not (outcome := self._settled()) and (step := self.state.step) < steps:
@@ -152,14 +152,14 @@ class Stepwise(Driver):
                 yield from self._given_out()
         except StoppedError:  # after the last step, too, while it is looked at
             step = self.state.step
-            self.stopped = outcome = Outcome("interrupted", f"stopped after step {step}", step)
+            self.stopped = outcome = RunOutcome("interrupted", f"stopped after step {step}", step)
         if self.stopped or self.kept < self.state.step:
             self.ending = True
             yield from self._given_out()
         if outcome:
             return outcome
         unsettled = f", not settled: {self.settling.obstacle}" if self.settling else ""
-        return Outcome("complete", f"all steps done{unsettled}", steps)
+        return RunOutcome("complete", f"all steps done{unsettled}", steps)
 
     def _advance(self) -> None:
         """To the next step at which to look. Raises FloatingPointError."""
@@ -187,12 +187,12 @@ class Stepwise(Driver):
         if self.scene.experiment.records(self.state.step):
             self.kept = self.state.step
 
-    def _settled(self) -> Outcome | None:
+    def _settled(self) -> RunOutcome | None:
         state = self.state
         if self.settling is None or state.step != self.settling.pace.next_look:
             return None
         found = self.settling.look(state)
-        return Outcome("settled", str(found), state.step, found.as_dict()) if found else None
+        return RunOutcome("settled", str(found), state.step, found.as_dict()) if found else None
 
     def _diverged(self, error: FloatingPointError) -> States:
         step, rule = self.state.step, self.scene.experiment.rule.type
@@ -213,7 +213,7 @@ class Stepwise(Driver):
                         f"; kept is step {good.step}, the last no larger than the body and its "
                         "leaders' ways"
                     )
-        return Outcome("diverged", reason, step)
+        return RunOutcome("diverged", reason, step)
 
     def _cause_of_nan(self) -> str:
         """Where the rule made NaN of numbers, found by stepping once more with numpy; empty where
@@ -231,7 +231,7 @@ class Stepwise(Driver):
         return f": a displacement is NaN{found}; guard divisions and roots with `pbdkit.where`"
 
 
-class Straight(Driver):
+class EquilibriumDriver(Driver):
     """The driver of the solver `equilibrium`: gives out the start, what it reaches on the way, and
     the equilibrium."""
 
@@ -257,21 +257,21 @@ class Straight(Driver):
         yield state
         try:
             certificate = yield from self._on_the_way(state)
-            outcome = Outcome("complete", str(certificate), state.step, certificate.as_dict())
+            outcome = RunOutcome("complete", str(certificate), state.step, certificate.as_dict())
         except UnconvergedError as error:
             found = error.certificate
-            outcome = Outcome("unconverged", f"{error}: {found}", state.step, found.as_dict())
+            outcome = RunOutcome("unconverged", f"{error}: {found}", state.step, found.as_dict())
         except SeparatedError as error:
-            outcome = Outcome("separated", str(error), state.step)
+            outcome = RunOutcome("separated", str(error), state.step)
         except FloatingPointError as error:
-            return Outcome("unconverged", f"{error} left all bounds", state.step)
+            return RunOutcome("unconverged", f"{error} left all bounds", state.step)
         except StoppedError:
             reason = f"stopped on the way to equilibrium, after step {state.step}"
-            outcome = self.stopped = Outcome("interrupted", reason, state.step)
+            outcome = self.stopped = RunOutcome("interrupted", reason, state.step)
         self.ending = outcome.status != "complete"
         yield state
         if self.rejection:
-            return Outcome("unconverged", f"{self.rejection} left all bounds", state.step)
+            return RunOutcome("unconverged", f"{self.rejection} left all bounds", state.step)
         return outcome
 
     def _way(self, state: State) -> Way:
@@ -312,8 +312,8 @@ def checkpoint_of(driver: Driver, recorder: Recorder, rate: float = 0.0) -> Chec
 
 
 DRIVERS: dict[type[Solver], Callable[[Scene, State, Watch], Driver]] = {
-    Stepping: Stepwise,
-    Equilibrium: Straight,
+    Stepping: SteppingDriver,
+    Equilibrium: EquilibriumDriver,
 }
 """What carries out what an experiment asks for under `solver`."""
 FAILED = ("diverged", "unconverged", "separated")
@@ -340,7 +340,7 @@ class Run:
     ) -> None:
         chosen = scene.experiment.stepping.open_parameters
         self.scene = scene = tuned(scene)
-        self.outcome: Outcome | None = None
+        self.outcome: RunOutcome | None = None
         """How the run ended; None until it has."""
         with _located(scene):
             make = DRIVERS[type(scene.experiment.solver)]
@@ -397,11 +397,11 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Report:
+class RunReport:
     """How a recorded run went, for those who look at its cost, and what is to be said of its
     end."""
 
-    outcome: Outcome
+    outcome: RunOutcome
     particles: int
     wall_s: float
     choice: Choice
@@ -434,16 +434,16 @@ def peak_memory() -> int:
     return getrusage(RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> Report:
+def record(run: Run, sink: Sink, *, recorder: Recorder | None = None) -> RunReport:
     """Takes a run to its end, and what the experiment records of it into the sink. A `recorder` of
     the sink that has begun goes on with what it took before. A run that is asked to stop is left
     where it stands, where the sink can keep that."""
     begun, scene, first = time.perf_counter(), run.scene, run.state.step
     keeping = sink if isinstance(sink, KeepingSink) else None
 
-    def report(outcome: Outcome, warnings: tuple[str, ...] = ()) -> Report:
+    def report(outcome: RunOutcome, warnings: tuple[str, ...] = ()) -> RunReport:
         wall_s = time.perf_counter() - begun
-        return Report(outcome, run.particles, wall_s, run.choice, warnings, first, run.processes)
+        return RunReport(outcome, run.particles, wall_s, run.choice, warnings, first, run.processes)
 
     try:
         if recorder is None:

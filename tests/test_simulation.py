@@ -18,7 +18,7 @@ from pbdkit.io.sinks import MemorySink
 from pbdkit.model.solver import Equilibrium, Solver
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import DRIVERS, Run, Stepwise, record
+from pbdkit.simulation import DRIVERS, Run, SteppingDriver, record
 from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.state import State
 
@@ -109,10 +109,10 @@ def test_all_that_decides_when_a_run_settles_is_data(tensile: dict[str, Any]) ->
         if state.step == middle:
             break
     driver, state = left.driver, left.state.copy()
-    assert isinstance(driver, Stepwise)
+    assert isinstance(driver, SteppingDriver)
     assert driver.settling is not None
     rest = Run(scene_of(given), start=state)
-    assert isinstance(rest.driver, Stepwise)
+    assert isinstance(rest.driver, SteppingDriver)
     assert rest.driver.settling is not None
     rest.driver.guard = Guard(**vars(copy.deepcopy(driver.guard)))
     rest.driver.settling.pace = Pace(**dataclasses.asdict(driver.settling.pace))

@@ -18,7 +18,7 @@ from pbdkit.cli.options import PATH, at_option, json_option, result_argument
 if TYPE_CHECKING:
     import xarray
 
-    from pbdkit.io.explain import Explained, Standing
+    from pbdkit.io.explain import BondStatus, Explained
     from pbdkit.scene.scene import Scene
 
 
@@ -183,7 +183,7 @@ def _run_in_words(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
-    s: Standing = found["bond"]
+    s: BondStatus = found["bond"]
     yield f"bond {_name(s)}: shell {s.shell}, rest length {s.rest_length:.6g}"
     if s.state == "broken":
         strain = _number(s.strain_at_break, "an unknown strain")
@@ -202,7 +202,7 @@ def _bond_in_words(found: dict[str, Any]) -> Iterator[str]:
     yield from _around_in_words(found["around"], s.step)
 
 
-def _around_in_words(around: list[Standing], step: int | None) -> Iterator[str]:
+def _around_in_words(around: list[BondStatus], step: int | None) -> Iterator[str]:
     """The other bonds at its ends: what broke before it, with it and after it."""
     broken = [s for s in around if s.step is not None]
     groups = {"broken around it": broken}
@@ -219,11 +219,11 @@ def _around_in_words(around: list[Standing], step: int | None) -> Iterator[str]:
     yield f"not broken around it: {len(whole)}{strained}"
 
 
-def _name(s: Standing) -> str:
+def _name(s: BondStatus) -> str:
     return f"{s.bond[0]}-{s.bond[1]}"
 
 
-def _standing(s: Standing) -> str:
+def _standing(s: BondStatus) -> str:
     """An unbroken bond in a few words."""
     words = f"{s.state}, strain {s.strain:.6g} in step {s.at_step}"
     if s.breaks_above is not None and s.share is not None:

@@ -21,9 +21,9 @@ from pbdkit.errors import ExperimentError, NotSharedError, PbdkitWarning
 
 if TYPE_CHECKING:
     from pbdkit.io.netcdf import NetcdfSink
-    from pbdkit.io.recorder import Outcome
+    from pbdkit.io.recorder import RunOutcome
     from pbdkit.progress import Watch
-    from pbdkit.simulation import Execution, Report, Run
+    from pbdkit.simulation import Execution, Run, RunReport
 
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -232,7 +232,7 @@ def _warn(texts: Iterable[str], quiet: bool) -> None:
 
 
 def _tell(
-    run: Run, report: Report, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
+    run: Run, report: RunReport, file: NetcdfSink, path: Path, quiet: bool, as_json: bool
 ) -> None:
     """What there is to say of a run that ended."""
     _warn(report.warnings, quiet)
@@ -249,14 +249,14 @@ def _tell(
         click.echo(f"{what}; what was recorded until then is in {file.written}{left}", err=True)
 
 
-def _exit_status(outcome: Outcome, stop: Stop) -> int:
+def _exit_status(outcome: RunOutcome, stop: Stop) -> int:
     """Of the program, in all processes."""
     if outcome.status in ENDED:
         return 0
     return stop.exit_status if outcome.status == "interrupted" else 4
 
 
-def _say(report: Report, path: Path, *, settling: bool) -> None:
+def _say(report: RunReport, path: Path, *, settling: bool) -> None:
     outcome = report.outcome
     made = f"{outcome.steps - report.first} of {outcome.steps}" if report.first else outcome.steps
     steps = "step" if made == 1 else "steps"
@@ -272,7 +272,7 @@ def _say(report: Report, path: Path, *, settling: bool) -> None:
         click.echo(f"engine: {report.choice.engine}{threads} ({report.choice.reason})")
 
 
-def _figures(report: Report, path: Path) -> dict[str, Any]:
+def _figures(report: RunReport, path: Path) -> dict[str, Any]:
     from pbdkit.simulation import peak_memory
 
     peak = peak_memory()

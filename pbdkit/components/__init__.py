@@ -14,8 +14,9 @@ COMPONENTS = {
     "elasticity": "Elastic Orthotropic StrainGradient",
     "frames": "MeanFrame FirstFrame MirrorFrame NoFrame Natural",
     "fracture": "NoFracture Threshold StrainFracture Damage Cohesive",
-    "diagnostics": "PE1 PE1Intact PE2 Displacement Track Broken SmallestCellArea CrackPath "
-    "Strain Rotation Stress StrainEnergy Reaction LoadDisplacement StressStrain Contact",
+    "diagnostics": "PE1 PE1Intact PE2 Displacement Track BrokenBonds SmallestCellArea CrackPath "
+    "Strain LocalRotation Stress StrainEnergy Reaction LoadDisplacement StressStrain "
+    "ContactForces",
 }
 """By module of this folder the classes that it offers."""
 

@@ -122,7 +122,7 @@ class Track(Diagnostic):
         return (now.reference(rows) + now.displacement(rows),)
 
 
-class Broken(Diagnostic):
+class BrokenBonds(Diagnostic):
     """The number of broken bonds."""
 
     type: Literal["broken"] = "broken"
@@ -252,7 +252,7 @@ class Strain(Diagnostic):
         return _inside(now, xx, yy, xy, equivalent, principal(xx, yy, xy))
 
 
-class Rotation(Diagnostic):
+class LocalRotation(Diagnostic):
     """The angle by which the surroundings of every body particle inside the outline have turned,
     counterclockwise, from -π to π; 0 where no cell is.
 
@@ -603,7 +603,7 @@ def _joint_pushes(need: Floats, ways: Floats) -> Floats:
     return np.asarray(np.array(found)[best].mean(axis=0))
 
 
-class Contact(Diagnostic):
+class ContactForces(Diagnostic):
     """The force that each obstacle exerts on the body, and on every particle.
 
     On a follower that touches an obstacle, f = max(0, -F·n) n: what balances the force F of its

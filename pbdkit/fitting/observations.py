@@ -359,7 +359,7 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Prediction:
     """At some parameters: the residuals (measured - predicted) / weighted noise, (number,), and how
     the predictions over it change with each parameter, (number, parameter), with each unknown
     of the observation's own, (number, own), and with Young's modulus, (number,)."""
@@ -375,7 +375,7 @@ class Near:
     """What was seen before, and by what share of the way between its bounds a parameter is away
     from there at most."""
 
-    seen: Seen
+    seen: Prediction
     away: float
 
 
@@ -422,7 +422,7 @@ class Observation(ABC):
         own: Floats,
         modulus: float,
         near: Near | None = None,
-    ) -> Seen:
+    ) -> Prediction:
         """What there is at an experiment like its own; what was seen `near` there is where
         the search for it may begin. Raises ExperimentError, and
         UnconvergedError where nothing can be predicted."""
@@ -469,13 +469,13 @@ class RunObservation(Observation):
         own: Floats,
         modulus: float,
         near: Near | None = None,
-    ) -> Seen:
+    ) -> Prediction:
         """By one run, and eight for each parameter."""
         predicted, broken, steps = self._run(experiment)
         columns = [self._change(experiment, each, broken, steps) for each in parameters]
         rows = len(self.measured)
         scale = modulus if self.needs_modulus else 1.0
-        return Seen(
+        return Prediction(
             (self.measured - scale * predicted) / self.weighted_noise,
             scale * np.array(columns).T.reshape(rows, len(columns)) / self.weighted_noise,
             np.zeros((rows, 0)),
@@ -688,7 +688,7 @@ NEAR = ", or nearer to its outline than the margin"
 
 
 @dataclass(frozen=True)
-class FieldSeen(Seen):
+class FieldPrediction(Prediction):
     """With the scene at rest, and the derivative of its displacements by each parameter and by each
     coefficient of boundaries, as planes; the latter may be those of an equilibrium nearby."""
 
@@ -765,13 +765,13 @@ class FieldObservation(Observation):
         own: Floats,
         modulus: float,
         near: Near | None = None,
-    ) -> FieldSeen:
+    ) -> FieldPrediction:
         """At its equilibrium."""
         n = 0
         for boundary in self.boundaries:
             experiment = boundary.moved(experiment, own[n : n + boundary.size])
             n += boundary.size
-        before = near.seen if near and isinstance(near.seen, FieldSeen) else None
+        before = near.seen if near and isinstance(near.seen, FieldPrediction) else None
         resting = Resting.of(experiment, before.resting if before else self.scene, DERIVATIVES)
         changes = [resting.change(parameter) for parameter in parameters]
         away = before.away + near.away if before and near else np.inf
@@ -784,7 +784,7 @@ class FieldObservation(Observation):
         beside = self.evidence.distortions / self.weighted_noise
         predicted = self.evidence.seen(resting.state.u, resting)
         residuals = (self.measured - predicted) / self.weighted_noise - beside @ own[n:]
-        return FieldSeen(
+        return FieldPrediction(
             residuals,
             np.array(by[:count]).T.reshape(rows, count),
             np.column_stack([*by[count:], beside]) if by[count:] else beside,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.equilibrium.system import Moves
 from pbdkit.errors import ExperimentError
-from pbdkit.fitting.observations import FieldObservation, Near, Observation, Seen
+from pbdkit.fitting.observations import FieldObservation, Near, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.model.experiment import Experiment
@@ -119,7 +119,7 @@ class At:
     z: Floats
     residuals: Floats
     jacobian: Floats
-    seen: tuple[Seen, ...]
+    seen: tuple[Prediction, ...]
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ Pair = Annotated[tuple[float, float], Field(strict=False)]
 WAYS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
 
 
-class Measured(Component):
+class MeasuredColumns(Component):
     """The columns of a CSV `file` beside the fit file.
 
     `noise` is the standard deviation of what was measured; without it that of the residuals is
@@ -115,7 +115,7 @@ def _without_type(schema: dict[str, Any]) -> None:
     schema["required"] = [key for key in schema["required"] if key != "type"]
 
 
-class MeasuredField(Measured):
+class MeasuredField(MeasuredColumns):
     """Displacements at scattered points of the equilibrium, in lattice units.
 
     Points nearer to the outline of the body than `margin` are left out.
@@ -145,7 +145,7 @@ class MeasuredField(Measured):
         return FieldObservation.of(scene, evidence, self.assumed_noise, modes, far)
 
 
-class MeasuredTracks(Measured):
+class MeasuredTracks(MeasuredColumns):
     """Displacements of points of the body as it moves: at `time`, counted in steps, of the point
     that lies at x and y in the reference."""
 
@@ -164,7 +164,7 @@ class MeasuredTracks(Measured):
         return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
 
 
-class MeasuredCurve(Measured):
+class MeasuredCurve(MeasuredColumns):
     """The force that leader group `group` exerts along `axis`, over its own displacement along it,
     or over time, counted in steps, where it is measured `against` that.
 
@@ -208,14 +208,16 @@ def _refuse_other_unit(points: Floats, scene: Scene) -> None:
         )
 
 
-_Any = Annotated[Measured, closed_part(Measured, MeasuredField, MeasuredTracks, MeasuredCurve)]
-_one = TypeAdapter[Measured](_Any)
-_some = TypeAdapter[tuple[Measured, ...]](
+_Any = Annotated[
+    MeasuredColumns, closed_part(MeasuredColumns, MeasuredField, MeasuredTracks, MeasuredCurve)
+]
+_one = TypeAdapter[MeasuredColumns](_Any)
+_some = TypeAdapter[tuple[MeasuredColumns, ...]](
     Annotated[tuple[_Any, ...], Field(strict=False, min_length=1)]
 )
 
 
-def _one_or_some(value: Any, info: ValidationInfo) -> tuple[Measured, ...]:
+def _one_or_some(value: Any, info: ValidationInfo) -> tuple[MeasuredColumns, ...]:
     if isinstance(value, Mapping):
         return (_one.validate_python(_typed(value), context=info.context),)
     if isinstance(value, (list, tuple)):
@@ -228,7 +230,7 @@ def _typed(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 Measurements = Annotated[
-    tuple[SerializeAsAny[Measured], ...],
+    tuple[SerializeAsAny[MeasuredColumns], ...],
     BeforeValidator(_one_or_some, json_schema_input_type=_Any | tuple[_Any, ...]),
 ]
 """One measurement, of a field unless it says otherwise, or a list of some."""

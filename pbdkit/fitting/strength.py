@@ -297,7 +297,7 @@ def knows_forces(scene: Scene) -> bool:
     return isinstance(scene.experiment.rule, Calibrated)
 
 
-class Seen(NamedTuple):
+class MachineReading(NamedTuple):
     """What a testing machine shows; the force is nan where the rule knows none."""
 
     force: float
@@ -331,12 +331,14 @@ class Pull:
             )
         return cls(group, moved[group] / size[group], peaks.youngs_modulus * peaks.thickness)
 
-    def seen(self, tables: Tables, state: State) -> Seen:
+    def seen(self, tables: Tables, state: State) -> MachineReading:
         """Both along the way; the displacement is the mean of the group's particles."""
         carried = np.full(len(self.way), np.nan)
         if knows_forces(tables.scene):
             carried = reactions(StateMoment(state, tables))[self.group]
-        return Seen(self.factor * float(self.way @ carried), self.moved(tables.scene, state))
+        return MachineReading(
+            self.factor * float(self.way @ carried), self.moved(tables.scene, state)
+        )
 
     def moved(self, scene: Scene, state: State) -> float:
         """The displacement alone."""
@@ -349,17 +351,17 @@ def _mean(scene: Scene, state: State, group: int) -> Floats:
 
 
 @dataclass(frozen=True)
-class Elastic:
+class ElasticResponse:
     """A body before anything breaks, under the experiment's full load: its displacements u as
     planes, how its bonds are strained, and what is seen of it, if a leader group is asked for."""
 
     strains: BondStrains
     pull: Pull | None
-    full: Seen
+    full: MachineReading
     u: Floats
 
     @classmethod
-    def of(cls, experiment: Experiment, peaks: Peaks) -> Elastic:
+    def of(cls, experiment: Experiment, peaks: Peaks) -> ElasticResponse:
         """From the equilibrium of an experiment whose bonds do not break. Raises ExperimentError
         where displacements do not grow in proportion to the load."""
         experiment = experiment.model_copy(update={"solver": Equilibrium(increments=PARTS)})
@@ -373,7 +375,7 @@ class Elastic:
         _refuse_out_of_proportion(seen, state.u, experiment.rule.linear)
         strains = bond_strains(scene, state)
         if peaks.of == "factor":
-            return cls(strains, None, Seen(1.0, 1.0), state.u)
+            return cls(strains, None, MachineReading(1.0, 1.0), state.u)
         pull = Pull.of(scene, state, peaks)
         return cls(strains, pull, pull.seen(Tables(scene), state), state.u)
 
@@ -403,8 +405,8 @@ class Specimen:
     """What was seen of one at its peak, and when its first bond broke (None where one equilibrium
     does not tell), and whether it failed."""
 
-    peak: Seen
-    first: Seen | None
+    peak: MachineReading
+    first: MachineReading | None
     failed: bool
 
     def peak_of(self, of: str) -> float:
@@ -424,10 +426,10 @@ class Specimens:
 
     scene: Scene
     peaks: Peaks
-    elastic: Elastic | None
+    elastic: ElasticResponse | None
 
     @classmethod
-    def of(cls, experiment: Experiment, peaks: Peaks, elastic: Elastic | None) -> Specimens:
+    def of(cls, experiment: Experiment, peaks: Peaks, elastic: ElasticResponse | None) -> Specimens:
         """Torn by the experiment's solver, or in increments. Raises ExperimentError."""
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
@@ -443,13 +445,13 @@ class Specimens:
         first = None if limits is None else self._first(limits)
         since = self._whole_until(state, first) if first else 0.0
         pull = self.elastic.pull if self.elastic else None
-        top, before, grows = first or Seen(0.0, 0.0), Seen(0.0, 0.0), 1.0
+        top, before, grows = first or MachineReading(0.0, 0.0), MachineReading(0.0, 0.0), 1.0
         for _ in chain(increments(scene, state, Watch(), since), [None]):
             pull = pull or Pull.of(scene, state, self.peaks)
             seen = pull.seen(tables, state)
             if grows > 1.0 and before.displacement > 0.0:
                 share = min(grows, seen.displacement / before.displacement)
-                top = max(top, Seen(share * before.force, share * before.displacement))
+                top = max(top, MachineReading(share * before.force, share * before.displacement))
             top = max(top, seen) if seen.displacement > (first or seen).displacement else top
             if seen.force < LOST * top.force and seen.displacement >= top.displacement:
                 return Specimen(top, first, True)
@@ -464,7 +466,7 @@ class Specimens:
         tells = isinstance(model, BreaksAtStrain) and not isinstance(model, Softens)
         return tells and self.elastic is not None
 
-    def _whole_until(self, state: State, first: Seen) -> float:
+    def _whole_until(self, state: State, first: MachineReading) -> float:
         """Takes a state to the last increment before its first bond breaks, and returns its moment:
         on the way there nothing but the load changes."""
         assert self.elastic is not None
@@ -492,11 +494,13 @@ class Specimens:
             found.append((moment, moved / self.elastic.full.displacement))
         return found
 
-    def _first(self, limits: Floats) -> Seen:
+    def _first(self, limits: Floats) -> MachineReading:
         """Bond by bond, in their order: exact."""
         assert self.elastic is not None
         share = float(self.elastic.strains.load_at(limits).min())
-        return Seen(share * self.elastic.full.force, share * self.elastic.full.displacement)
+        return MachineReading(
+            share * self.elastic.full.force, share * self.elastic.full.displacement
+        )
 
 
 def seeded(experiment: Experiment, seed: int) -> Experiment:
@@ -528,7 +532,7 @@ class Breaks:
 
 
 @dataclass(frozen=True)
-class Draws:
+class WeightedSamples:
     """Parameters that go with the measurement, (draw, parameter), and how much each counts."""
 
     values: Floats
@@ -546,7 +550,7 @@ class StrengthLaw(ABC):
         """The number at a path with which no bond breaks."""
 
     @abstractmethod
-    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> Draws:
+    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
         """From the integrated likelihood between bounds."""
 
     @staticmethod
@@ -572,7 +576,7 @@ class WeibullLaw(StrengthLaw):
 
         return np.asarray(np.sqrt(np.expm1(gammaln(1 + 2 / second) - 2 * gammaln(1 + 1 / second))))
 
-    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> Draws:
+    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
         """For a modulus, Σ_specimens Σ_b ε^m / s^m is gamma-distributed with the number of
         failures; moduli are drawn from what is left when that is integrated."""
         from scipy.special import gammainc, gammaincinv
@@ -603,7 +607,7 @@ class WeibullLaw(StrengthLaw):
         # A low-discrepancy sequence beside `order`: the same draws whenever the fit is made.
         other = (np.arange(DRAWS) * 0.6180339887498949 + 0.5) % 1.0
         log_s = (log_total - np.log(gammaincinv(count, low + other * (high - low)))) / m
-        return Draws(np.stack([np.exp(log_s), m], axis=1), np.full(DRAWS, 1.0 / DRAWS))
+        return WeightedSamples(np.stack([np.exp(log_s), m], axis=1), np.full(DRAWS, 1.0 / DRAWS))
 
 
 def weibull_sums(strains: BondStrains, breaks: Breaks, m: Floats) -> tuple[Floats, Floats]:
@@ -637,7 +641,7 @@ class UniformLaw(StrengthLaw):
         """s/√3."""
         return np.asarray(second / np.sqrt(3.0))
 
-    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> Draws:
+    def draws(self, strains: BondStrains, breaks: Breaks, bounds: LawBounds) -> WeightedSamples:
         """On a grid of ln w and of how far a lies below what the weakest specimen bore."""
         strain, rate = strains.at(breaks.load), strains.rate(breaks.load)
         lowest = float(strain[breaks.broke].max(axis=1).min())
@@ -660,7 +664,7 @@ class UniformLaw(StrengthLaw):
         a, w = np.meshgrid(lowest - np.exp(depth), np.exp(log_w), indexing="ij")
         weights = np.exp(found - found.max()).ravel()
         values = np.stack([a + w / 2, w / (2 * a + w)], axis=-1).reshape(-1, 2)
-        return Draws(values[weights > 0.0], weights[weights > 0.0] / weights.sum())
+        return WeightedSamples(values[weights > 0.0], weights[weights > 0.0] / weights.sum())
 
 
 def _uniform(strain: Floats, rate: Floats, count: Floats, broke: Mask, a: float, w: float) -> float:
@@ -782,7 +786,7 @@ class FittedStrength:
     specimens: int
     failed: int
     checked: Checked | None = None
-    draws: Draws = field(kw_only=True, repr=False)
+    draws: WeightedSamples = field(kw_only=True, repr=False)
 
     def with_check(self, checked: Checked | None) -> FittedStrength:
         """The same with what was seen of torn specimens."""
@@ -826,7 +830,11 @@ class FittedStrength:
 
 
 def fitted_strength(
-    fit: StrengthFit, paths: Sequence[str], draws: Draws, method: str, law: StrengthLaw | None
+    fit: StrengthFit,
+    paths: Sequence[str],
+    draws: WeightedSamples,
+    method: str,
+    law: StrengthLaw | None,
 ) -> FittedStrength:
     """The answer in words of the fit file."""
     values = {}
@@ -939,7 +947,7 @@ class PeakDistribution:
         return np.asarray(-(away + np.log(determinant)) / 2.0)
 
 
-def simulated(fit: StrengthFit, experiment: Experiment, specimens: Specimens) -> Draws:
+def simulated(fit: StrengthFit, experiment: Experiment, specimens: Specimens) -> WeightedSamples:
     """Strengths that go with the measured peaks, between the bounds, on which the logarithm is
     spread evenly. Raises ExperimentError."""
     if not fit.measured.failed.all():
@@ -969,7 +977,7 @@ def simulated(fit: StrengthFit, experiment: Experiment, specimens: Specimens) ->
         margin = WIDER * np.ptp(near, axis=0)
         box = np.clip([near.min(axis=0) - margin, near.max(axis=0) + margin], *whole)
     weights = np.exp(logarithm - logarithm.max())
-    return Draws(np.exp(points), weights / weights.sum())
+    return WeightedSamples(np.exp(points), weights / weights.sum())
 
 
 def _spread(box: Floats, count: int, seed: int) -> Floats:
@@ -1053,11 +1061,11 @@ def _by_likelihood(fit: StrengthFit, experiment: Experiment) -> FittedStrength:
     return found.with_check(_checked(fit, experiment, law, elastic, found))
 
 
-def _elastic(fit: StrengthFit, experiment: Experiment, law: StrengthLaw) -> Elastic:
+def _elastic(fit: StrengthFit, experiment: Experiment, law: StrengthLaw) -> ElasticResponse:
     if experiment.fracture.can_break:
         for path in law.paths:
             experiment = Parameter(path).put(experiment, law.whole(path))
-    return Elastic.of(experiment, fit.measured)
+    return ElasticResponse.of(experiment, fit.measured)
 
 
 def _law(fit: StrengthFit, experiment: Experiment) -> StrengthLaw:
@@ -1080,7 +1088,7 @@ def _checked(
     fit: StrengthFit,
     experiment: Experiment,
     law: StrengthLaw,
-    elastic: Elastic,
+    elastic: ElasticResponse,
     found: FittedStrength,
 ) -> Checked | None:
     """Whether specimens of the strengths found fail as their first bond breaks; None where the
@@ -1121,7 +1129,7 @@ def _by_simulation(
             "peak; take 'elastic' or another calibrated rule",
             ("rule",),
         )
-    draws: Draws = simulated(fit, experiment, specimens)
+    draws: WeightedSamples = simulated(fit, experiment, specimens)
     law = LAWS[name] if name and {*fit.unknown} == {*LAWS[name].paths} else None
     found = fitted_strength(fit, tuple(fit.unknown), draws, "simulation", law)
     return found.with_check(checked)

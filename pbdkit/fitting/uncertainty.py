@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pbdkit.equilibrium.certificate import UnconvergedError
 from pbdkit.errors import ExperimentError, refuse_without
-from pbdkit.fitting.observations import Carried, FieldSeen
+from pbdkit.fitting.observations import Carried, FieldPrediction
 from pbdkit.fitting.problem import (
     MODULUS,
     RANK,
@@ -91,7 +91,7 @@ def _of_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     """Force over thickness and what the group carries over Young's modulus, along the force."""
     way = np.array(force.value) / np.hypot(*force.value)
     count, seen = len(problem.unknowns), solution.at.seen[0]
-    assert isinstance(seen, FieldSeen)
+    assert isinstance(seen, FieldPrediction)
     carried = Carried(seen.resting, force.group)
     unit, gradient = float(way @ carried.predicted), np.zeros(problem.size)
     for n, (du, unknown) in enumerate(zip(seen.changes, problem.unknowns, strict=True)):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.identification.elastic_constants import DIFFUSION, ELASTICITY, NEITHER, SAME, Elasticity
-from pbdkit.identification.waves import LongWaves, Primitive, Range, Spectrum
+from pbdkit.identification.waves import DirectionalRange, LongWaves, Primitive, WaveSpectrum
 from pbdkit.linear.spectrum import NEUTRAL
 from pbdkit.scene.scene import Scene
 
@@ -43,7 +43,7 @@ class Identity:
     symmetric: bool
     rests_at_edges: bool
     stencil: Primitive = field(repr=False)
-    spectrum: Spectrum = field(repr=False)
+    spectrum: WaveSpectrum = field(repr=False)
     relaxation: float
     memory: float
     kind: str
@@ -193,7 +193,7 @@ def _waves(found: Identity) -> Iterator[Row]:
         yield "gradient length²", f"{fast if alike else f'{fast} and {slow}'} h² {where}, {rows}"
 
 
-def _range_text(waves: Range, unit: str) -> str:
+def _range_text(waves: DirectionalRange, unit: str) -> str:
     largest = f"{_number(waves.largest)} {unit}"
     if waves.largest - waves.smallest < 1e-8 * abs(waves.largest):
         return f"{largest} in every direction"

@@ -221,7 +221,7 @@ SAME_CURVATURE, ROUNDING = 1e-6, 1e-13
 
 
 @dataclass(frozen=True)
-class Range:
+class DirectionalRange:
     """The smallest and the largest value over all directions, and where they are, in degrees."""
 
     smallest: float
@@ -254,8 +254,8 @@ class LongWaves:
     second: Floats
     diffusivity: Floats | None
     elasticity: Elasticity | None
-    fast: Range
-    slow: Range
+    fast: DirectionalRange
+    slow: DirectionalRange
     gradients: tuple[Gradient, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -266,7 +266,7 @@ class LongWaves:
 
 
 @dataclass(frozen=True)
-class Spectrum:
+class WaveSpectrum:
     """Over all waves: the smallest real part, the largest modulus of the imaginary part, the
     largest real part of the eigenvalues of the rule's step; the largest stable relaxation."""
 
@@ -276,7 +276,7 @@ class Spectrum:
     largest_stable_relaxation: float | None
 
 
-def ranges(q: Floats) -> tuple[Range, Range]:
+def ranges(q: Floats) -> tuple[DirectionalRange, DirectionalRange]:
     """Of the diffusivities of the fast and of the slow long wave; of the real parts where they
     turn."""
 
@@ -289,7 +289,7 @@ def ranges(q: Floats) -> tuple[Range, Range]:
         at, found = minimum(value, np.array([0.0]), np.array([180.0]), ANGLES)
         return sign * found, round(float(at[0]), 3) % 180.0
 
-    slow, fast = (Range(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
+    slow, fast = (DirectionalRange(*least(wave, 1.0), *least(wave, -1.0)) for wave in (0, 1))
     return fast, slow
 
 
@@ -326,7 +326,7 @@ def fourth_order(waves: SlowWaves, normal: Floats) -> tuple[float, float]:
     return float(lengths[fast].real), float(lengths[1 - fast].real)
 
 
-def spectrum(stencil: Primitive, memory: float) -> Spectrum:
+def spectrum(stencil: Primitive, memory: float) -> WaveSpectrum:
     """Of all waves on the infinite lattice, extremes refined beyond the grid of WAVES²."""
     reciprocal = 2 * np.pi * np.linalg.inv(stencil.basis).T
     low, high = np.zeros(2), np.ones(2)
@@ -341,7 +341,7 @@ def spectrum(stencil: Primitive, memory: float) -> Spectrum:
     ends = eigenvalues(np.array([at_smallest, at_largest])).ravel()
     known = np.concatenate([sampled, ends])
     imaginary, bound = float(np.abs(known.imag).max()), largest_stable_relaxation(known, memory)
-    return Spectrum(smallest, imaginary, -largest, bound)
+    return WaveSpectrum(smallest, imaginary, -largest, bound)
 
 
 def minimum(

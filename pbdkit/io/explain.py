@@ -28,7 +28,7 @@ Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Standing:
+class BondStatus:
     """One bond: the numbers of its particles, its shell and rest length, and how it stands.
 
     `state` is "intact", "broken", "cut", "broken from the start" or "cannot break". `step`, `order`
@@ -139,7 +139,7 @@ class Explained:
         now = rest + (u[..., b, :] - u[..., a, :])
         return np.asarray(np.hypot(now[..., 0], now[..., 1]) / np.hypot(*rest.T) - 1.0)
 
-    def standings(self, rows: Rows, until: int | None = None) -> list[Standing]:
+    def standings(self, rows: Rows, until: int | None = None) -> list[BondStatus]:
         """How some bonds stand, strained as at the last recorded step, or the last one until a
         step."""
         place = {row: n + 1 for n, row in enumerate(self.order.tolist())}
@@ -147,7 +147,7 @@ class Explained:
         time = int(np.searchsorted(times, times[-1] if until is None else until, "right")) - 1
         strains = self.strains(rows, time).tolist()
         return [
-            Standing(
+            BondStatus(
                 bond=tuple(self.bonds.ends[row].tolist()),
                 shell=int(self.bonds.shell[row]),
                 rest_length=float(np.hypot(*self.bonds.rest[row])),
@@ -169,7 +169,7 @@ class Explained:
             return "broken from the start"
         return "cut" if self.cut[row] else "broken"
 
-    def nearest(self) -> Standing | None:
+    def nearest(self) -> BondStatus | None:
         """The bond that is nearest to breaking at the last recorded step, if that is known."""
         rows = np.flatnonzero((self.steps < 0) & ~self.spared & np.isfinite(self.limits))
         if not len(rows):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
 from pbdkit.io.atomic_file import NewFile, write_all
-from pbdkit.io.seal import BLOCK, BrokenSealError, Extent, digest, is_whole, put_seal
+from pbdkit.io.seal import BLOCK, BrokenSealError, ByteRange, digest, is_whole, put_seal
 
 MAGIC = b"pbdkit-r"
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -89,7 +89,7 @@ class PagedFile(NewFile):
         disk: io.FileIO,
         size: int = 0,
         pages: Mapping[int, bytes] | None = None,
-        extents: Sequence[Extent] = (),
+        extents: Sequence[ByteRange] = (),
         *,
         read_only: bool = False,
     ) -> None:
@@ -109,7 +109,7 @@ class PagedFile(NewFile):
         self._append_from, self._place = (2**63 if read_only else size), 0
 
     @property
-    def added(self) -> list[Extent]:
+    def added(self) -> list[ByteRange]:
         """The extents written since the last commit."""
         return self.extents[self.noted :]
 
@@ -201,7 +201,7 @@ class PagedFile(NewFile):
                 return False
         return True
 
-    def _settled(self, extent: Extent) -> Extent:
+    def _settled(self, extent: ByteRange) -> ByteRange:
         """With the digest that it has now, should a page lie over it."""
         pages = range(extent.start // PAGE, -(-extent.stop // PAGE))
         if not any(page in self.pages for page in pages):
@@ -215,7 +215,7 @@ class PagedFile(NewFile):
         for start in range(0, len(view), BLOCK):
             piece = view[start : start + BLOCK]
             place = self._place + start
-            self.extents.append(Extent(place, place + len(piece), digest(piece)))
+            self.extents.append(ByteRange(place, place + len(piece), digest(piece)))
         self._append_from = self.extents[-1].stop
 
     def _on_disk(self, start: int, length: int) -> bytes:

@@ -31,7 +31,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
 
-class Measured:
+class RecordedVariables:
     """The numbers and diagnostics of a scene that go into its dataset."""
 
     def __init__(self, scene: Scene) -> None:
@@ -191,7 +191,7 @@ def _refuse_infinite(variable: Variable, value: Any, now: Moment, before: int) -
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """How a run ended; `certificate` says of an equilibrium how far it can be off."""
 
     status: str
@@ -205,7 +205,7 @@ class Recorder:
 
     def __init__(self, scene: Scene, sink: Sink) -> None:
         self._scene, self.sink = scene, sink
-        self._tables, self._measured = Tables(scene), Measured(scene)
+        self._tables, self._measured = Tables(scene), RecordedVariables(scene)
         self._columns = columns_of(scene)
         self._twins = Twins(self._columns)
         self.seen = RecordedSteps()
@@ -290,7 +290,7 @@ class Recorder:
     def _diagnosed(self, when: When, moment: StateMoment) -> Values:
         return self._measured.diagnosed(when, moment)
 
-    def finish(self, state: State, outcome: Outcome, prediction: dict[str, Any]) -> None:
+    def finish(self, state: State, outcome: RunOutcome, prediction: dict[str, Any]) -> None:
         """Hands over what is known at the end, and the attributes, with what was predicted before
         the first step; `warnings` says what the user should know of the last state."""
         # Where a run diverged, what broke since the last record is no result.
@@ -312,7 +312,7 @@ class Recorder:
     def _inside_out(self, state: State) -> str | None:
         return StateMoment(state, self._tables).cells.inside_out()
 
-    def _attributes(self, outcome: Outcome, prediction: dict[str, Any]) -> dict[str, str]:
+    def _attributes(self, outcome: RunOutcome, prediction: dict[str, Any]) -> dict[str, str]:
         experiment = self._scene.experiment
         return {
             "Conventions": layout.CONVENTIONS,
@@ -330,7 +330,7 @@ class Recorder:
 
 def columns_of(scene: Scene) -> list[Column]:
     """Those of the scene's dataset."""
-    measured = Measured(scene)
+    measured = RecordedVariables(scene)
     wanted = (
         scene.experiment.shows_bonds,
         scene.has_fracture,

@@ -35,7 +35,7 @@ from pbdkit.io.paged_file import (
     read_header,
     write_header,
 )
-from pbdkit.io.seal import Extent, seal_of
+from pbdkit.io.seal import ByteRange, seal_of
 from pbdkit.io.sqlite_file import connect, fault_of, files_of, is_database, look
 
 FORMAT = "3"
@@ -616,7 +616,7 @@ class UnfinishedRun:
             pages[int(key.removeprefix(PAGES))] = self._store.piece(key)
         rows = b"".join(self._store.piece(key) for key in self._store.keys(EXTENTS))
         table = np.frombuffer(rows[: len(rows) // EXTENT.itemsize * EXTENT.itemsize], EXTENT)
-        extents = [Extent(*row) for row in np.sort(table, order="start").tolist()]
+        extents = [ByteRange(*row) for row in np.sort(table, order="start").tolist()]
         counts = {"size": layout.get("size"), "pages": len(pages), "extents": len(extents)}
         if layout != counts or any(len(page) != PAGE for page in pages.values()):
             raise StorageError(f"{self._store.path}: is damaged: parts of it are missing")

@@ -39,7 +39,7 @@ class BrokenSealError(StorageError):
     """A result is not what was written; the text says which and where."""
 
 
-class Extent(NamedTuple):
+class ByteRange(NamedTuple):
     """Bytes of a file, from `start` to before `stop`, with their digest."""
 
     start: int
@@ -131,7 +131,7 @@ class SealedFile(io.RawIOBase):
         super().close()
 
 
-def put_seal(file: io.FileIO, known: Iterable[Extent] = ()) -> None:
+def put_seal(file: io.FileIO, known: Iterable[ByteRange] = ()) -> None:
     """Seals a finished file, open for reading and writing. Extents of values whose digests are
     `known`, in their order, are not read. Raises OSError."""
     size, known = file.seek(0, os.SEEK_END), tuple(known)
@@ -142,14 +142,14 @@ def put_seal(file: io.FileIO, known: Iterable[Extent] = ()) -> None:
     write_all(file, seal.table.tobytes() + seal.foot())
 
 
-def _gapless(file: io.FileIO, size: int, known: tuple[Extent, ...]) -> Iterator[Extent]:
+def _gapless(file: io.FileIO, size: int, known: tuple[ByteRange, ...]) -> Iterator[ByteRange]:
     """The known extents, and between them those that fill the file."""
     place = 0
-    for extent in (*known, Extent(size, size, 0)):
+    for extent in (*known, ByteRange(size, size, 0)):
         while place < extent.start:
             stop = min(place + BLOCK, extent.start)
             file.seek(place)
-            yield Extent(place, stop, digest(file.read(stop - place)))
+            yield ByteRange(place, stop, digest(file.read(stop - place)))
             place = stop
         if extent.stop > extent.start:
             yield extent

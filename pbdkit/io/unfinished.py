@@ -10,7 +10,7 @@ from typing import Any
 from pbdkit.errors import StorageError
 from pbdkit.io.layout import Column, Values
 from pbdkit.io.netcdf import NetcdfFile, reopened
-from pbdkit.io.recorder import Outcome, Recorder, columns_of
+from pbdkit.io.recorder import Recorder, RunOutcome, columns_of
 from pbdkit.io.run_store import UnfinishedRun
 from pbdkit.io.seal import opened_in
 from pbdkit.io.sinks import Sink
@@ -71,5 +71,5 @@ def unfinished_dataset(output: Path) -> Any:
     reason = f"unfinished: step {state.step} of {scene.experiment.steps} when it was kept last"
     with suppress(FloatingPointError):  # a state that is not finite is not shown
         recorder.observe(state, last=True)
-    recorder.finish(state, Outcome("interrupted", reason, state.step), {})
+    recorder.finish(state, RunOutcome("interrupted", reason, state.step), {})
     return opened_in(file)

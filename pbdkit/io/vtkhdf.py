@@ -36,7 +36,7 @@ VERTEX, LINE, TRIANGLE, POLYGON, QUAD = 1, 3, 5, 7, 9
 
 
 @dataclass(frozen=True)
-class Grid:
+class UnstructuredGrid:
     """First a vertex for each particle, then a line for each bond, then the polygons between
     particles: `connectivity` are rows of the particle table, those of cell n from offsets[n] to
     offsets[n + 1]; `types` are VTK's. `part` says what each is; `broken_step` the step in which a
@@ -55,7 +55,7 @@ class Grid:
         return found
 
 
-def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> Grid:
+def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
     """The grid of a dataset; without its scene, and on a lattice in space, without polygons."""
     count = dataset.sizes["particle"]
     has_bonds = "bond_ends" in dataset.variables
@@ -73,7 +73,7 @@ def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> Grid:
         broken = np.concatenate([*own, *(_torn(rows, bonds, steps, count) for rows in polygons)])
     connectivity = np.concatenate([rows.ravel() for rows in kinds]).astype(np.int64)
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return Grid(connectivity, offsets, types, part, broken)
+    return UnstructuredGrid(connectivity, offsets, types, part, broken)
 
 
 def polygons_of(scene: Scene) -> list[Array]:
@@ -137,7 +137,7 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
         _write(file, dataset, grid)
 
 
-def _write(file: h5py.File, dataset: xarray.Dataset, grid: Grid) -> None:
+def _write(file: h5py.File, dataset: xarray.Dataset, grid: UnstructuredGrid) -> None:
     for name, said in dataset.attrs.items():
         file.attrs[name] = said if isinstance(said, str) else json.dumps(said, default=str)
     root = file.create_group("VTKHDF")
@@ -209,7 +209,9 @@ class Parts:
             self.root[f"Steps/FieldDataSizes/{self.name}"] = np.tile(size, (self.steps, 1))
 
 
-def _put(parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: Grid) -> None:
+def _put(
+    parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: UnstructuredGrid
+) -> None:
     """A variable where it belongs; what is of neither particles nor bonds is field data."""
     along = {*dims} - {"time", "axis"}
     if parts.name in ELSEWHERE or values.dtype.kind not in "biuf" or "step" in along:
@@ -233,7 +235,7 @@ def _put(parts: Parts, values: xarray.DataArray, dims: tuple[Any, ...], grid: Gr
     parts.each(where, (shown(row) for _, block in _blocks(whole) for row in block))
 
 
-def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: Grid) -> None:
+def _put_broken(parts: Parts, dataset: xarray.Dataset, grid: UnstructuredGrid) -> None:
     """Which part every cell of the grid is, and where bonds break, which are broken at each step: a
     cell between particles is where a bond of its corners is."""
     Parts(parts.root, "part", parts.steps).once("CellData", grid.part)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pbdkit.lattice.raster import FOLLOWER, Block, Floats, Mask, Raster, Where
 from pbdkit.plugin import Cell, Components, Offset, Slot, Vector
 from pbdkit.plugin.frame import Indices
-from pbdkit.plugin.lattice import Index, Polygon, Side, Tiling
+from pbdkit.plugin.lattice import CellPolygon, Index, Side, Tiling
 
 Slots = tuple[tuple[Slot, ...], ...]
 Step = tuple[int, int, Index]
@@ -44,7 +44,7 @@ class Patch:
     """The cells of one shape on a rectangle of the raster: `corners[k]` is the block of their k-th
     corners, `whole` tells of which all corners are particles of the body."""
 
-    polygon: Polygon
+    polygon: CellPolygon
     corners: tuple[Block, ...]
     whole: Mask
 
@@ -144,7 +144,7 @@ def whole_cells(raster: Raster, tiling: Tiling) -> WeighedCells:
     return WeighedCells(tiling, share, share)
 
 
-def _within(raster: Raster, polygon: Polygon) -> Block | None:
+def _within(raster: Raster, polygon: CellPolygon) -> Block | None:
     """The block of first corners in the body whose other corners lie on the raster."""
     block = raster.body_block(polygon.source)
     if not block:
@@ -156,7 +156,7 @@ def _within(raster: Raster, polygon: Polygon) -> Block | None:
     return there if (start < stop).all() else None
 
 
-def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[Polygon]:
+def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[CellPolygon]:
     """Those whose first corner is of sublattice `source`, counter-clockwise; corners that are
     neighbours lie where the slots say, to the last bit."""
     exact = {(slot.target, slot.cell): slot.rest for slot in slots}
@@ -169,7 +169,7 @@ def _polygons(cell: Cell, source: int, slots: tuple[Slot, ...]) -> Iterator[Poly
         if all(_is_ahead(offset.rest) for offset in others):
             found.append((cell.offset(source, source, (0, 0)), *others))
     found.sort(key=lambda corners: math.atan2(*corners[1].rest[::-1]))
-    return (Polygon(source, kind, corners) for kind, corners in enumerate(found))
+    return (CellPolygon(source, kind, corners) for kind, corners in enumerate(found))
 
 
 def _is_ahead(r: Components) -> bool:
@@ -177,7 +177,7 @@ def _is_ahead(r: Components) -> bool:
     return bool(r.x > 0.0 if level else r.y > 0.0)
 
 
-def _beside(polygons: tuple[Polygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
+def _beside(polygons: tuple[CellPolygon, ...], slots: Slots) -> dict[Slot, tuple[Side, Side]]:
     """The cells beside every slot, where the neighbours are the corners of simple cells."""
     slot_of = {(slot.source, slot.target, slot.cell): slot for own in slots for slot in own}
     left: dict[Step, Side] = {}
@@ -200,7 +200,7 @@ def _step(here: Offset, there: Offset) -> Step:
     return here.target, there.target, tuple(map(sub, there.cell, here.cell))
 
 
-def _is_simple(polygon: Polygon) -> bool:
+def _is_simple(polygon: CellPolygon) -> bool:
     """Whether it is a triangle or a parallelogram, whose triangles around the middle are equal."""
     r = polygon.rest
     if len(r) != 4:

@@ -38,7 +38,7 @@ from pbdkit.lattice.raster import (
 from pbdkit.model.bodies import Body, Box, Floats, Sites
 from pbdkit.plugin import Cell, Lattice, Vector
 from pbdkit.plugin.frame import Indices
-from pbdkit.plugin.lattice import Index, Offset, Polygon, Tiling
+from pbdkit.plugin.lattice import CellPolygon, Index, Offset, Tiling
 
 Lines = tuple[int, int]
 """Lines of sites, of indices i from the first to below the second."""
@@ -356,13 +356,13 @@ class _Cutter:
                 marked[_shifted(there, corner.site)] |= exists
         return marked
 
-    def first_corners(self, polygon: Polygon) -> Window:
+    def first_corners(self, polygon: CellPolygon) -> Window:
         """The part of the window where all corners of a cell lie in the window."""
         steps = [corner.site for corner in polygon.corners]
         low, high = np.min(steps, axis=0), np.max(steps, axis=0)
         return tuple(map(slice, -low, np.array(self.shape) - high))
 
-    def _shares(self, polygon: Polygon) -> tuple[Floats, Indices]:
+    def _shares(self, polygon: CellPolygon) -> tuple[Floats, Indices]:
         """(share, in pieces): the shares of all cells of a shape, by the place of their first
         corner, 0 where there is no cell; and the places of the large ones left out because their
         inside falls in pieces, (cell, axis)."""
@@ -593,7 +593,7 @@ def _cells_around(tiling: Tiling, source: int) -> list[tuple[int, int]]:
     return sorted(found, key=direction)
 
 
-def _next(polygon: Polygon, corner: int) -> Offset:
+def _next(polygon: CellPolygon, corner: int) -> Offset:
     """The corner after one, counter-clockwise."""
     return polygon.corners[(corner + 1) % len(polygon.corners)]
 
@@ -726,7 +726,7 @@ def _shifted(window: Window, step: Index) -> Window:
     return tuple(slice(s.start + n, s.stop + n) for s, n in zip(window, step, strict=True))
 
 
-def _width(polygon: Polygon) -> float:
+def _width(polygon: CellPolygon) -> float:
     """The largest distance between corners of a cell."""
     return max(math.dist(a, b) for a in polygon.rest for b in polygon.rest)
 

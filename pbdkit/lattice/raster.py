@@ -181,7 +181,7 @@ CHUNK_ROWS = 65536
 
 
 @dataclass(frozen=True)
-class Extent:
+class RowLayout:
     """How many particles each row of repeat cells of a lattice has, padding included, and how many
     rows are `before` those of a raster."""
 
@@ -212,7 +212,7 @@ class Raster:
     low: Index
     sites: NDArray[np.int8]
     before: int = 0
-    extent: Extent | None = None
+    extent: RowLayout | None = None
     communicator: Communicator = SERIAL
     row_range: RowRange | None = None
 

@@ -33,7 +33,7 @@ from pbdkit.plugin import Draws
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.memory_estimate import asks_for_grids
 from pbdkit.scene.scene import Scene, build_scene
-from pbdkit.simulation import SECONDS_A_VALUE, Driver, Stepwise, Straight
+from pbdkit.simulation import SECONDS_A_VALUE, Driver, EquilibriumDriver, SteppingDriver
 from pbdkit.stepping.divergence import EVERY, Guard, most_of, size_of
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.leaders import steady_steps
@@ -149,7 +149,7 @@ class Division:
         return DividedStepper(self.ranks, self.scene, engine, self.halo, steps), choice
 
 
-class DividedWatch(Watch):
+class DistributedWatch(Watch):
     """All stop where one is asked to; the first shows how far the run is."""
 
     def __init__(self, ranks: MPICommunicator, watch: Watch) -> None:
@@ -203,7 +203,7 @@ class DividedSettling(Settling):
         return self._agree(found)
 
 
-class DividedStepwise(Stepwise):
+class DistributedSteppingDriver(SteppingDriver):
     """Steps a part; decides with the others."""
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
@@ -217,7 +217,7 @@ class DividedStepwise(Stepwise):
             ],
         )
         start, anew = division.begun(scene)
-        Driver.__init__(self, division.scene, start, DividedWatch(ranks, watch))
+        Driver.__init__(self, division.scene, start, DistributedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
         self._patience = self._steps_in(SECONDS_A_VALUE * scene.raster.total / ranks.size)
         size = size_of(scene) + ranks.largest(most_of(start))
@@ -258,7 +258,7 @@ A_CYCLE = 6
 on the way down, and by 2 on the way up."""
 
 
-class DividedRows(Rows):
+class DistributedRows(Rows):
     """The rows of one of the processes that share a grid."""
 
     def __init__(self, ranks: MPICommunicator, halo: Halo, strip: Strip) -> None:
@@ -322,7 +322,7 @@ def _margin(scene: Scene) -> int:
 STUCK = "the iteration that several processes share gets nowhere; run it in one process"
 
 
-class DividedStraight(Straight):
+class DistributedEquilibriumDriver(EquilibriumDriver):
     """Finds the equilibrium of a part with the others: of rules that are linear, without bonds that
     break and without obstacles, on the stencils of a lattice with one site a cell."""
 
@@ -331,10 +331,10 @@ class DividedStraight(Straight):
         refuse(scene, [(ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME)])
         _refuse(scene)
         start, anew = division.begun(scene)
-        super().__init__(division.scene, start, DividedWatch(ranks, watch))
+        super().__init__(division.scene, start, DistributedWatch(ranks, watch))
         self._start = None if anew else start.copy()
         strip = strip_of(scene, division.part.subdomain, ranks.size)
-        self._rows = DividedRows(ranks, division.halo, strip)
+        self._rows = DistributedRows(ranks, division.halo, strip)
 
     def state_dict(self) -> dict[str, Any]:
         """With the state of the whole, as it is joined."""

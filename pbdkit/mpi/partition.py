@@ -28,10 +28,10 @@ from pbdkit.lattice.raster import (
     EMPTY,
     FOLLOWER,
     FRAME,
-    Extent,
     LeftOut,
     Mask,
     Raster,
+    RowLayout,
     Stretch,
     hull,
 )
@@ -214,7 +214,7 @@ def _steps(each: int, least: int) -> int:
 
 
 @dataclass(frozen=True)
-class Part:
+class SubdomainScene:
     """A subdomain's part of a scene: the scene of the part, and what is known of the whole.
     `ours` are which particles of each leader group that the part has are of its own rows, and
     `early` how many of these groups' particles come before."""
@@ -227,12 +227,12 @@ class Part:
     """Of the table of its scene, those of its own particles."""
 
 
-def part_of(scene: Scene, subdomain: Subdomain) -> Part:
+def part_of(scene: Scene, subdomain: Subdomain) -> SubdomainScene:
     """That part of a scene that has these rows and more around them, or all."""
     window = _Window(scene.raster, subdomain)
     places = [each.place[window.leads(each)] for each in scene.leading]
     ours, early = map(window.has_own, places), map(window.comes_before, places)
-    return Part(
+    return SubdomainScene(
         subdomain,
         window.scene(scene),
         tuple(ours),
@@ -273,7 +273,7 @@ class _Window:
             low=(raster.low[0] + low, *raster.low[1:]),
             sites=sites,
             before=raster.before + int(counts[line(seen[0])]),
-            extent=Extent(raster.row_counts, before + subdomain.low),
+            extent=RowLayout(raster.row_counts, before + subdomain.low),
             communicator=SERIAL,
             row_range=None,
         )
@@ -380,7 +380,9 @@ def _others(sites: Array) -> Sequence[int]:
 class Halo:
     """The halo of a part: what other parts have of their own rows."""
 
-    def __init__(self, ranks: MPICommunicator, parts: Sequence[Subdomain], part: Part) -> None:
+    def __init__(
+        self, ranks: MPICommunicator, parts: Sequence[Subdomain], part: SubdomainScene
+    ) -> None:
         self._ranks, self._part, self._axes = ranks, part, part.scene.axes
         self._parts = parts
         sizes = ranks.allgather([int(ours.sum()) for ours in part.ours])

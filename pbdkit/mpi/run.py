@@ -17,7 +17,7 @@ from pbdkit.errors import ExperimentError, PbdkitError
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When, when_measured
 from pbdkit.io.paged_file import PiecedArray
-from pbdkit.io.recorder import Measured, Recorder, columns_of
+from pbdkit.io.recorder import RecordedVariables, Recorder, columns_of
 from pbdkit.io.sinks import KeepingSink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import Floats, RowRange, Stretch
@@ -26,8 +26,8 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import Equilibrium, Solver, Stepping
 from pbdkit.mpi.communicator import MPICommunicator
 from pbdkit.mpi.driver import (
-    DividedStepwise,
-    DividedStraight,
+    DistributedEquilibriumDriver,
+    DistributedSteppingDriver,
     Division,
     deep_halo,
     deep_subdomains,
@@ -53,7 +53,7 @@ from pbdkit.stability.relaxation import tuned, with_solver
 from pbdkit.stepping.state import State
 
 
-class Cut(NamedTuple):
+class PartitionScheme(NamedTuple):
     """What cuts a scene into parts for a solver; and how wide halos are at most, where neighbours
     and frame points of a step reach so many rows, neighbours alone so many, of parts of so many
     rows and more, and of so many parts."""
@@ -62,9 +62,9 @@ class Cut(NamedTuple):
     widest: Callable[[int, int, int, int], int]
 
 
-CUTS: dict[type[Solver], Cut] = {
-    Stepping: Cut(subdomains, widest_halo),
-    Equilibrium: Cut(deep_subdomains, deep_halo),
+CUTS: dict[type[Solver], PartitionScheme] = {
+    Stepping: PartitionScheme(subdomains, widest_halo),
+    Equilibrium: PartitionScheme(deep_subdomains, deep_halo),
 }
 
 
@@ -181,7 +181,7 @@ def _search(ground: Ground) -> int:
     return 1 + max(near, math.ceil(2 * ground.layers / cell.period[0]))
 
 
-class DividedRecorder(Recorder):
+class DistributedRecorder(Recorder):
     """Records a part. Diagnostics that are not `local` measure the whole state, which the first
     process gathers for them."""
 
@@ -190,7 +190,7 @@ class DividedRecorder(Recorder):
         self._joining = sink
         self._division, self._ranks = division, division.ranks
         whole = division.whole
-        self._wholes = (Tables(whole), Measured(whole)) if whole else None
+        self._wholes = (Tables(whole), RecordedVariables(whole)) if whole else None
         self._whole: State | None = None
         diagnostics = division.scene.experiment.diagnostics
         self._gathered = {when_measured(d) for d in diagnostics if not d.local}
@@ -343,13 +343,13 @@ class PartSink(KeepingSink):
 
 
 DRIVERS: dict[type[Solver], Callable[[Division, Scene, Watch], Driver]] = {
-    Stepping: DividedStepwise,
-    Equilibrium: DividedStraight,
+    Stepping: DistributedSteppingDriver,
+    Equilibrium: DistributedEquilibriumDriver,
 }
 """What carries it out on one of them."""
 
 
-class DividedRun(Run):
+class DistributedRun(Run):
     """One run that several processes share: each has its part of the scene. What it gives out are
     states of the part. Raises what any run does, in all processes."""
 
@@ -385,7 +385,7 @@ class DividedRun(Run):
     def recorder(self, sink: Sink) -> Recorder:
         """Of the part, into what `sink` gives."""
         assert isinstance(sink, PartSink)
-        return DividedRecorder(self.division, sink)
+        return DistributedRecorder(self.division, sink)
 
     def sink(self, inner: KeepingSink) -> KeepingSink:
         """Joins the parts for the sink of the first process."""
@@ -425,4 +425,4 @@ class DistributedExecution(Execution):
 
     def run(self, scene: Scene, watch: Watch) -> Run:
         """Return the run of this process's part."""
-        return DividedRun(self.communicator, scene, watch)
+        return DistributedRun(self.communicator, scene, watch)

@@ -211,7 +211,7 @@ class NeighbourMetric(Component):
 
 
 @dataclass(frozen=True)
-class Polygon:
+class CellPolygon:
     """A cell: sites on one circle with no site inside it (Delaunay's; the square lattice's squares,
     the hexagonal one's triangles). It is met once for each site of sublattice `source`, as number
     `kind` of those that are.
@@ -267,7 +267,7 @@ class Tiling:
     triangles or parallelograms: 8 on the square and rectangular lattices, 6 on the hexagonal one.
     """
 
-    polygons: tuple[Polygon, ...] = ()
+    polygons: tuple[CellPolygon, ...] = ()
     beside: dict[Slot, tuple[Side, Side]] = field(default_factory=dict)
 
     @cached_property

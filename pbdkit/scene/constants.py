@@ -368,7 +368,7 @@ Numbers = tuple[Number, ...]
 
 
 @dataclass(frozen=True)
-class Seen:
+class VisibleNumbers:
     """The numbers by who sees them, in their order: the rule's parameters p, weights w and
     `here.own`, the fracture model's parameters p and c."""
 
@@ -379,12 +379,14 @@ class Seen:
     bond: Numbers
 
 
-def numbers_of(experiment: Experiment, constants: SceneConstants, *, weighs_cells: bool) -> Seen:
+def numbers_of(
+    experiment: Experiment, constants: SceneConstants, *, weighs_cells: bool
+) -> VisibleNumbers:
     """What the functions of a scene's rule and fracture model see."""
     shares = WHOLE_CELLS if weighs_cells else {}
     weights = next(iter(constants.weights.values()))._fields
     limits = next(iter(constants.limits.values()))._fields
-    return Seen(
+    return VisibleNumbers(
         _all(constants.rule._fields, Home.SCENE, constants.by_particle, Home.FIXED_PARTICLE),
         tuple(Number(w, Home.CELL if w in shares else Home.SLOT) for w in weights),
         _remembered(particle_numbers(experiment), Home.PARTICLE),

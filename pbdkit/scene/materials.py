@@ -20,7 +20,7 @@ from pbdkit.model.bodies import Body
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import MixesCells, Setting, Slot, Stiffness, TearsCells
 from pbdkit.plugin.fields import ByRegion
-from pbdkit.plugin.lattice import Polygon
+from pbdkit.plugin.lattice import CellPolygon
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.constants import Values, kinds_of, named_weights, signed_distance, values_at
 
@@ -215,7 +215,7 @@ class _Cells:
     first corners on the raster, x and y of all corners, (corner, cell)."""
 
     experiment: Experiment
-    polygon: Polygon
+    polygon: CellPolygon
     place: Any
     x: Floats
     y: Floats
@@ -223,7 +223,7 @@ class _Cells:
     """(cell,): whether all corners are of the body."""
 
     @classmethod
-    def of(cls, experiment: Experiment, raster: Raster, polygon: Polygon) -> _Cells | None:
+    def of(cls, experiment: Experiment, raster: Raster, polygon: CellPolygon) -> _Cells | None:
         """Those of the raster; None where there is none."""
         steps = np.array([corner.cell for corner in polygon.corners])
         start, stop = np.maximum(0, -steps.min(axis=0)), raster.shape[1:] - steps.max(axis=0)

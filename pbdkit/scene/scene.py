@@ -32,7 +32,7 @@ from pbdkit.lattice.neighbourhood import (
     missing_segments,
     setting_of,
 )
-from pbdkit.lattice.raster import Extent, LeftOut, Raster, RowRange, distinct
+from pbdkit.lattice.raster import LeftOut, Raster, RowLayout, RowRange, distinct
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
@@ -123,7 +123,7 @@ class Ground:
             low, sites = (first, *rest), sites[first - before : last - before]
         raster = build_raster(lattice, low, sites, self.neighbourhood.reach_in_cells)
         if stretch:
-            extent = Extent(stretch.rows, raster.first[0] - stretch.first)
+            extent = RowLayout(stretch.rows, raster.first[0] - stretch.first)
             raster = replace(
                 raster,
                 before=stretch.before,

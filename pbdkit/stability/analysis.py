@@ -61,10 +61,10 @@ class Spectra:
         return step_operator(self.scene)
 
     @cached_property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> StabilityEstimate:
         """Of what has no matrix, or one that is too large."""
 
-        return Estimate(self.scene)
+        return StabilityEstimate(self.scene)
 
     @cached_property
     def spectrum(self) -> Spectrum | None:
@@ -372,7 +372,7 @@ BYTES = 500
 """Of memory a particle (measured at 1000 × 1000)."""
 
 
-class Estimate:
+class StabilityEstimate:
     """Of one scene, linearised at rest."""
 
     NEEDS = (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbdkit.lattice.raster import Block
 from pbdkit.plugin import CellStress, Slot, SoftensCells, Stiffness, Vector
-from pbdkit.plugin.lattice import Index, Polygon, Side, signed_area
+from pbdkit.plugin.lattice import CellPolygon, Index, Side, signed_area
 from pbdkit.plugin.rule import material_of
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import shown
@@ -139,7 +139,7 @@ def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
     return CellBeside(corners, _rates(polygon), side)
 
 
-def _rates(polygon: Polygon) -> tuple[Vector, ...]:
+def _rates(polygon: CellPolygon) -> tuple[Vector, ...]:
     """Of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1) over its area."""
     r, twice = polygon.rest, 2.0 * float(signed_area(polygon.rest))
     ends = [(r[(k + 1) % len(r)], r[k - 1]) for k in range(1, len(r))]

@@ -17,7 +17,7 @@ from pbdkit.io.layout import carried, in_this_layout, reserved_names
 from pbdkit.io.members import STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
-from pbdkit.sweeps.worker import KEPT, Report, Variable, unpacked
+from pbdkit.sweeps.worker import KEPT, MemberReport, MemberVariable, unpacked
 
 if TYPE_CHECKING:
     import xarray
@@ -87,7 +87,7 @@ def _attributes(runs: list[xarray.Dataset]) -> list[str]:
 
 
 Array = NDArray[Any]
-Reports = Callable[[str], Report]
+Reports = Callable[[str], MemberReport]
 FILL = "fill_value"
 """The attribute that says what stands in whole numbers where a member has none."""
 
@@ -127,7 +127,7 @@ class _Frame:
     differ from member to member."""
 
     def __init__(self) -> None:
-        self._first: dict[str, Variable] = {}
+        self._first: dict[str, MemberVariable] = {}
         self._dtypes: dict[str, np.dtype[Any]] = {}
         self._labels: dict[str, dict[Any, int]] = {}
         self._sizes: dict[str, int] = {}
@@ -135,7 +135,7 @@ class _Frame:
         self._members = 0
         self.described: list[tuple[str, tuple[str, ...], dict[str, Any]]] = []
 
-    def look(self, variables: dict[str, Variable]) -> None:
+    def look(self, variables: dict[str, MemberVariable]) -> None:
         """At the variables of one more member. Raises ExperimentError where one of them has other
         dimensions than in another member."""
         self._members += 1
@@ -189,7 +189,7 @@ class _Frame:
         return arrays | {name: np.array(list(found)) for name, found in self._labels.items()}
 
     def place(
-        self, variables: dict[str, Variable], where: tuple[int, ...], arrays: dict[str, Array]
+        self, variables: dict[str, MemberVariable], where: tuple[int, ...], arrays: dict[str, Array]
     ) -> None:
         """Puts the variables of one member to where they belong."""
         along = {
@@ -210,11 +210,11 @@ class _Frame:
         return name not in self._labels and not alike
 
 
-def _alike(said: str, one: Variable, other: Variable) -> bool:
+def _alike(said: str, one: MemberVariable, other: MemberVariable) -> bool:
     return said in other.attributes and np.array_equal(one.attributes[said], other.attributes[said])
 
 
-def _digest(variable: Variable) -> bytes:
+def _digest(variable: MemberVariable) -> bytes:
     return xxhash.xxh3_128_digest(np.ascontiguousarray(variable.values).tobytes())
 
 

@@ -49,7 +49,15 @@ from pbdkit.stepping.engine_choice import processors
 from pbdkit.sweeps.combine import joined
 from pbdkit.sweeps.specification import Asked, Dimension, Job, Keep, Member, checked, named
 from pbdkit.sweeps.store import Store
-from pbdkit.sweeps.worker import INTERRUPTED, KEPT, LOST, Report, report_of, run_member, run_members
+from pbdkit.sweeps.worker import (
+    INTERRUPTED,
+    KEPT,
+    LOST,
+    MemberReport,
+    report_of,
+    run_member,
+    run_members,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -67,11 +75,11 @@ AHEAD = 2
 WAIT_FOR_WORKERS_S = 30.0
 
 
-class Crew(ABC):
+class Executor(ABC):
     """Runs members in whatever order."""
 
     @abstractmethod
-    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
         """A report for each job, and None every now and then while there is none. Once `stopping`
         says so nothing more is begun. Whoever closes the iterator ends the workers, too."""
 
@@ -99,13 +107,13 @@ class Queue:
             found.append(self.jobs.popleft())
         return found
 
-    def reported(self, reports: list[Report]) -> Iterator[Report]:
+    def reported(self, reports: list[MemberReport]) -> Iterator[MemberReport]:
         """The reports."""
         for report in reports:
             self._seconds, self._count = self._seconds + report.seconds, self._count + 1
             yield report
 
-    def lost(self, chunk: list[Job], reason: str) -> Iterator[Report]:
+    def lost(self, chunk: list[Job], reason: str) -> Iterator[MemberReport]:
         """Takes members back whose worker came to an end; one that was alone too often is given
         up."""
         again = []
@@ -120,13 +128,13 @@ class Queue:
         self.jobs.extendleft(reversed(again))
 
 
-class Alone(Crew):
+class SerialExecutor(Executor):
     """This process, with classes from Python where there are any."""
 
     def __init__(self, components: tuple[type[Component], ...] = ()) -> None:
         self._components = components
 
-    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
         """One after the other."""
         for job in jobs:
             if stopping():
@@ -134,13 +142,13 @@ class Alone(Crew):
             yield run_member(job, self._components, stopping)
 
 
-class Cluster(Crew):
+class ClusterExecutor(Executor):
     """The workers of a dask cluster. Who can reach it can run code on it."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
 
-    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
         """Chunks as tasks, a few more than there are threads; those still out are cancelled where
         the work ends early. Raises ExperimentError where no worker is there, and StorageError where
         the scheduler is lost."""
@@ -177,7 +185,7 @@ class Cluster(Crew):
 
     def _handed_out(
         self, jobs: list[Job], out: dict[Any, list[Job]], stopping: Callable[[], bool]
-    ) -> Iterator[Report | None]:
+    ) -> Iterator[MemberReport | None]:
         from distributed import wait as wait_for
 
         wait: Any = wait_for
@@ -195,7 +203,7 @@ class Cluster(Crew):
                 yield from _reports(future, out.pop(future), queue)
 
 
-def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[Report]:
+def _reports(future: Any, chunk: list[Job], queue: Queue) -> Iterator[MemberReport]:
     """Of a task that has ended, well or not."""
     try:
         reports = future.result()
@@ -230,7 +238,7 @@ class _Plan(Sink):
         """Does not come."""
 
 
-class Outlook:
+class SizeEstimate:
     """Looks at the experiments of all members, builds the scene of each different body, and sums up
     the dataset that they come to."""
 
@@ -326,7 +334,7 @@ class Summary:
 
 
 def carry_out(
-    asked: Asked, folder: Path, crew: Crew, stopping: Callable[[], bool], show: Show
+    asked: Asked, folder: Path, crew: Executor, stopping: Callable[[], bool], show: Show
 ) -> Summary:
     """Validates every member, runs those that the folder does not hold, and writes the dataset.
 
@@ -347,7 +355,7 @@ def carry_out(
     with Store(folder) as store:
         ends = store.held()
         todo = [job for key, job in jobs.items() if key not in ends]
-        passing: dict[str, Report] = {}
+        passing: dict[str, MemberReport] = {}
         run = 0
         for report in _heard(crew.work(todo, stopping), len(jobs), len(todo), show):
             store.commit_if_due()
@@ -373,8 +381,8 @@ class _StoppedError(Exception):
 
 
 def _heard(
-    reports: Iterator[Report | None], members: int, todo: int, show: Show
-) -> Iterator[Report | None]:
+    reports: Iterator[MemberReport | None], members: int, todo: int, show: Show
+) -> Iterator[MemberReport | None]:
     """The reports of all but interrupted members, with what whoever waits is told meanwhile."""
     run = failed = 0
     for report in reports:
@@ -390,7 +398,7 @@ def validated(asked: Asked, show: Show) -> tuple[list[Dimension], list[Member], 
     """The grid, the members on it, and the versions of what they use. Raises ExperimentError and
     PluginError."""
     experiment = asked.experiment()
-    grid, outlook = asked.grid(experiment), Outlook(asked.sweep.keep, asked.sweep.count)
+    grid, outlook = asked.grid(experiment), SizeEstimate(asked.sweep.keep, asked.sweep.count)
     members: list[Member] = []
     versions: dict[str, str] = {}
     try:
@@ -431,14 +439,14 @@ ONE_THREAD = dict.fromkeys(
 the one that each member asks for."""
 
 
-class Processes(Crew):
+class ProcessExecutor(Executor):
     """So many workers, each a pool of one process, so that who is killed takes nobody along and
     what it was doing is known."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
 
-    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[Report | None]:
+    def work(self, jobs: list[Job], stopping: Callable[[], bool]) -> Iterator[MemberReport | None]:
         """Raises PbdkitError where workers cannot be started."""
         workers = [_Worker() for _ in range(min(self._workers, len(jobs)))]
         queue = Queue(deque(jobs), max(1, len(workers)))
@@ -471,7 +479,7 @@ class _Worker:
     """One process at a time, and the chunks that it has, the one that it is at first."""
 
     def __init__(self) -> None:
-        self.chunks: dict[Future[list[Report]], list[Job]] = {}
+        self.chunks: dict[Future[list[MemberReport]], list[Job]] = {}
         self._pool: ProcessPoolExecutor | None = None
         self._processes: set[BaseProcess] = set()
 
@@ -489,7 +497,7 @@ class _Worker:
         queue.jobs.extendleft(reversed(chunk))
         return False
 
-    def reports(self, queue: Queue) -> Iterator[Report]:
+    def reports(self, queue: Queue) -> Iterator[MemberReport]:
         """Of the chunks that are done. Where the process was killed the first is what it was at."""
         for future in [future for future in self.chunks if future.done()]:
             chunk = self.chunks.pop(future, None)
@@ -511,7 +519,7 @@ class _Worker:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
-    def _killed(self, chunk: list[Job], queue: Queue) -> Iterator[Report]:
+    def _killed(self, chunk: list[Job], queue: Queue) -> Iterator[MemberReport]:
         waiting = [job for jobs in self.chunks.values() for job in jobs]
         self.chunks.clear()
         queue.jobs.extendleft(reversed(waiting))
@@ -616,7 +624,9 @@ def called(
         return dataset
 
 
-def crew_of(workers: int | None, client: Any, components: tuple[type[Component], ...] = ()) -> Crew:
+def crew_of(
+    workers: int | None, client: Any, components: tuple[type[Component], ...] = ()
+) -> Executor:
     """Who runs the members. Raises ExperimentError where that cannot be."""
     if workers is not None and (type(workers) is not int or workers < 1):
         raise ExperimentError(f"workers: should be a number from 1, got {workers!r}")
@@ -628,6 +638,6 @@ def crew_of(workers: int | None, client: Any, components: tuple[type[Component],
             "make a plugin of them (`pbdkit plugins new`)"
         )
     if client is not None:
-        return Cluster(client)
+        return ClusterExecutor(client)
     number = workers or (1 if components else processors())
-    return Alone(components) if number == 1 else Processes(number)
+    return SerialExecutor(components) if number == 1 else ProcessExecutor(number)

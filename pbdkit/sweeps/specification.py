@@ -178,7 +178,7 @@ NAMELESS = (".otherwise", ".type")
 Array = NDArray[Any]
 
 
-class Setting(NamedTuple):
+class MemberSetting(NamedTuple):
     """One parameter at one of its values; `section` is where the sweep says so."""
 
     section: str
@@ -199,7 +199,7 @@ class Dimension:
     at each place of it."""
 
     name: str
-    settings: tuple[tuple[Setting, ...], ...]
+    settings: tuple[tuple[MemberSetting, ...], ...]
     coordinates: dict[str, Coordinate] = field(default_factory=dict)
 
 
@@ -209,18 +209,18 @@ def dimensions(sweep: Sweep, experiment: Experiment, taken: Set[str]) -> list[Di
     names = _names(sweep, {*taken, CASE, REPLICATE, STATUS, MESSAGE})
     found = []
     for path, values in sweep.vary.items():
-        settings = tuple((Setting("vary", path, value),) for value in values)
+        settings = tuple((MemberSetting("vary", path, value),) for value in values)
         along = _coordinates(names[path], path, values, experiment)
         found.append(Dimension(names[path], settings, along))
     if sweep.together:
-        each = ([Setting("together", p, v) for v in vs] for p, vs in sweep.together.items())
+        each = ([MemberSetting("together", p, v) for v in vs] for p, vs in sweep.together.items())
         along = {CASE: Coordinate(np.arange(sweep.cases), {})}
         for path, values in sweep.together.items():
             along[names[path]] = coordinate(path, values, experiment)
         found.append(Dimension(CASE, tuple(zip(*each, strict=True)), along))
     if sweep.replicates > 1:
         seeds = replicate_seeds(experiment.seed, sweep.replicates)
-        settings = tuple((Setting("replicates", "seed", value),) for value in seeds)
+        settings = tuple((MemberSetting("replicates", "seed", value),) for value in seeds)
         along = {REPLICATE: Coordinate(np.arange(sweep.replicates), {})}
         along["seed"] = coordinate("seed", tuple(seeds), experiment)
         found.append(Dimension(REPLICATE, settings, along))
@@ -237,14 +237,14 @@ def _names(sweep: Sweep, taken: Set[str]) -> dict[str, str]:
     return sweep.names | names_of(others, {*taken, *sweep.names.values()})
 
 
-def places(grid: list[Dimension]) -> Iterator[tuple[tuple[int, ...], tuple[Setting, ...]]]:
+def places(grid: list[Dimension]) -> Iterator[tuple[tuple[int, ...], tuple[MemberSetting, ...]]]:
     """Every place on the grid, and what is set there; the last dimension goes fastest."""
     for place in product(*(range(len(d.settings)) for d in grid)):
         every = (d.settings[n] for d, n in zip(grid, place, strict=True))
         yield place, tuple(setting for some in every for setting in some)
 
 
-def words(settings: tuple[Setting, ...]) -> str:
+def words(settings: tuple[MemberSetting, ...]) -> str:
     """What a member is called in messages: its parameters."""
     return ", ".join(f"{s.path}={brief(s.value)}" for s in settings) or "the experiment"
 
@@ -389,7 +389,7 @@ class Asked:
                 job = job_of(experiment, self.sweep.keep, versions)
             yield Member(place, words(settings), job), experiment
 
-    def _with(self, settings: Iterable[Setting]) -> Experiment:
+    def _with(self, settings: Iterable[MemberSetting]) -> Experiment:
         source, defaults = self.base, Experiment.defaults()
         for section, path, value in settings:
             label = self.source.places.get((section, path), section)

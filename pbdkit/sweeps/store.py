@@ -28,7 +28,7 @@ from pbdkit.io.sqlite_file import (
     is_database,
     look,
 )
-from pbdkit.sweeps.worker import Report, digest_of
+from pbdkit.sweeps.worker import MemberReport, digest_of
 
 DATABASE, LOCK, LARGE, ASIDE = "sweep.sqlite", "lock", "members", "set-aside"
 NEW = DATABASE + ".new"
@@ -112,7 +112,7 @@ class Store:
         self.commit()
         return found
 
-    def put(self, report: Report) -> None:
+    def put(self, report: MemberReport) -> None:
         """Keeps a report; it is on the disk with the next commit."""
         large = len(report.content) > LARGE_BYTES
         with self._storing():
@@ -140,7 +140,7 @@ class Store:
             self._lock.write(f"{len(self._keys):>19}\n".encode())
         self._due = time.monotonic() + COMMIT_S
 
-    def report(self, key: str) -> Report:
+    def report(self, key: str) -> MemberReport:
         """What is held of a member; StorageError where it is not what was written."""
         with self._storing():
             query = f"SELECT {COLUMNS} FROM member WHERE key = ?"
@@ -178,7 +178,7 @@ class Store:
                 "again, the same command goes on with what it holds"
             )
 
-    def _checked(self, row: Row) -> Report | str:
+    def _checked(self, row: Row) -> MemberReport | str:
         """The report in a row, or what is wrong with it."""
         changed = "is not what was written"
         key, status, message, large, digest, content = row or (None,) * 6
@@ -191,12 +191,12 @@ class Store:
                 return f"belongs to {self._file(key)}, which cannot be read: {error}"
         if not isinstance(content, bytes) or digest_of(key, status, message, content) != digest:
             return changed
-        return Report(key, status, message, content, digest)
+        return MemberReport(key, status, message, content, digest)
 
     def _file(self, key: str) -> Path:
         return self._folder / LARGE / f"{key}.member"
 
-    def _write(self, report: Report) -> None:
+    def _write(self, report: MemberReport) -> None:
         """Under a name that no process on any machine has, then under its own."""
         path = self._file(report.key)
         path.parent.mkdir(exist_ok=True)

@@ -33,7 +33,7 @@ LENGTH = 8
 """Bytes of the number that says how long the JSON is."""
 
 
-class Variable(NamedTuple):
+class MemberVariable(NamedTuple):
     """One variable of a run; `fixed` where it was known before the first step."""
 
     dims: tuple[str, ...]
@@ -43,12 +43,12 @@ class Variable(NamedTuple):
     fixed: bool
 
 
-def variable_of(column: Column, values: NDArray[Any], fixed: bool) -> Variable:
+def variable_of(column: Column, values: NDArray[Any], fixed: bool) -> MemberVariable:
     """The variable of a column of the dataset."""
-    return Variable(column.dims, values, column.attributes, column.coordinate, fixed)
+    return MemberVariable(column.dims, values, column.attributes, column.coordinate, fixed)
 
 
-def packed(variables: dict[str, Variable]) -> bytes:
+def packed(variables: dict[str, MemberVariable]) -> bytes:
     """The bytes."""
     head, parts = {}, []
     for name, (dims, values, attributes, *marks) in variables.items():
@@ -59,7 +59,7 @@ def packed(variables: dict[str, Variable]) -> bytes:
     return b"".join([len(described).to_bytes(LENGTH, "little"), described, *parts])
 
 
-def unpacked(content: bytes) -> dict[str, Variable]:
+def unpacked(content: bytes) -> dict[str, MemberVariable]:
     """What was packed; the values are views of the bytes."""
     begin = LENGTH + int.from_bytes(content[:LENGTH], "little")
     found = {}
@@ -69,7 +69,7 @@ def unpacked(content: bytes) -> dict[str, Variable]:
         values = np.frombuffer(content, kind, count, begin) if count else np.zeros(0, kind)
         begin += count * kind.itemsize
         flags = {k: np.array(v, kind) if isinstance(v, list) else v for k, v in attributes.items()}
-        found[name] = Variable(tuple(dims), values.reshape(shape), flags, coordinate, fixed)
+        found[name] = MemberVariable(tuple(dims), values.reshape(shape), flags, coordinate, fixed)
     return found
 
 
@@ -85,7 +85,7 @@ _one_at_a_time = threading.Lock()
 algebra belong to the process."""
 
 
-class Report(NamedTuple):
+class MemberReport(NamedTuple):
     """What came of a member: `message` says why it failed, or what its run warned of. `digest` is
     that of all the rest; `lasting` whether another attempt would come to the same."""
 
@@ -100,10 +100,10 @@ class Report(NamedTuple):
 
 def report_of(
     key: str, status: str, message: str, content: bytes = b"", lasting: bool = True, **more: Any
-) -> Report:
+) -> MemberReport:
     """The report with its digest."""
     whole = digest_of(key, status, message, content)
-    return Report(key, status, message, content, whole, lasting, **more)
+    return MemberReport(key, status, message, content, whole, lasting, **more)
 
 
 def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
@@ -141,7 +141,7 @@ class KeptSink(Sink):
         """What is kept, as bytes."""
         return packed({name: self._variable(column) for name, column in self.columns.items()})
 
-    def _variable(self, column: Column) -> Variable:
+    def _variable(self, column: Column) -> MemberVariable:
         entries = self._entries[column.name]
         if not column.grows:
             dtype = None if column.dtype == "str" else column.dtype
@@ -172,7 +172,7 @@ def kept_columns(columns: list[Column], wanted: set[str] | None) -> dict[str, Co
     return {c.name: c for c in columns if c in chosen or c in labels}
 
 
-def run_members(jobs: list[Job]) -> list[Report]:
+def run_members(jobs: list[Job]) -> list[MemberReport]:
     """One after the other."""
     return [run_member(job) for job in jobs]
 
@@ -181,7 +181,7 @@ def run_member(
     job: Job,
     components: Iterable[type[Component]] = (),
     stopping: Callable[[], bool] = lambda: False,
-) -> Report:
+) -> MemberReport:
     """Runs a member on one thread; what it raises becomes a report of the status `failed`."""
     begun, sink = time.perf_counter(), KeptSink(job.variables, job.times)
     content, lasting = b"", False

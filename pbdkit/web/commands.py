@@ -108,7 +108,7 @@ class Save(Strict):
     do: Literal["save"]
 
 
-class Seen(Strict):
+class PictureReceived(Strict):
     """The last picture has come; the next may."""
 
     do: Literal["seen"]
@@ -116,7 +116,7 @@ class Seen(Strict):
 
 Command = (
     Play | Advance | Rewind | Speed | Grab | Drag | Release | Turn | CutLine | CutBond | Colour
-    | Save | Seen
+    | Save | PictureReceived
 )  # fmt: skip
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="do")])
 
@@ -166,6 +166,6 @@ def obey(session: Session, command: Command) -> None:
             session.camera.colour = command.by
         case Save():
             session.save()
-        case Seen():
+        case PictureReceived():
             return
     session.pictures += 1

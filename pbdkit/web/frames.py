@@ -38,7 +38,7 @@ Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Frame:
+class ViewFrame:
     """A state as it is shown: positions (particle, 2), a value of each (None: coloured by kind),
     its kind, and which bonds are broken. `kinds` and `broken` are the same objects as long as
     nothing in them changes. `end` is the last step that was made, `made` counts the pictures that
@@ -53,7 +53,7 @@ class Frame:
     kinds: Bytes
     broken: Bytes
 
-    def encoded(self, before: Frame | None) -> bytes:
+    def encoded(self, before: ViewFrame | None) -> bytes:
         """The bytes for whoever has seen the frame before: what they know is left out."""
         parts: list[NDArray[Any]] = [self.positions]
         holds = 0
@@ -108,13 +108,13 @@ class Camera:
         u = state.u.reshape(len(state.u), -1)[:, self._place]
         return np.asarray(self.reference + u.T, np.float64)
 
-    def frame(self, scene: Scene, state: State, end: int, made: int, step_s: float) -> Frame:
+    def frame(self, scene: Scene, state: State, end: int, made: int, step_s: float) -> ViewFrame:
         """A picture of a state of a scene of that body; of what else it tells, see Frame."""
         with np.errstate(over="ignore"):  # of what diverges
             positions = self.positions(state).astype(np.float32)
             values = self._values(state)
         kinds, broken = self._kinds_of(scene, state.step), self._broken_of(state)
-        return Frame(state.step, end, made, step_s, positions, values, kinds, broken)
+        return ViewFrame(state.step, end, made, step_s, positions, values, kinds, broken)
 
     def _values(self, state: State) -> NDArray[np.float32] | None:
         if self.colour == "kind":
@@ -172,7 +172,7 @@ SPANS = {"solver.relaxation": (0.01, 2.0), "solver.memory": (0.0, 1.0)}
 
 
 @dataclass
-class Number:
+class AdjustableNumber:
     """One number by its place in the file, e.g. ``fracture.thresholds.0``.
 
     `given` is what the experiment says, a number or a course; `turns` are the steps after which it
@@ -254,18 +254,18 @@ class Number:
         return knots + [(step, course.at(step)) for step in range(begin, until + 1)]
 
 
-def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, Number]:
+def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, AdjustableNumber]:
     """All that may change in time of an experiment with these parts, by name."""
     found = {}
     for name, value in _candidates(parts):
-        number = Number(name, value, _bounds(experiment, name))
+        number = AdjustableNumber(name, value, _bounds(experiment, name))
         with suppress(PbdkitError):
             experiment.of_parts(placed(parts, number, number.turned(number.at(0) * MORE or LITTLE)))
             found[name] = number
     return found
 
 
-def placed(parts: dict[str, Any], number: Number, value: Any) -> dict[str, Any]:
+def placed(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:
     """The parts with another value there; what is not on the way to it is shared."""
     *parents, last = number.where
     parts = dict(parts)

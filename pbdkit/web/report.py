@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from pbdkit.bench.work_precision import COLUMNS
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
-from pbdkit.io.explain import Explained, Standing
+from pbdkit.io.explain import BondStatus, Explained
 from pbdkit.io.layout import OF_BODY, carried, in_this_layout, scene_of
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
 from pbdkit.io.open import reading
@@ -218,7 +218,7 @@ class Thinning:
             said.append(
                 f"{len(self.particles)} of the {self.count} particles are shown: one in "
                 f"{self.stride} along i and along j{', and all that lead' if self.led else ''}. "
-                "Bonds are shown where both of their particles are."
+                "BondArrays are shown where both of their particles are."
             )
         return said
 
@@ -262,7 +262,7 @@ STATES = ("intact", "broken", "cut", "broken from the start", "cannot break")
 
 
 @dataclass(frozen=True)
-class Bonds:
+class BondArrays:
     """Arrays along the bonds: `ends` the numbers of their particles, `rest` the rest offset, `step`
     of breaking or -1, `strain` at breaking and `limit`, NaN where not known, `state` of STATES; and
     what a model remembers of each at the end. `order` has the rows of the broken ones; `nearest` is
@@ -278,7 +278,7 @@ class Bonds:
     order: Rows
     model: str = "none"
     remembered: dict[str, Array] = field(default_factory=dict)
-    nearest: Standing | None = None
+    nearest: BondStatus | None = None
 
     @property
     def spacing(self) -> float:
@@ -338,7 +338,7 @@ class Bonds:
         }
 
 
-def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | None:
+def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
     """All that the dataset has; of one that has no table of bonds those of its scene, unless
     neighbours are found anew. None where neither knows any. Lengths are in the units of the page.
 
@@ -348,7 +348,7 @@ def bonds_of(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | None:
     return found and replace(found, rest=lattice_unit(dataset) * found.rest)
 
 
-def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | None:
+def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> BondArrays | None:
     if dataset.sizes.get("bond") == 0:  # of a body whose particles have no neighbours
         return None
     if scene is not None and "bond_ends" in dataset.variables:
@@ -365,26 +365,26 @@ def _in_lattice_units(dataset: xarray.Dataset, scene: Scene | None) -> Bonds | N
     return _whole(found.ends, found.rest, found.shell)
 
 
-def _whole(ends: Array, rest: Array, shell: Array) -> Bonds:
+def _whole(ends: Array, rest: Array, shell: Array) -> BondArrays:
     """Bonds of which nobody knows whether they break."""
     count = len(ends)
     unknown, never = np.full(count, np.nan), np.full(count, -1)
     state, order = np.zeros(count, np.int64), np.empty(0, np.intp)
-    return Bonds(ends, rest, shell, never, unknown, unknown, state, order)
+    return BondArrays(ends, rest, shell, never, unknown, unknown, state, order)
 
 
-def _explained(known: Explained, dataset: xarray.Dataset) -> Bonds:
+def _explained(known: Explained, dataset: xarray.Dataset) -> BondArrays:
     bonds = known.bonds
     names = known.remembered(0) if len(bonds) else ()
     last = {n: dataset[n].isel(time=-1, missing_dims="ignore").values for n in names}
-    return Bonds(
+    return BondArrays(
         bonds.ends, bonds.rest, bonds.shell, known.steps, known.strains_at_break,
         np.where(known.spared, np.nan, known.limits), _states(known.steps, known.cut, known.spared),
         known.order, known.model.type, last, known.nearest(),
     )  # fmt: skip
 
 
-def _told(dataset: xarray.Dataset) -> Bonds | None:
+def _told(dataset: xarray.Dataset) -> BondArrays | None:
     """By the dataset alone."""
     there = (dataset["bond_ends"].values > 0).all(axis=1)
     if not there.all():  # of a sweep, in which other members have more
@@ -399,7 +399,7 @@ def _told(dataset: xarray.Dataset) -> Bonds | None:
     return replace(broken_as(whole, dataset), model="not known")
 
 
-def broken_as(bonds: Bonds, dataset: xarray.Dataset) -> Bonds:
+def broken_as(bonds: BondArrays, dataset: xarray.Dataset) -> BondArrays:
     """The same bonds, broken as in a dataset that knows them all."""
     known = dataset.variables.get("broken_step")
     if known is None or known.shape != bonds.step.shape:
@@ -688,7 +688,7 @@ FADED = 1e-11
 
 
 @dataclass(frozen=True)
-class Moves:
+class SettlingMoves:
     """The largest move a step of any follower, `move`, up to each of the `steps`; `free` is the
     first of these rows after the last event: a leader that moves, begins or ends, a bond that
     breaks."""
@@ -720,7 +720,7 @@ class Moves:
         return int(self.steps[self.free + below[0]] - self.steps[self.free]) if len(below) else None
 
 
-def moves_of(dataset: xarray.Dataset) -> Moves | None:
+def moves_of(dataset: xarray.Dataset) -> SettlingMoves | None:
     """Between recorded steps that lie equally far apart, MOST at most; None where there are too
     few of them, or no kinds."""
     recorded = dataset.sizes["time"]
@@ -743,7 +743,7 @@ def moves_of(dataset: xarray.Dataset) -> Moves | None:
     if "broken_step" in dataset and dataset["broken_step"].size:
         last = int(dataset["broken_step"].max())
         event = max(event, int(np.searchsorted(times, last)))
-    return Moves(times[1:], np.array(move), min(event, len(move) - 1))
+    return SettlingMoves(times[1:], np.array(move), min(event, len(move) - 1))
 
 
 def settling(dataset: xarray.Dataset, scene: Scene | None) -> dict[str, Any]:
@@ -781,7 +781,9 @@ def _found(dataset: xarray.Dataset) -> dict[str, Any]:
     return {"certificate": told, "notes": [f"{note}last state can be at most."]}
 
 
-def _rows(dataset: xarray.Dataset, analysis: Analysis, moves: Moves | None) -> list[list[Any]]:
+def _rows(
+    dataset: xarray.Dataset, analysis: Analysis, moves: SettlingMoves | None
+) -> list[list[Any]]:
     to = analysis.steps_to["1e-3"]
     measured: Any = moves.steps_to(1e-3) if moves else None
     if moves and measured is None:
@@ -801,7 +803,7 @@ def _yes(stable: bool | None) -> str:
     return "not known" if stable is None else "yes" if stable else "no"
 
 
-def _ended(dataset: xarray.Dataset, moves: Moves | None) -> str:
+def _ended(dataset: xarray.Dataset, moves: SettlingMoves | None) -> str:
     status = str(dataset.attrs.get("status", ""))
     if status not in ("complete", "settled") or moves is None:
         return status
@@ -821,7 +823,7 @@ def _notes(analysis: Analysis) -> list[str]:
     return [*notes, *analysis.warnings()]
 
 
-def _curve(analysis: Analysis, moves: Moves) -> dict[str, Any]:
+def _curve(analysis: Analysis, moves: SettlingMoves) -> dict[str, Any]:
     """The logarithm of the moves, and the slope that was predicted through the middle of those
     that the decay is measured of."""
     with np.errstate(divide="ignore"):
@@ -911,7 +913,7 @@ def _refuse_no_motion(dataset: xarray.Dataset) -> None:
         raise ExperimentError("has no step or no particle: a page needs one of each")
 
 
-def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[Bonds | None, list[str]]:
+def _bonds(dataset: xarray.Dataset, origin: Origin) -> tuple[BondArrays | None, list[str]]:
     """Those that are known, and sentences about what is not."""
     notes = []
     if origin.fault:
@@ -1072,7 +1074,7 @@ class _Body:
     """Of one member: where it is at rest, (particle, axis), and its bonds."""
 
     reference: Array
-    bonds: Bonds | None
+    bonds: BondArrays | None
 
     @classmethod
     def of(cls, member: xarray.Dataset, scene: Scene | None) -> _Body:

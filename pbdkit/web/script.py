@@ -26,7 +26,7 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Floats, Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture import Segment
-from pbdkit.web.frames import Number, numbers_of, placed
+from pbdkit.web.frames import AdjustableNumber, numbers_of, placed
 
 Way = tuple[float, float]
 
@@ -133,7 +133,7 @@ class Script:
 
     experiment: Experiment
     parts: Parts
-    numbers: dict[str, Number]
+    numbers: dict[str, AdjustableNumber]
     groups: list[Led]
     cuts: list[Parts] = field(default_factory=list)
 

@@ -33,8 +33,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from pbdkit.errors import ExperimentError, PbdkitError
-from pbdkit.web.commands import LONGEST, Command, Rewind, Seen, command_of, obey
-from pbdkit.web.frames import Frame
+from pbdkit.web.commands import LONGEST, Command, PictureReceived, Rewind, command_of, obey
+from pbdkit.web.frames import ViewFrame
 from pbdkit.web.page import script, source
 from pbdkit.web.session import Judge, Judgement, Message, Session, scenery, standing
 
@@ -92,7 +92,7 @@ class Viewer(ABC):
 
     ready = True
     """Whether the last picture has come to it, so that the next may be sent."""
-    seen: Frame | None = None
+    seen: ViewFrame | None = None
     """The last that was sent."""
 
     @abstractmethod
@@ -190,7 +190,7 @@ class Conductor:
             self._viewers.remove(viewer)
             if not self._viewers:  # nobody is there to see it
                 self._try(None, self._session.rest)
-        elif isinstance(what, Seen) and viewer:
+        elif isinstance(what, PictureReceived) and viewer:
             viewer.ready = True
         elif not isinstance(what, str):
             self._try(viewer, lambda: obey(self._session, what))
@@ -256,7 +256,7 @@ def _silent() -> logging.Logger:
     return log
 
 
-class Page(Viewer):
+class SocketViewer(Viewer):
     """A page at the other end of a socket."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -364,7 +364,7 @@ class SessionServer:
         return response
 
     async def _talk(self, socket: ServerConnection) -> None:
-        viewer = Page(asyncio.get_running_loop())
+        viewer = SocketViewer(asyncio.get_running_loop())
         self._pages += 1
         sending = asyncio.create_task(viewer.send(socket))
         self._conductor.join(viewer)

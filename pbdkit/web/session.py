@@ -41,7 +41,7 @@ from pbdkit.stepping.divergence import Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state, unmoved_state
-from pbdkit.web.frames import COLOURS, Camera, Frame
+from pbdkit.web.frames import COLOURS, Camera, ViewFrame
 from pbdkit.web.script import NEVER, Led, Saved, Script, Way, saved
 
 LARGEST = 4000
@@ -130,7 +130,7 @@ SMALL = 20_000
 each takes seconds."""
 
 
-class Stage:
+class LiveStepper:
     """The scene of a script from one change of it to the next, and the engine that steps it."""
 
     def __init__(self, script: Script, scene: Scene) -> None:
@@ -334,7 +334,7 @@ REPLAY_S = 0.5
 
 
 @dataclass
-class Held:
+class GrabbedParticle:
     """A particle that the mouse holds: the group that is led, None until it is moved, where that
     was when it was grabbed, and how far the mouse has come since. `frees` tells that it follows
     again once it is let go."""
@@ -361,7 +361,7 @@ class Session:
     running: bool = False
     owed: int = 0
     speed: int = 1
-    held: Held | None = None
+    held: GrabbedParticle | None = None
     step_s: float = 0.0
     pictures: int = 0
     """How many there could have been."""
@@ -369,7 +369,7 @@ class Session:
     def __post_init__(self) -> None:
         scene = stepped(self.experiment)
         self.script = Script.of(scene.experiment)
-        self.stage = Stage(self.script, scene)
+        self.stage = LiveStepper(self.script, scene)
         self.state = self.stage.set(initial_state(scene))
         self.end, self.guard = 0, Guard.of(scene, self.state)
         self.camera, self.history = Camera(self.stage.scene), History(self.state)
@@ -428,7 +428,7 @@ class Session:
         found = int(self.camera.rows[row])
         if self.stage.scene.raster.table_kind[found] == FRAME:
             raise ExperimentError("points of the frame follow others, and cannot be led")
-        self.held = Held(found)
+        self.held = GrabbedParticle(found)
 
     def drag(self, by: Way) -> None:
         """How far the mouse has come since the particle was grabbed."""
@@ -477,7 +477,7 @@ class Session:
         self.says({"is": "saved", "path": str(found.path), "text": found.text, "steps": self.step})
         return found
 
-    def frame(self) -> Frame:
+    def frame(self) -> ViewFrame:
         """A picture of the body as it stands."""
         return self.camera.frame(self.stage.scene, self.state, self.end, self.pictures, self.step_s)
 
@@ -491,7 +491,7 @@ class Session:
         with self._editing():
             self.script.cut(segments, self.step)
 
-    def _take(self, held: Held) -> None:
+    def _take(self, held: GrabbedParticle) -> None:
         step, self.held = self.step, None  # nothing is, where it cannot be led
         with self._editing():
             leading = self.stage.scene.leading

@@ -19,7 +19,7 @@ from pbdkit.fitting.strength import (
     LAWS,
     BondStrains,
     Breaks,
-    Elastic,
+    ElasticResponse,
     Peaks,
     Specimens,
     bond_strains,
@@ -111,7 +111,7 @@ def test_the_likelihood_of_an_even_bar_is_weibulls_own():
 
 def test_alike_bonds_count_as_often_as_there_are():
     experiment = pbdkit.Experiment(**chain(16))
-    strains = Elastic.of(experiment, ANY).strains
+    strains = ElasticResponse.of(experiment, ANY).strains
     merged = strains.merged()
     assert len(strains.p) == 16
     assert merged.count.tolist() == [16.0]
@@ -197,7 +197,7 @@ def test_what_outlasts_its_test_counts():
 def test_the_first_break_of_a_run_is_where_it_is_computed():
     """Against the bonds that the equilibrium solver breaks in fine increments."""
     experiment = pbdkit.Experiment(**sheet(STRAIN), seed=4)
-    elastic = Elastic.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
+    elastic = ElasticResponse.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
     scene = build_scene(experiment)
     limits = strengths(scene, initial_state(scene))
     load = elastic.strains.load_at(limits).min()
@@ -211,7 +211,7 @@ def test_the_first_break_of_a_run_is_where_it_is_computed():
 def test_a_torn_specimen_bears_what_the_run_shows():
     """In the increments after its first break, run by run with one more of them: the peak force is
     the largest of these, or up to an increment above."""
-    elastic = Elastic.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
+    elastic = ElasticResponse.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
     specimens = Specimens.of(pbdkit.Experiment(**sheet(STRAIN)), ANY, elastic)
     reaction = {"type": "reaction", "youngs_modulus": 1.0, "thickness": 1.0}
     for seed in (1,):

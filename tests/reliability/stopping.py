@@ -23,7 +23,7 @@ from pbdkit.plugin import Component
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.restart import restore
 from pbdkit.scene.scene import build_scene
-from pbdkit.simulation import Report, Run, record
+from pbdkit.simulation import Run, RunReport, record
 
 Components = Iterable[type[Component]]
 MOST_STOPS = 4
@@ -56,14 +56,14 @@ def compression_of(experiment: Experiment) -> str:
     return experiment.record.compression
 
 
-def begun(parts: dict[str, Any], output: Path, own: Components, watch: Watch) -> Report:
+def begun(parts: dict[str, Any], output: Path, own: Components, watch: Watch) -> RunReport:
     """A run from its start."""
     experiment = Experiment.build(Source("trial", parts), own)
     sink = NetcdfSink(output, compression=compression_of(experiment))
     return record(Run(build_scene(experiment), watch=watch), OverlappingSink(sink))
 
 
-def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> Report:
+def gone_on(output: Path, own: Components, watch: Watch, engine: dict[str, Any]) -> RunReport:
     """The unfinished run of an output, by an engine of its own, as `pbdkit resume` does it."""
     left = UnfinishedRun.open(output, writing=True)
     try:

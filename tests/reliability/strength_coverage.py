@@ -36,9 +36,9 @@ from pbdkit.fitting.strength import (
     LAWS,
     BondStrains,
     Breaks,
-    Elastic,
+    ElasticResponse,
+    MachineReading,
     Peaks,
-    Seen,
     Specimen,
     Specimens,
     StrengthFit,
@@ -94,11 +94,11 @@ def built(law: str, parts: dict[str, Any]) -> pbdkit.Experiment:
     return pbdkit.Experiment.build(Source("pulled", parts), [plugin])
 
 
-def elastic_of(law: str, experiment: pbdkit.Experiment, of: str = "force") -> Elastic:
+def elastic_of(law: str, experiment: pbdkit.Experiment, of: str = "force") -> ElasticResponse:
     """The body before anything breaks."""
     for path in LAWS[law].paths:
         experiment = Parameter(path).put(experiment, LAWS[law].whole(path))
-    return Elastic.of(experiment, Peaks(peaks=(1.0, 1.0, 1.0), of=of))
+    return ElasticResponse.of(experiment, Peaks(peaks=(1.0, 1.0, 1.0), of=of))
 
 
 def described(law: str, peaks: Any, **more: Any) -> StrengthFit:
@@ -259,7 +259,7 @@ class Chains:
             least = fracture.scale * numbers.weibull(fracture.modulus, BONDS).min()
         else:
             least = fracture.failure * (1 + fracture.scatter * numbers.uniform(-1, 1, BONDS).min())
-        return Specimen(Seen(least, least), None, True)
+        return Specimen(MachineReading(least, least), None, True)
 
 
 def closed(law: str, trials: int, count: int, numbers: Any) -> bool:

@@ -7,7 +7,7 @@ import pytest
 from property_cases import HOLD_LEFT, experiment, pull_right, scene_of
 
 import pbdkit
-from pbdkit.stability.analysis import Analysis, Estimate
+from pbdkit.stability.analysis import Analysis, StabilityEstimate
 from pbdkit.stability.lag import lag_of
 
 pytest.importorskip("numba")
@@ -41,7 +41,7 @@ def test_estimates_are_near_what_is_exact(parts):
     """1 - λ of the slowest mode within 1 %, the smallest eigenvalue within 2 % of the width of the
     spectrum, the lag within 2 %."""
     scene = body(**parts)
-    exact, estimate = Analysis(scene), Estimate(scene)
+    exact, estimate = Analysis(scene), StabilityEstimate(scene)
     own, found = exact.spectra.of_rule, estimate.spectrum
     assert not exact.estimated
     assert 1 - found.largest == pytest.approx(1 - own.largest, rel=0.01)
@@ -56,12 +56,12 @@ def test_of_large_bodies_coarser_grids_are_enough(monkeypatch):
     monkeypatch.setattr("pbdkit.stability.analysis.MANY", 0)
     scene = body(240, 60)
     exact = (1 - math.cos(math.pi / 239)) / 2
-    assert 1 - Estimate(scene).spectrum.largest == pytest.approx(exact, rel=0.01)
+    assert 1 - StabilityEstimate(scene).spectrum.largest == pytest.approx(exact, rel=0.01)
 
 
 def test_waves_that_change_their_sign_do_not_outlast_the_slowest_mode():
     """The barycentre on the square lattice: waves have -1, held bodies nothing beyond -ρ."""
-    found = Estimate(body()).spectrum
+    found = StabilityEstimate(body()).spectrum
     assert found.smallest == -found.largest
     assert found.radius < 1.0
 

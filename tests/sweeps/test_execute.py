@@ -23,7 +23,7 @@ import pbdkit
 from pbdkit.io import sqlite_file
 from pbdkit.model.reading import Source
 from pbdkit.sweeps import store as stores
-from pbdkit.sweeps.execute import Alone, Cluster, Processes, carry_out
+from pbdkit.sweeps.execute import ClusterExecutor, ProcessExecutor, SerialExecutor, carry_out
 from pbdkit.sweeps.specification import Asked, checked, replicate_seeds
 
 VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
@@ -40,7 +40,7 @@ def small(tensile):
 def run_only(monkeypatch):
     """The keys of the members that are run, in this process or by workers."""
     seen = []
-    for crew in (Alone, Processes):
+    for crew in (SerialExecutor, ProcessExecutor):
         original = crew.work
 
         def work(self, jobs, stopping, original=original):
@@ -371,7 +371,7 @@ def test_a_locked_database_is_waited_for_and_said_to_be_locked(small, tmp_path, 
 
 def meanwhile(monkeypatch, act):
     """Does something once the first member of a sweep has been run."""
-    work, left = Alone.work, [act]
+    work, left = SerialExecutor.work, [act]
 
     def working(self, jobs, stopping):
         for report in work(self, jobs, stopping):
@@ -379,7 +379,7 @@ def meanwhile(monkeypatch, act):
             if left:
                 left.pop()()
 
-    monkeypatch.setattr(Alone, "work", working)
+    monkeypatch.setattr(SerialExecutor, "work", working)
 
 
 def test_a_database_that_is_removed_while_a_sweep_runs_is_said_to_be(small, tmp_path, monkeypatch):
@@ -479,7 +479,7 @@ def test_a_worker_that_hangs_before_it_begins_is_ended(small, tmp_path, monkeypa
     (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     begun, stopped = time.monotonic(), []
-    reports = Processes(1).work(jobs_of(small, 2), lambda: bool(stopped))
+    reports = ProcessExecutor(1).work(jobs_of(small, 2), lambda: bool(stopped))
     assert next(reports) is None
     stopped.append(True)
     assert [*reports] == []
@@ -507,7 +507,7 @@ def test_a_sweep_is_stopped_while_its_members_are_validated(small, tmp_path, mon
     base = Source(data=small)
     sweep = checked({"experiment": small, "vary": {"seed": [*range(50)]}}, base)
     summary = carry_out(
-        Asked(sweep, base, base), tmp_path / "out", Alone(), stopping, lambda *told: None
+        Asked(sweep, base, base), tmp_path / "out", SerialExecutor(), stopping, lambda *told: None
     )
     assert (summary.path, summary.run, len(asked)) == (None, 0, 4)
     assert not (tmp_path / "out").exists()
@@ -528,7 +528,7 @@ class Lost:
 
 def test_a_scheduler_that_is_lost_is_named_with_how_to_go_on(small):
     with pytest.raises(pbdkit.StorageError, match=r"the scheduler is lost.*is held, and the same"):
-        [*Cluster(Lost()).work(jobs_of(small, 2), lambda: False)]
+        [*ClusterExecutor(Lost()).work(jobs_of(small, 2), lambda: False)]
 
 
 def test_the_wait_for_a_worker_of_a_cluster_can_be_stopped(small):
@@ -536,7 +536,7 @@ def test_the_wait_for_a_worker_of_a_cluster_can_be_stopped(small):
 
     with Client(processes=False, n_workers=0, dashboard_address=None) as client:
         begun, stopped = time.monotonic(), []
-        reports = Cluster(client).work(jobs_of(small, 2), lambda: bool(stopped))
+        reports = ClusterExecutor(client).work(jobs_of(small, 2), lambda: bool(stopped))
         assert next(reports) is None
         stopped.append(True)
         assert [*reports] == []

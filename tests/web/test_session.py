@@ -31,7 +31,7 @@ from pbdkit.web import session as history
 from pbdkit.web import session as stage
 from pbdkit.web.command_line import live
 from pbdkit.web.commands import FARTHEST, LONGEST, command_of, obey
-from pbdkit.web.server import Access, Conductor, Page, SessionServer
+from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
 from pbdkit.web.session import Session, judged, scenery, standing
 from pbdkit.web.widget import LiveWidget
 
@@ -617,7 +617,7 @@ class Gone:
 
 def test_who_is_gone_is_told_nothing_and_nobody_minds():
     async def told():
-        page = Page(asyncio.get_running_loop())
+        page = SocketViewer(asyncio.get_running_loop())
         page.tell({"is": "note"})
         await page.send(Gone())
         return page

@@ -38,7 +38,14 @@ from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene import obstacles as outlines
-from pbdkit.scene.constants import Home, Number, Seen, bond_numbers, numbers_of, particle_numbers
+from pbdkit.scene.constants import (
+    Home,
+    Number,
+    VisibleNumbers,
+    bond_numbers,
+    numbers_of,
+    particle_numbers,
+)
 from pbdkit.scene.leaders import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses, tried
@@ -67,7 +74,7 @@ class Level:
     """Of each contribution, the number of its components."""
 
     @cached_property
-    def seen(self) -> Seen:
+    def seen(self) -> VisibleNumbers:
         """The numbers that the rule sees."""
         scene = self.scene
         return numbers_of(scene.experiment, scene.constants, weighs_cells=scene.cells is not None)
