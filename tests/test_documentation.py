@@ -36,8 +36,9 @@ def blocks(language):
 
 
 COARSER = {
-    '{"lattice.a": 0.5}': '{"lattice.a": 1.25}',
-    '{"lattice.a": 0.25}': '{"lattice.a": 1.5}',
+    '["lattice"]["a"] = 1.0': '["lattice"]["a"] = 2.0',
+    '{"lattice.a": 0.5}': '{"lattice.a": 2.5}',
+    '    "0.25 mm": {"settings": {"lattice.a": 0.25}},\n': "",
     '"folds": 3': '"folds": 2',
 }
 """What is changed in `fitting.md`: its finer rivals take half a minute; the builder of the site has

@@ -255,8 +255,8 @@ TORN = {
 }
 
 
-def test_kernels_soften_as_numpy_does():
-    """One kernel, which takes a minute to compile."""
+def test_kernels_soften_as_numpy_does(interpreted):
+    """One that softens is compiled in `testing/test_conformance`, which takes half a minute."""
     pytest.importorskip("numba")
     fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01}
     found, known = (

@@ -194,9 +194,8 @@ COMPILED = {
     "found anew, numbers of particles": {"neighbours": ANEW, "rule": Tiring(spread=0.1)},
 }
 """Each kind of code that kernels are made of, several together in each; one rule that moves by
-another is compiled for threads, below, cells that soften in
-`components/test_fracture_cohesive`, single precision in `components/test_fracture`, and the
-built-in functions in `testing/test_conformance`."""
+another is compiled for threads, below, single precision in `components/test_fracture`, and the
+built-in functions, those of cells that soften too, in `testing/test_conformance`."""
 
 
 @pytest.mark.parametrize("parts", COMPILED.values(), ids=COMPILED)
