@@ -25,8 +25,8 @@ from pbdkit.model.solver import Settle
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.divergence import way_of
+from pbdkit.stepping.fracture import Fracturing
 from pbdkit.stepping.leaders import bends_of, is_cut_short, last_event
-from pbdkit.stepping.numpy_engine import Fracturing
 from pbdkit.stepping.state import Floats, State
 
 WAYS = {

@@ -1,16 +1,12 @@
-"""How particles give way along different directions: on edges and at corners not alike.
+"""Contact: particles inside an obstacle are put on its outline after the step, as position-based
+dynamics does it, without friction.
 
 A calibrated rule moves a particle by S⁻¹ · force for some matrix S of the particle: of elastic
-rules that is the stiffness with which its neighbours hold it, of springs a multiple of 1.
-
-Keep particles out of obstacles: those that lie inside one are put on its outline after the step,
-as position-based dynamics does it, without friction.
-
-A rule moves a particle by S⁻¹ · force (stepping/compliance.py). A particle goes to the place
-outside of all obstacles that is nearest in the metric S: the way there is S⁻¹ n for a push along
-the normal n at that place, or normals where obstacles meet, so that what is left of the forces at
-rest is along normals. Where S is a multiple of 1 that is the nearest place. A guided particle goes
-along the axis along which it follows.
+rules that is the stiffness with which its neighbours hold it, of springs a multiple of 1. A
+particle goes to the place outside of all obstacles that is nearest in the metric S: the way there
+is S⁻¹ n for a push along the normal n at that place, or normals where obstacles meet, so that what
+is left of the forces at rest is along normals. Where S is a multiple of 1 that is the nearest
+place. A guided particle goes along the axis along which it follows.
 """
 
 from __future__ import annotations
@@ -30,6 +26,7 @@ from pbdkit.plugin.vector import length, vector
 from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import Floats, State, unmoved_state
 
@@ -285,3 +282,20 @@ class Contact:
 def _alike(count: int) -> Floats:
     """C of particles that give way alike along all directions, (xx xy yy, particle)."""
     return np.repeat([[1.0], [0.0], [1.0]], count, axis=1)
+
+
+class PushOut(Operation):
+    """Put particles out of obstacles."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.contact = Contact(scene)
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where there are obstacles."""
+        return bool(scene.barriers)
+
+    def apply(self, step: Step) -> None:
+        """After particles have moved, guided ones where they are led to."""
+        self.contact.push_out(step.new, step.number)

@@ -44,7 +44,7 @@ from pbdkit.lattice.raster import slot_step
 from pbdkit.plugin import Slot
 from pbdkit.plugin.discovery import blaming
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.leaders import Led, prescribe, steady_steps
+from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
@@ -77,6 +77,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
     write_whole,
 )
 from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.operation import Led
 from pbdkit.stepping.state import State, cut_bonds, unmoved_state
 
 THREAD = ("me", "threads")

@@ -1,5 +1,5 @@
-"""What moves followers: a rule's move, then relaxation and memory. Their neighbours stay as they
-are, or are found anew at every step, by distance (model.md, section 4)."""
+"""Followers: a rule's move, then relaxation and memory. Their neighbours stay as they are, or are
+found anew at every step, by distance (model.md, section 4)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from pbdkit.lattice.neighbourhood import Neighbourhood
 from pbdkit.lattice.raster import positions
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import Components, Here, StoresEnergy
+from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
     Evaluator,
@@ -247,3 +249,24 @@ def _summed(part: Any, owner: Indices, count: int) -> Any:
     if isinstance(part, Components):
         return part.each(lambda values: _summed(values, owner, count))
     return np.bincount(owner, np.broadcast_to(part, owner.shape), count)
+
+
+class MoveFollowers(Operation):
+    """Move the particles of the body by the rule, leaders and guided particles too."""
+
+    def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
+        super().__init__(scene)
+        kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
+        self._followers = followers or kind(scene)
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """In every scene."""
+        return True
+
+    def apply(self, step: Step) -> None:
+        """From the intermediate configuration. What leaves the finite numbers is found at
+        recording."""
+        quiet = np.errstate(all="ignore", invalid=step.invalid)
+        with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
+            self._followers.move(step.u, step.new, step.state)

@@ -1,25 +1,22 @@
-"""Clamped leaders: their directions are prescribed as their places are.
+"""Leaders: what they prescribe in a step, and what guided particles do along the other axes.
 
-How guided particles follow along the axes along which they do not lead.
+Clamped leaders prescribe their directions as they prescribe their places.
 
-A rule's move is S⁻¹ · force for some 2 × 2 matrix S of the particle. Where that is held along some
-axes l, and free along others f, the move along f that has no force there is
+A rule's move is S⁻¹ · force for some 2 × 2 matrix S of the particle. Where a guided particle is
+held along some axes l, and free along others f, the move along f that has no force there is
 
     m_f + S_ff⁻¹ S_fl m_l:
 
-what the rule moves along l is what pushes at the guide. S is asked of calibrated rules; others are
-taken at their word. On straight edges S_fl is zero, at corners and in cut cells it is not.
+what the rule moves along l is what pushes at the guide. S is computed for calibrated rules; others
+are taken at their word. On straight edges S_fl is zero, at corners and in cut cells it is not.
 
-What neighbours exert on leaders that move by Newton's law: at their single places, by numpy in
-every engine.
-
-What the leaders prescribe in a step, and for how many steps that stays so.
+Forces on leaders that move by Newton's law are computed at their single places, by numpy in every
+engine.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +30,7 @@ from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.operation import Led, Operation, Placed, Starts, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import Array, Floats, State
 
@@ -229,19 +227,6 @@ def _parts(scene: Scene, place: Indices) -> list[tuple[Indices, Surroundings]]:
     return found
 
 
-class Placed(NamedTuple):
-    """Particles that lead: their places, and their displacements u (axis, particle) along those
-    axes."""
-
-    place: Indices
-    u: Floats
-    axes: tuple[int, ...]
-
-
-Led = list[Placed]
-Starts = tuple[Floats | None, ...]
-
-
 def prescribe(
     scene: Scene, state: State, moment: float, forces: NewtonForces | None = None
 ) -> tuple[Led, Starts]:
@@ -370,3 +355,107 @@ def placed(u: Floats, led: Led) -> Led:
     """Where the same particles stand, along the same axes."""
     flat = u.reshape(len(u), -1)
     return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in led]
+
+
+class PlaceLeaders(Operation):
+    """Put the leaders where they are prescribed: the intermediate configuration."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._forces = NewtonForces(scene)
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where there are leader groups."""
+        return bool(scene.leading)
+
+    def apply(self, step: Step) -> None:
+        """Before anybody moves; where the leaders stood is noted."""
+        step.led, step.starts = prescribe(self.scene, step.state, step.number, self._forces)
+        step.stood = placed(step.u, step.led)
+        place(step.u, step.led)
+
+
+class GuideLeaders(Operation):
+    """Put guided particles where they are prescribed after the step, too: along those axes they
+    make no way that memory could carry on."""
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where particles may be guided."""
+        return has_guides(scene.leading)
+
+    def apply(self, step: Step) -> None:
+        """In the displacements after the step."""
+        place(step.new, step.led)
+
+
+class GuideToObstacles(GuideLeaders):
+    """Put guided particles where obstacles find them."""
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where particles may be guided, and pushed."""
+        return bool(scene.barriers) and super().is_needed(scene)
+
+
+class TurnDirections(Operation):
+    """Turn the directions of clamped leaders as their motions turn."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._clamps = Clamps(scene)
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where leaders are clamped."""
+        return bool(Clamps(scene).numbers)
+
+    def apply(self, step: Step) -> None:
+        """Before particles move; what is prescribed is noted."""
+        clamped = self._clamps.turn(step.state, step.number)
+        values = self._clamps.directions(step.state)
+        step.turned = [(value, clamped, value[clamped]) for value in values]
+
+
+class HoldDirections(TurnDirections):
+    """Let clamped leaders have the directions that they prescribe, whatever the rule makes of
+    them."""
+
+    def apply(self, step: Step) -> None:
+        """After particles have moved."""
+        for values, clamped, prescribed in step.turned:
+            values[clamped] = prescribed
+
+
+class CorrectGuided(Operation):
+    """Add what guided particles make of the moves along the axes along which they lead."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._guidance = Guidance(scene)
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where moves along one axis may add to those along another."""
+        return Guidance(scene).slanted
+
+    def apply(self, step: Step) -> None:
+        """After particles have moved."""
+        with np.errstate(all="ignore", invalid=step.invalid):
+            self._guidance.correct(step.new, step.u, step.number)
+
+
+class HoldLeaders(Operation):
+    """Let the leaders be where they are prescribed, whatever the rule makes of them, and put back
+    where they stood in the displacements before the step."""
+
+    @classmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Where there are leader groups."""
+        return bool(scene.leading)
+
+    def apply(self, step: Step) -> None:
+        """After all particles have moved."""
+        place(step.new, step.led)
+        place(step.u, step.stood)

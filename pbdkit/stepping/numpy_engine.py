@@ -1,169 +1,16 @@
-"""Breaking bonds (model.md, section 6).
-
-The engine interface: what takes a state some steps further.
-"""
+"""The engine interface, and the numpy engine: the oracle of every faster one."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from pbdkit.lattice.neighbourhood import bonds_in, plane_block
-from pbdkit.plugin import CellStress, Components, FractureModel, SoftensCells, length
-from pbdkit.plugin.discovery import blaming
-from pbdkit.plugin.vector import vector
-from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.cell_stress import CellStresses
-from pbdkit.stepping.contact import Contact
-from pbdkit.stepping.followers import Followers, GatheringFollowers, SlotFollowers
-from pbdkit.stepping.leaders import Clamps, Guidance, NewtonForces, place, placed, prescribe
-from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
-from pbdkit.stepping.state import State, cut_bonds
-
-Home = tuple[Any, ...]
-"""Where bonds are kept: plane and cells."""
-DIRECTIONS = 8
-TIE = 1e-6
-"""Cells begin to soften together whose loads differ by no more than this share."""
-CALM = 1e-3
-"""Other cells begin once none that has begun changes its damage by more."""
-
-
-class Fracturing:
-    """The fracture model of a scene on its planes of bonds."""
-
-    @classmethod
-    def of(cls, scene: Scene) -> Self | None:
-        """None where the model breaks nothing."""
-        return cls(scene) if scene.experiment.fracture.can_break else None
-
-    def __init__(self, scene: Scene) -> None:
-        self._model: FractureModel = scene.experiment.fracture
-        self._constants, self._evaluator = scene.constants, Evaluator(scene)
-        self._breakable = []
-        frame_too = self._model.breaks_frame_bonds()
-        inside = isinstance(self._model, SoftensCells)
-        self._cells = CellStresses(scene) if inside else None
-        self._numbers = [number.name for number in bond_numbers(scene.experiment)]
-        for n, plane in enumerate(scene.neighbourhood.planes):
-            block = plane_block(scene.raster, plane, inside=inside)
-            for part in block.rows(BLOCK_CELLS) if block else ():
-                where_ = bonds_in(scene.raster, part, plane, frame_too)
-                self._breakable.append((n, plane.slot, part, where_))
-
-    def break_bonds(
-        self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
-    ) -> None:
-        """Renews, in place, what is remembered of the bonds in the intermediate configuration m,
-        and marks those that break, with their length.
-
-        Of cells that would begin to soften the most loaded begin if they are to do so `in_turn`,
-        and none before those that have begun are nearly settled.
-        """
-        assert state.broken_step is not None
-        assert state.broken_length is not None
-        when = f"at step {step}"
-        renewed: Iterable[_Renewed] = self._renewed(m, state, when)
-        if in_turn and self._cells:
-            before = [value.copy() for value in state.bond_values]
-            renewed = list(renewed)
-            self._hold_back(before, renewed)
-        for part in renewed:
-            breaks = self._breaks(part, when)
-            if breaks.any():
-                state.broken_step[part.home][breaks] = step
-                now = part.r + part.d.each(lambda values, where=breaks: values[where])
-                state.broken_length[part.home][breaks] = length(now)
-
-    def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
-        """Whether any bond breaks at u, or at a configuration in which one of its ends is less than
-        `within` away from there as seen from the other.
-
-        Looked for in eight directions, so far out that the octagon takes in the circle.
-        """
-        radius = within / np.cos(np.pi / DIRECTIONS)
-        angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-        around = np.stack([np.cos(angles), np.sin(angles)], axis=1).tolist()
-        return any(
-            self._breaks(part, "near equilibrium").any()
-            for along in ([0.0, 0.0], *around)
-            for part in self._renewed(u, state, "near equilibrium", radius * vector(along))
-        )
-
-    def _renewed(
-        self, m: NDArray[Any], state: State, when: str, nudge: Components | None = None
-    ) -> Iterator[_Renewed]:
-        """Part by part the bonds of each slot where they are kept. What is remembered is renewed in
-        place; not where d is nudged, all alike, to see."""
-        assert state.broken_step is not None
-        for n, slot, block, breakable in self._breakable:
-            there, here = block.seen_through(slot).of(m), block.of(m)
-            d, r = vector(there) - vector(here), slot.rest
-            intact = breakable & (block.within(state.broken_step[n]) < 0)
-            own = [block.within(value[n]) for value in state.bond_values]
-            if nudge:
-                d, own = d + nudge, [value.copy() for value in own]
-            with np.errstate(all="ignore"), blaming(self._model, when):
-                limits = self._constants.limits_at(slot, n, block)
-                cells = self._cells.of(m, slot, block) if self._cells else ()
-                self._evaluator.renew_bonds(d, r, limits, own, intact, cells)
-            yield _Renewed((n, *block.slices()[1:]), d, r, limits, own, intact, cells)
-
-    def _breaks(self, part: _Renewed, when: str) -> NDArray[np.bool_]:
-        """Which of some bonds break."""
-        with np.errstate(all="ignore"), blaming(self._model, when):
-            return np.asarray(
-                part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.own)
-            )
-
-    def _hold_back(self, before: list[NDArray[Any]], parts: Sequence[_Renewed]) -> None:
-        """Leaves cells as they were `before` that would begin to soften, all but the most loaded,
-        or all as long as what has begun to soften still changes."""
-        changed, most = 0.0, 0.0
-        sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
-        waiting = []
-        for part in parts:
-            for n, numbers in enumerate(sides):
-                old = [value[part.home] for value, its in zip(before, numbers, strict=True) if its]
-                new = [value for value, its in zip(part.own, numbers, strict=True) if its]
-                begins = np.all([value == 0.0 for value in old], axis=0)
-                ways = (abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True))
-                changed = max(changed, *(float(way[~begins].max(initial=0.0)) for way in ways))
-                begins &= np.any([value != 0.0 for value in new], axis=0)
-                if begins.any():
-                    load = self._load(part, n)
-                    most = max(most, float(load[begins].max()))
-                    waiting.append((begins, load, old, new))
-        least = most * (1.0 - TIE) if changed <= CALM else math.inf
-        for begins, load, old, new in waiting:
-            for a, b in zip(old, new, strict=True):
-                np.copyto(b, a, where=begins & (load < least))
-
-    def _load(self, part: _Renewed, side: int) -> NDArray[Any]:
-        """The load of the cells on a side of some bonds, or of those on the other where they have
-        none there."""
-        loads = [self._evaluator.load(cell, part.limits, part.own) for cell in part.cells]
-        found: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
-        return np.broadcast_to(found, part.intact.shape)
-
-
-class _Renewed(NamedTuple):
-    """Some bonds along a slot where they are kept, with what is remembered of them."""
-
-    home: Home
-    d: Components
-    r: Components
-    limits: Any
-    own: list[NDArray[Any]]
-    intact: NDArray[np.bool_]
-    cells: tuple[CellStress, ...]
+from pbdkit.stepping.followers import MoveFollowers
+from pbdkit.stepping.operation import Step
+from pbdkit.stepping.program import program_of
+from pbdkit.stepping.state import State
 
 
 class Engine(ABC):
@@ -185,24 +32,18 @@ class Engine(ABC):
 
 
 class Stepper(Engine):
-    """The numpy engine: the oracle of every faster one. It holds what is constant and no state."""
+    """The numpy engine: it applies the operations of a step, and holds no state."""
 
     name = "numpy"
 
     def __init__(
-        self, scene: Scene, followers: Followers | None = None, *, strict: bool = False
+        self, scene: Scene, sweep: MoveFollowers | None = None, *, strict: bool = False
     ) -> None:
         """With `strict` the first operation of the rule that gives NaN raises
         FloatingPointError."""
         self._scene = scene
         self._invalid: Literal["raise", "ignore"] = "raise" if strict else "ignore"
-        self._rule = scene.experiment.rule
-        self._fracturing = Fracturing.of(scene)
-        self._contact = Contact(scene) if scene.barriers else None
-        self._clamps = Clamps(scene)
-        kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
-        self._followers = followers or kind(scene)
-        self._guidance, self._newton = Guidance(scene), NewtonForces(scene)
+        self._program = program_of(scene, sweep)
         self._now = self
         """With the numbers of the last step."""
 
@@ -216,31 +57,8 @@ class Stepper(Engine):
         return state
 
     def _step(self, state: State) -> State:
-        step, u, new = state.step + 1, state.u, state.previous
-        cut_bonds(self._scene, state.broken_step, step)
-        led, starts = prescribe(self._scene, state, step, self._newton)
-        before = placed(u, led)
-        place(u, led)
-        if self._guidance.some:  # who leads along an axis makes no way along it that could go on
-            place(new, led)
-        if self._fracturing:
-            self._fracturing.break_bonds(u, state, step)
-        clamped = self._clamps.turn(state, step)
-        kept = [(values, values[clamped]) for values in self._clamps.directions(state)]
-        # What leaves the finite numbers is found at recording.
-        quiet = np.errstate(all="ignore", invalid=self._invalid)
-        with quiet, blaming(self._rule, f"at step {step}"):
-            self._followers.move(u, new, state)
-            self._guidance.correct(new, u, step)
-        for values, prescribed in kept:
-            values[clamped] = prescribed
-        if self._contact:
-            if self._guidance.some:
-                place(new, led)
-            self._contact.push_out(new, step)
-        place(new, led)
-        place(u, before)
-        if self._scene.frame:
-            body = u if self._scene.frame.map.lag else new
-            self._scene.frame.follow(body.reshape(len(u), -1), new.reshape(len(u), -1))
-        return replace(state, step=step, u=new, previous=u, starts=starts)
+        step = Step(state.step + 1, state.u, state.previous, state, self._invalid)
+        for operation in self._program:
+            operation.apply(step)
+        starts = step.starts or state.starts
+        return replace(state, step=step.number, u=step.new, previous=step.u, starts=starts)

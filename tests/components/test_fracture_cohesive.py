@@ -10,7 +10,7 @@ import pbdkit
 from pbdkit.plugin.lattice import signed_area
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.followers import SlotFollowers
-from pbdkit.stepping.numpy_engine import Fracturing
+from pbdkit.stepping.fracture import Fracturing
 from pbdkit.stepping.state import initial_state
 
 sys.path.append(str(Path(__file__).parents[1] / "reliability"))

@@ -22,10 +22,11 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.scene.leaders import has_guides
 from pbdkit.scene.obstacles import Walls, outlines_at
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.leaders import Led, Placed, Slants, prescribe, steady_steps
+from pbdkit.stepping.leaders import Slants, prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import Arrays
 from pbdkit.stepping.numba_engine.plan import Function, Plan, banded, room_for
 from pbdkit.stepping.numba_engine.sweeps import local_places
+from pbdkit.stepping.operation import Led, Placed
 from pbdkit.stepping.state import State
 
 

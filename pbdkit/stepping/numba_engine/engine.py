@@ -31,8 +31,8 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact
-from pbdkit.stepping.followers import Followers, GatheringFollowers
-from pbdkit.stepping.leaders import Clamps, Guidance, Led, NewtonForces, prescribe, steady_steps
+from pbdkit.stepping.followers import Followers, GatheringFollowers, MoveFollowers
+from pbdkit.stepping.leaders import Clamps, Guidance, NewtonForces, prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
     bits_for,
@@ -65,6 +65,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
     torn_marks,
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.operation import Led
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
 from pbdkit.stepping.state import Floats, State, cut_bonds, unmoved_state
 
@@ -278,7 +279,7 @@ class CompiledStepper(Engine):
         self._scene = scene
         self._pairs: Stepper | None = None
         if scene.experiment.neighbours.nearness():
-            self._pairs = Stepper(scene, PairFollowers(scene, self.threads))
+            self._pairs = Stepper(scene, MoveFollowers(scene, PairFollowers(scene, self.threads)))
             return
         self._last: State | None = None
         self._numbered = scene

@@ -50,7 +50,7 @@ from pbdkit.scene.leaders import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses, tried
 from pbdkit.stepping.followers import target
-from pbdkit.stepping.leaders import Clamps, Guidance, Led
+from pbdkit.stepping.leaders import Clamps, Guidance
 from pbdkit.stepping.numba_engine.cache import load_kernel
 from pbdkit.stepping.numba_engine.time_skewing import (
     CACHE,
@@ -59,6 +59,7 @@ from pbdkit.stepping.numba_engine.time_skewing import (
     exceeds_cache,
     single_steps,
 )
+from pbdkit.stepping.operation import Led
 from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.stepping.state import started
 

@@ -1,0 +1,76 @@
+"""A step is a list of operations, one for each feature of a scene (docs/extending/internals.md).
+
+An engine interprets the list and knows no feature by name: numpy applies one operation after the
+other, a kernel is written by letting each of them emit its lines. The order stands once, in
+`stepping/program.py`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, Self
+
+from numpy.typing import NDArray
+
+from pbdkit.plugin.frame import Indices
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.state import Floats, State
+
+
+class Placed(NamedTuple):
+    """Particles that lead: their places, and their displacements u (axis, particle) along those
+    axes."""
+
+    place: Indices
+    u: Floats
+    axes: tuple[int, ...]
+
+
+Led = list[Placed]
+Starts = tuple[Floats | None, ...]
+
+
+@dataclass(slots=True)
+class Step:
+    """A step under way, as its operations see it one after the other.
+
+    `u` are the displacements at the end of the step before, with the leaders in place as long as
+    particles move: the intermediate configuration. `new` comes holding those of the step before
+    that, and leaves holding those at the end of this one. What bonds and particles remember is
+    renewed in place in `state`. `led` are the leaders with where they are put, `stood` the same
+    with where they stood; `turned` is what clamped leaders prescribe, as (values, places,
+    prescribed). `invalid` says what becomes of operations of the rule that give NaN.
+    """
+
+    number: int
+    u: Floats
+    new: Floats
+    state: State
+    invalid: Literal["raise", "ignore"] = "ignore"
+    led: Led = field(default_factory=list)
+    stood: Led = field(default_factory=list)
+    starts: Starts = ()
+    turned: list[tuple[NDArray[Any], Indices, NDArray[Any]]] = field(default_factory=list)
+
+
+class Operation(ABC):
+    """What one feature of a scene does in a step."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    @classmethod
+    def of(cls, scene: Scene) -> Sequence[Self]:
+        """The operations of this kind that a scene needs; none of a feature that it lacks."""
+        return [cls(scene)] if cls.is_needed(scene) else []
+
+    @classmethod
+    @abstractmethod
+    def is_needed(cls, scene: Scene) -> bool:
+        """Whether a scene has the feature."""
+
+    @abstractmethod
+    def apply(self, step: Step) -> None:
+        """Compute its part of a step by numpy, in place: the reference for every engine."""

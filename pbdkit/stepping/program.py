@@ -1,0 +1,45 @@
+"""The program of a scene: the operations of a step, in their order."""
+
+from __future__ import annotations
+
+from pbdkit.scene.scene import Scene
+from pbdkit.stepping.contact import PushOut
+from pbdkit.stepping.followers import MoveFollowers
+from pbdkit.stepping.fracture import BreakBonds, CutBonds
+from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.leaders import (
+    CorrectGuided,
+    GuideLeaders,
+    GuideToObstacles,
+    HoldDirections,
+    HoldLeaders,
+    PlaceLeaders,
+    TurnDirections,
+)
+from pbdkit.stepping.operation import Operation
+
+Program = tuple[Operation, ...]
+ORDER: tuple[type[Operation], ...] = (
+    CutBonds,
+    PlaceLeaders,
+    BreakBonds,
+    TurnDirections,
+    GuideLeaders,
+    MoveFollowers,
+    CorrectGuided,
+    HoldDirections,
+    GuideToObstacles,
+    PushOut,
+    HoldLeaders,
+    FollowFrame,
+)
+"""The order of a step: it stands here, and nowhere else."""
+
+
+def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
+    """Return the operations that a scene needs, in the order of a step; of a feature that it does
+    not have there is none. `sweep` takes the place of the one that moves its followers."""
+    found: list[Operation] = []
+    for kind in ORDER:
+        found += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
+    return tuple(found)
