@@ -46,6 +46,7 @@ from pbdkit.plugin import (
 from pbdkit.plugin.discovery import blaming
 from pbdkit.plugin.fracture import Segment
 from pbdkit.plugin.lattice import Index
+from pbdkit.plugin.schedule import Course
 from pbdkit.scene.checks import (
     angles_in_radians,
     carried_by_leaders,
@@ -199,7 +200,7 @@ class Scene:
     def at(self, moment: float) -> Scene:
         """The scene with its numbers as they are at the end of a step, or at a moment within it; in
         itself they are as in the end."""
-        courses = self.experiment.courses.values()
+        courses = self._courses
         if all(course.at(moment) == course.last for course in courses):
             return self
         now = tuple(course.at(moment) for course in courses)
@@ -207,6 +208,11 @@ class Scene:
             self._known.clear()
             self._known[now] = renumbered(self, self.experiment.at(moment))
         return self._known[now]
+
+    @cached_property
+    def _courses(self) -> tuple[Course[float], ...]:
+        """The numbers that change in time."""
+        return tuple(self.experiment.courses.values())
 
     @cached_property
     def _known(self) -> dict[tuple[float, ...], Scene]:

@@ -244,9 +244,16 @@ class Surroundings:
         self._present = presence(scene.raster, where, self.slots)
         self._weights = [self._weights_of(slot) for slot in self.slots]
         self._more = [self._more_of(slot) for slot in self.slots]
+        self._there = [where.seen_through(slot) for slot in self.slots]
         neighbours = sum(1 if there is None else there.astype(int) for there in self._present)
         movable = (where.of(scene.raster.kind) == FOLLOWER) & (neighbours > 0)
         self.movable: Mask | None = None if movable.all() else movable
+
+    @cached_property
+    def _constant_neighbours(self) -> list[Neighbour]:
+        """The neighbours of a scene in which nothing about them changes."""
+        parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
+        return [Neighbour(slot.rest, w, present, more=more) for slot, w, present, more in parts]
 
     @cached_property
     def _reference(self) -> tuple[Any, Any]:
@@ -260,10 +267,12 @@ class Surroundings:
     def differences(self, u: NDArray[Any]) -> list[Components]:
         """u_k - u_j along each slot."""
         here = vector(self.where.of(u))
-        return [vector(self.where.seen_through(slot).of(u)) - here for slot in self.slots]
+        return [vector(there.of(u)) - here for there in self._there]
 
     def neighbours(self, state: State) -> list[Neighbour]:
         """The neighbours through each slot, as they are in a state."""
+        if state.broken_step is None and not shares_particles(self._scene.experiment.rule):
+            return self._constant_neighbours
         parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
         if self._scene.tears:
             torn = self._torn(state)
