@@ -37,11 +37,12 @@ from pbdkit.scene.leaders import kinds_at
 from pbdkit.scene.memory_estimate import LARGEST_ANEW
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.engine_choice import PATIENCE_S, obstacle
+from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.kernel import Function
 from pbdkit.stepping.leaders import place, prescribe
 from pbdkit.stepping.numba_engine.arrays import Arrays, constant_arrays, find_runs, state_arrays
-from pbdkit.stepping.numba_engine.boundary import write_frame
-from pbdkit.stepping.numba_engine.emitter import write_module
-from pbdkit.stepping.numba_engine.plan import Function, Plan, levels_of, load_blamed
+from pbdkit.stepping.numba_engine.emitter import LatticeWriter, write_module
+from pbdkit.stepping.numba_engine.plan import Passes, Plan, levels_of, load_blamed
 from pbdkit.stepping.numba_engine.sweeps import write_bond_pass, write_general
 from pbdkit.stepping.state import State, unmoved_state
 
@@ -326,9 +327,9 @@ def write_settling(plan: Plan) -> tuple[str, list[str]]:
     (level,) = plan.levels
     general = write_general(plan, level, None)
     follow = Function(plan.shared, "follow_body")
-    if plan.scene.frame:
-        follow.depth = -1
-        write_frame(follow, plan, "flat_u", "flat_u")
+    follow.depth = -1
+    for frame in FollowFrame.of(plan.scene):
+        frame.emit_for(LatticeWriter(plan, follow, Passes(None, [])), "flat_u")
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
     judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
     known, settle = _write_known(plan, derive), _write_settle(plan, follow, moves)

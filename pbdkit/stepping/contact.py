@@ -26,6 +26,7 @@ from pbdkit.plugin.vector import length, vector
 from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.kernel import Function, KernelWriter, Lines
 from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import Floats, State, unmoved_state
@@ -287,9 +288,10 @@ def _alike(count: int) -> Floats:
 class PushOut(Operation):
     """Put particles out of obstacles."""
 
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
-        self.contact = Contact(scene)
+    @cached_property
+    def contact(self) -> Contact:
+        """The obstacles, and the particles that they push."""
+        return Contact(self.scene)
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -299,3 +301,54 @@ class PushOut(Operation):
     def apply(self, step: Step) -> None:
         """After particles have moved, guided ones where they are led to."""
         self.contact.push_out(step.new, step.number)
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """Rows whose particles reach no obstacle's box, as far as their displacements go, are
+        passed over."""
+        kernel.over_rows("push_out", lambda out: self._write(kernel, out))
+
+    def _write(self, kernel: KernelWriter, out: Function) -> None:
+        """The function that pushes the particles of some rows."""
+        out.add(0, "m = min(moment, wall_box.shape[0] - 1)")
+        out.add(0, "points, edges, radii = wall_points[m], wall_box[m], wall_radii[m]")
+        out.add(0, "j0, j1 = max(0, box[2]), min(kind.shape[2], box[3])", "width = j1 - j0")
+        out.add(0, "for s in range(kind.shape[0]):", "    for i in range(first_row, last_row):")
+        out.add(2, "if width <= 0:", "    continue")
+        out.add(2, *kernel.each(f"o@ = {kernel.row('v_@', 's')}"))
+        out.add(2, *kernel.each("l@, h@ = o@[0], o@[0]"))
+        out.add(2, "for j in range(width):")
+        out.add(3, *kernel.each("l@ = min(l@, o@[j])"), *kernel.each("h@ = max(h@, o@[j])"))
+        for name, j in (("A", "0"), ("B", "width - 1")):
+            out.add(2, f"j = {j}", *_places(kernel, name))
+        out.add(2, *kernel.each("l@, h@ = min(A@, B@) + l@, max(A@, B@) + h@"))
+        out.add(2, "near = 0", *_each_near("l", "h"))
+        out.add(2, "if near == 0:", "    continue", "for j in range(width):")
+        out.add(3, f"if kind[s, i, j0 + j] != {FOLLOWER}:", "    continue", *_places(kernel, "A"))
+        out.add(3, *kernel.each("p@ = A@ + o@[j]"), "near = 0")
+        out.add(3, *_each_near("p", "p"), "if near == 0:", "    continue")
+        compliance = ["1.0", "0.0", "1.0"]
+        if kernel.is_given("compliance"):
+            compliance = [f"compliance[{n}, s, i, j0 + j]" for n in range(3)]
+        led = "led_axes[s, i, j0 + j]" if has_guides(self.scene.leading) else "0"
+        particle = ", ".join([*compliance, led])
+        walls = "wall_kind, points, wall_first, radii"
+        out.add(3, f"{', '.join(kernel.each('w@'))} = leave(px, py, {particle}, {walls})")
+        out.add(3, *kernel.each("o@[j] = o@[j] + w@"))
+
+
+def _each_near(low: str, high: str) -> Lines:
+    """A loop over the obstacles that notes whether what lies from one place to the other may be in
+    the box of one; it does not where it is not a number."""
+    return [
+        "for w in range(wall_kind.size):",
+        f"    if {low}x > edges[w, 2] or {high}x < edges[w, 0] or "
+        f"{low}y > edges[w, 3] or {high}y < edges[w, 1]:",
+        "        continue",
+        "    near = 1",
+    ]
+
+
+def _places(kernel: KernelWriter, name: str) -> Lines:
+    """The reference position of particle j of a row."""
+    pairs = zip(kernel.each("@"), kernel.places("s"), strict=True)
+    return [f"{name}{axis} = {place}" for axis, place in pairs]

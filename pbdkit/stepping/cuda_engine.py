@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -44,6 +44,7 @@ from pbdkit.lattice.raster import slot_step
 from pbdkit.plugin import Slot
 from pbdkit.plugin.discovery import blaming
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.kernel import Function, Lines
 from pbdkit.stepping.leaders import prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
@@ -54,15 +55,18 @@ from pbdkit.stepping.numba_engine.arrays import (
     lost_bits,
     state_arrays,
 )
-from pbdkit.stepping.numba_engine.boundary import (
-    foreseen,
-    leading_arrays,
-    write_frame,
-    write_leading,
-)
+from pbdkit.stepping.numba_engine.boundary import foreseen, held, leading_arrays
 from pbdkit.stepping.numba_engine.cache import with_helpers_ready, words
 from pbdkit.stepping.numba_engine.emitter import module_text
-from pbdkit.stepping.numba_engine.plan import Function, Level, Plan, blamed, functions_of, levels_of
+from pbdkit.stepping.numba_engine.plan import (
+    Level,
+    Passes,
+    Plan,
+    PlanWriter,
+    blamed,
+    functions_of,
+    levels_of,
+)
 from pbdkit.stepping.numba_engine.sweeps import (
     GENERAL,
     PLAIN,
@@ -78,6 +82,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
 )
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.operation import Led
+from pbdkit.stepping.program import program_of
 from pbdkit.stepping.state import State, cut_bonds, unmoved_state
 
 THREAD = ("me", "threads")
@@ -243,6 +248,70 @@ def without_doubles(led: Led) -> Led:
     return found
 
 
+class ThreadWriter(PlanWriter):
+    """Writes what one of many threads does in a step. All wait for each other between operations
+    that go by different places: what one writes, none reads before the next."""
+
+    _list = ""
+    """The list that places have gone by since all have waited."""
+
+    def __init__(self, plan: Plan, out: Function, passes: Passes, wait: str) -> None:
+        super().__init__(plan, out, passes)
+        self._wait = wait
+
+    def begin(self) -> None:
+        """Where leaders are held, and what was remembered before the step."""
+        self.out.add(1, *(held(end, "made") for end in self.plan.leads))
+        for m in self.plan.kept:
+            self.out.add(1, f"for e in {self.plan.over(f'flat_own{m}.size')}:")
+            self.out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
+
+    def end(self) -> None:
+        """What was after the step is before the next one."""
+        u, v = (", ".join(self.each(f"flat_{name}_@")) for name in "uv")
+        self.out.add(1, f"{u}, {v} = {v}, {u}")
+
+    def wait(self) -> None:
+        """For all threads, unless nothing was done since."""
+        if not self.out.lines[-1].endswith(self._wait):
+            self.out.add(1, self._wait)
+        self._list = ""
+
+    def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
+        """Its share."""
+        if self._list not in ("", name):
+            self.wait()
+        self._list = name
+        self.out.add(1, f"for e in {self.plan.over(f'{name}.size')}:")
+        self.out.add(2, *lines)
+
+    def judge_bonds(self) -> None:
+        """Its share."""
+        if self.passes.judge:
+            self._call(self.passes.judge)
+
+    def sweep(self, level: int) -> None:
+        """Its share."""
+        self._call(self.passes.sweeps[level])
+
+    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+        """Its share."""
+        self.wait()
+        self.out.add(1, f"for f in {self.plan.over('points.size')}:")
+        self.out.add(2, *mapped("flat_u" if lag else planes))
+        self.out.add(2, *self.each(f"{planes}_@[points[f]] = t_@"))
+        self.wait()
+
+    def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
+        """There are no rows here."""
+        raise NotImplementedError(f"{name} on a GPU")
+
+    def _call(self, function: Function) -> None:
+        self.wait()
+        self.out.add(1, function.call(*THREAD))
+        self.wait()
+
+
 def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]:
     """The source of a module with ``run(step, count, ...)``, which takes the scene `count` steps
     further, and the names of the arrays that follow these two. A block that is `alone` waits for
@@ -253,39 +322,17 @@ def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]
     functions = [function for function in (events, judge, *sweeps) if function]
     run = Function(plan.shared, "run", "step", "count")
     run.add(0, "me, threads = cuda.grid(1), cuda.gridsize(1)")
-    wait = "cuda.syncthreads()" if alone else "everyone.sync()"
     if not alone:
         run.add(0, "everyone = cuda.cg.this_grid()")
     run.add(0, "for made in range(count):", "    step += 1")
-    _write_step(run, plan, judge, sweeps, wait)
+    wait = "cuda.syncthreads()" if alone else "everyone.sync()"
+    writer = ThreadWriter(plan, run, Passes(judge, sweeps), wait)
+    writer.begin()
+    for operation in program_of(plan.scene):
+        operation.emit(writer)
+    writer.end()
     head = ["@kernel", f"def run({', '.join([*run.own, *run.used])}):"]
     return module_text(plan, functions, head, run), run.used
-
-
-def _write_step(
-    out: Function, plan: Plan, judge: Function | None, sweeps: Iterable[Function], wait: str
-) -> None:
-    leading = "led_kept[#, e] = flat_u_@[led[e]]", "flat_u_@[led[e]] = held[#, e]"
-    write_leading(out, plan, *leading)
-    for m in plan.kept:
-        out.add(1, f"for e in {plan.over(f'flat_own{m}.size')}:")
-        out.add(2, f"flat_was{m}[e] = flat_own{m}[e]")
-    out.add(1, wait)
-    if judge:
-        out.add(1, judge.call(*THREAD), wait)
-    for n, sweep in enumerate(sweeps):
-        if n and plan.scene.frame:
-            write_frame(out, plan, f"flat_z{n - 1}", f"flat_z{n - 1}")
-            out.add(1, wait)
-        out.add(1, sweep.call(*THREAD), wait)
-    after = "flat_v_@[led[e]] = held[#, e]", "flat_u_@[led[e]] = led_kept[#, e]"
-    write_leading(out, plan, *after)
-    if frame := plan.scene.frame:
-        out.add(1, wait)
-        write_frame(out, plan, "flat_u" if frame.map.lag else "flat_v", "flat_v")
-        out.add(1, wait)
-    u, v = (", ".join(plan.each(f"flat_{name}_@")) for name in "uv")
-    out.add(1, f"{u}, {v} = {v}, {u}")
 
 
 ALONE = 4096
@@ -294,8 +341,8 @@ ALONE = 4096
 
 
 @dataclass(frozen=True)
-class Program:
-    """`names` are those of the arrays that the kernel takes, and `alone` whether it is for one
+class GpuKernel:
+    """A kernel that is not yet compiled: `names` are those of the arrays that the kernel takes, and `alone` whether it is for one
     block."""
 
     plan: Plan
@@ -305,8 +352,8 @@ class Program:
     alone: bool
 
 
-def program_of(scene: Scene) -> Program:
-    """The kernel that steps a scene, not yet compiled."""
+def kernel_of(scene: Scene) -> GpuKernel:
+    """The kernel that steps a scene."""
     plan = Plan(scene, levels_of(scene), parallel=False, gpu=True)
     steady, whole = steady_arrays(plan)
     start = unmoved_state(scene, scene.raster.shape[1:])
@@ -323,7 +370,7 @@ def program_of(scene: Scene) -> Program:
     found |= leading_arrays(plan, [[]], {}, start.u.dtype)
     alone = scene.raster.kind.size <= ALONE
     source, names = write_kernel(replace(plan, shared=("step", *found)), whole, alone)
-    return Program(plan, source, names, {name: found[name] for name in names}, alone)
+    return GpuKernel(plan, source, names, {name: found[name] for name in names}, alone)
 
 
 def changing_planes(plan: Plan, state: State) -> Arrays:
@@ -464,17 +511,17 @@ class GpuStepper(Engine):
         self._last: State | None = None
         self._load_changes = -math.inf
         """The step at which other loads act than those that were sent."""
-        program = program_of(scene)
-        self._plan, self._names = program.plan, program.names
+        kernel = kernel_of(scene)
+        self._plan, self._names = kernel.plan, kernel.names
         self._device: Arrays = {}
-        self._send(program.arrays)
+        self._send(kernel.arrays)
         with blamed(self._plan.levels):
-            threads = MOST_THREADS if program.alone else THREADS
+            threads = MOST_THREADS if kernel.alone else THREADS
             functions = functions_of(self._plan.levels)
-            self._run = make_kernel(program.source, functions, threads)
+            self._run = make_kernel(kernel.source, functions, threads)
             # No step is made, so that what does not compile is known before the first.
             first_launch(self._run, self._given(0, 0))
-        self._launch = launcher(self._run, *self._blocks(program.alone))
+        self._launch = launcher(self._run, *self._blocks(kernel.alone))
 
     def advance(self, state: State, steps: int = 1) -> State:
         """As many steps a launch as it is known beforehand where the leaders are."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from operator import add
 from typing import Any
 
@@ -20,6 +21,8 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.rule import shares_particles
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.frame import FollowFrame
+from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
@@ -256,13 +259,17 @@ class MoveFollowers(Operation):
 
     def __init__(self, scene: Scene, followers: Followers | None = None) -> None:
         super().__init__(scene)
-        kind = GatheringFollowers if scene.experiment.neighbours.nearness() else SlotFollowers
-        self._followers = followers or kind(scene)
+        self._known = followers
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
         """In every scene."""
         return True
+
+    @cached_property
+    def _followers(self) -> Followers:
+        nearness = self.scene.experiment.neighbours.nearness()
+        return self._known or (GatheringFollowers if nearness else SlotFollowers)(self.scene)
 
     def apply(self, step: Step) -> None:
         """From the intermediate configuration. What leaves the finite numbers is found at
@@ -270,3 +277,13 @@ class MoveFollowers(Operation):
         quiet = np.errstate(all="ignore", invalid=step.invalid)
         with quiet, blaming(self.scene.experiment.rule, f"at step {step.number}"):
             self._followers.move(step.u, step.new, step.state)
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """A sweep for each rule that works on the moves of another, and for these."""
+        level, scene = 0, self.scene
+        while inner := scene.inner:
+            kernel.sweep(level)
+            for frame in FollowFrame.of(self.scene):
+                frame.emit_for(kernel, f"flat_z{level}")
+            level, scene = level + 1, inner
+        kernel.sweep(level)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
+from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
 from pbdkit.stepping.state import State, cut_bonds
@@ -171,13 +173,16 @@ class CutBonds(Operation):
         """Before leaders are placed."""
         cut_bonds(self.scene, step.state.broken_step, step.number)
 
+    def emit(self, kernel: KernelWriter) -> None:
+        """Nothing: no kernel goes on beyond a step that begins with a cut."""
+
 
 class BreakBonds(Operation):
     """Renew what bonds remember in the intermediate configuration, and break them there."""
 
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
-        self._fracturing = Fracturing(scene)
+    @cached_property
+    def _fracturing(self) -> Fracturing:
+        return Fracturing(self.scene)
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -187,3 +192,7 @@ class BreakBonds(Operation):
     def apply(self, step: Step) -> None:
         """Before particles move."""
         self._fracturing.break_bonds(step.u, step.state, step.number)
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """Before particles move, or with them."""
+        kernel.judge_bonds()

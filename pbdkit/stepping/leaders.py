@@ -17,6 +17,7 @@ engine.
 from __future__ import annotations
 
 import math
+from itertools import permutations
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.operation import Led, Operation, Placed, Starts, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import Array, Floats, State
@@ -357,6 +359,13 @@ def placed(u: Floats, led: Led) -> Led:
     return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in led]
 
 
+def leader_lists(scene: Scene) -> dict[str, str]:
+    """Return the lists of leaders in kernels by the ending of their names, with the axes along
+    which they lead: one for all, or where some are guided one for each axis."""
+    axes = "xyz"[: scene.axes]
+    return {f"_{c}": c for c in axes} if has_guides(scene.leading) else {"": axes}
+
+
 class PlaceLeaders(Operation):
     """Put the leaders where they are prescribed: the intermediate configuration."""
 
@@ -375,6 +384,15 @@ class PlaceLeaders(Operation):
         step.stood = placed(step.u, step.led)
         place(step.u, step.led)
 
+    def emit(self, kernel: KernelWriter) -> None:
+        """The places are prescribed for as many steps as a call makes."""
+        for end, axes in leader_lists(self.scene).items():
+            if kernel.keeps_before:
+                stood = kernel.each(f"led_kept{end}[#, e] = flat_u_@[led{end}[e]]", axes)
+                kernel.listed(f"led{end}", *stood, ahead=True)
+            put = kernel.each(f"flat_u_@[led{end}[e]] = held{end}[#, e]", axes)
+            kernel.listed(f"led{end}", *put, ahead=True)
+
 
 class GuideLeaders(Operation):
     """Put guided particles where they are prescribed after the step, too: along those axes they
@@ -388,6 +406,12 @@ class GuideLeaders(Operation):
     def apply(self, step: Step) -> None:
         """In the displacements after the step."""
         place(step.new, step.led)
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """The same."""
+        for end, axes in leader_lists(self.scene).items():
+            put = kernel.each(f"flat_v_@[led{end}[e]] = held{end}[#, e]", axes)
+            kernel.listed(f"led{end}", *put)
 
 
 class GuideToObstacles(GuideLeaders):
@@ -417,6 +441,9 @@ class TurnDirections(Operation):
         values = self._clamps.directions(step.state)
         step.turned = [(value, clamped, value[clamped]) for value in values]
 
+    def emit(self, kernel: KernelWriter) -> None:
+        """Nothing: directions are turned before a call, and a call goes on while none turns."""
+
 
 class HoldDirections(TurnDirections):
     """Let clamped leaders have the directions that they prescribe, whatever the rule makes of
@@ -426,6 +453,13 @@ class HoldDirections(TurnDirections):
         """After particles have moved."""
         for values, clamped, prescribed in step.turned:
             values[clamped] = prescribed
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """They are those before the step."""
+        numbers = self._clamps.numbers
+        kernel.listed(
+            "clamped", *(f"flat_own{m}[clamped[e]] = flat_was{m}[clamped[e]]" for m in numbers)
+        )
 
 
 class CorrectGuided(Operation):
@@ -445,6 +479,13 @@ class CorrectGuided(Operation):
         with np.errstate(all="ignore", invalid=step.invalid):
             self._guidance.correct(step.new, step.u, step.number)
 
+    def emit(self, kernel: KernelWriter) -> None:
+        """Pair of axes by pair of axes."""
+        for to, of in permutations(kernel.each("@"), 2):
+            way = f"(flat_v_{of}[p] - flat_u_{of}[p])"
+            moved = f"flat_v_{to}[p] = flat_v_{to}[p] + share_{to}{of}[e] * {way}"
+            kernel.listed(f"slant_{to}{of}", f"p = slant_{to}{of}[e]", moved)
+
 
 class HoldLeaders(Operation):
     """Let the leaders be where they are prescribed, whatever the rule makes of them, and put back
@@ -459,3 +500,11 @@ class HoldLeaders(Operation):
         """After all particles have moved."""
         place(step.new, step.led)
         place(step.u, step.stood)
+
+    def emit(self, kernel: KernelWriter) -> None:
+        """After all particles have moved."""
+        for end, axes in leader_lists(self.scene).items():
+            lines = kernel.each(f"flat_v_@[led{end}[e]] = held{end}[#, e]", axes)
+            if kernel.keeps_before:
+                lines += kernel.each(f"flat_u_@[led{end}[e]] = led_kept{end}[#, e]", axes)
+            kernel.listed(f"led{end}", *lines)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pbdkit.plugin.frame import Indices
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.kernel import KernelWriter
 from pbdkit.stepping.state import Floats, State
 
 
@@ -74,3 +75,7 @@ class Operation(ABC):
     @abstractmethod
     def apply(self, step: Step) -> None:
         """Compute its part of a step by numpy, in place: the reference for every engine."""
+
+    @abstractmethod
+    def emit(self, kernel: KernelWriter) -> None:
+        """Write its part of a step into a kernel."""

@@ -7,17 +7,12 @@ places) are arguments.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
+from pbdkit.stepping.kernel import Function, Lines
 from pbdkit.stepping.numba_engine.blocking import write_deep_passes, write_piece
-from pbdkit.stepping.numba_engine.boundary import (
-    write_frame,
-    write_guiding,
-    write_leading,
-    write_obstacle_pass,
-    write_slants,
-)
-from pbdkit.stepping.numba_engine.plan import Function, Level, Plan, goes_deep
+from pbdkit.stepping.numba_engine.boundary import held
+from pbdkit.stepping.numba_engine.plan import Level, Passes, Plan, PlanWriter, goes_deep
 from pbdkit.stepping.numba_engine.sweeps import (
     GENERAL,
     write_bond_pass,
@@ -25,27 +20,36 @@ from pbdkit.stepping.numba_engine.sweeps import (
     write_general,
     write_row,
 )
+from pbdkit.stepping.program import Program
 
 Groups = Sequence[tuple[int, int]]
 """The sublattice and kind of the rows that occur."""
 
 
-def write_kernel(plan: Plan, groups: Groups) -> tuple[str, list[str]]:
+def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, list[str]]:
     """The source of a module with ``run(given, step, count, chunks, band)``, which takes the scene
     `count` steps further, and the names of the arrays that it is given."""
     events = write_events(plan) if plan.judged else None
-    passes = [write_bond_pass(plan)] if plan.bonds_first else []
-    functions = [events] if events else list(passes)
+    judge = write_bond_pass(plan) if plan.bonds_first else None
+    functions = [function for function in (events, judge) if function]
+    sweeps = list[Function]()
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
-        passes.append(functions[-1])
-    pushing = write_obstacle_pass(plan) if plan.scene.barriers else None
-    functions += [pushing] if pushing else []
-    pieces = write_piece(plan, passes, pushing) if goes_deep(plan) else []
-    functions += pieces
+        sweeps.append(functions[-1])
+    passes = Passes(judge, sweeps)
     run = Function(plan.shared, "run", "given", "step", "count", "chunks", "band")
-    _write_run(run, plan, passes, pushing, *pieces[-1:])
-    return write_module(plan, functions, run)
+    writer = LatticeWriter(plan, run, passes)
+    pieces = write_piece(plan, program, passes) if goes_deep(plan) else []
+    if pieces:
+        write_deep_passes(writer, pieces[-1])
+    else:
+        run.add(0, "for made in range(count):")
+    writer.begin()
+    for operation in program:
+        operation.emit(writer)
+    writer.end()
+    run.add(1, *(["made += 1"] if pieces else []))
+    return write_module(plan, [*functions, *passes.others.values(), *pieces], run)
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
@@ -91,58 +95,64 @@ def _sweep(plan: Plan, level: Level, groups: Groups, events: Function | None) ->
     return [*dict.fromkeys(found), out]
 
 
-def _write_run(
-    out: Function,
-    plan: Plan,
-    passes: Sequence[Function],
-    pushing: Function | None,
-    piece: Function | None = None,
-) -> None:
-    if piece:
-        write_deep_passes(out, plan, piece)
-    else:
-        out.add(0, "for made in range(count):")
-    out.add(1, "step += 1")
-    for side in "uv":
-        out.add(1, *plan.each(f"f{side}_@ = {side}_@.reshape(-1)"))
-    write_leading(out, plan, "led_kept[#, e] = fu_@[led[e]]")
-    write_leading(out, plan, "fu_@[led[e]] = held[#, e]")
-    write_guiding(out, plan)
-    out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
-    out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
-    out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
-    if plan.bonds_first:
-        _write_bands(out, plan, *passes)
-    else:
-        for n, sweep in enumerate(passes):
-            write_pass(out, plan, 1, sweep, "i0", "i1")
-            if n + 1 < len(passes) and plan.scene.frame:
-                out.add(1, *plan.each(f"fz{n}_@ = z{n}_@.reshape(-1)"))
-                write_frame(out, plan, f"fz{n}", f"fz{n}")
-    for m in plan.rotations:
-        out.add(1, f"now, was = own{m}.reshape(-1), was{m}.reshape(-1)")
-        out.add(1, "for e in range(clamped.size):", "    now[clamped[e]] = was[clamped[e]]")
-    write_slants(out, plan)
-    if pushing:
-        write_guiding(out, plan)
-        write_pass(out, plan, 1, pushing, "i0", "i1", "made")
-    write_leading(out, plan, "fv_@[led[e]] = held[#, e]", "fu_@[led[e]] = led_kept[#, e]")
-    if plan.scene.frame:
-        write_frame(out, plan, "fu" if plan.scene.frame.map.lag else "fv", "fv")
-    u, v = (", ".join(plan.each(f"{name}_@")) for name in "uv")
-    out.add(1, f"{u}, {v} = {v}, {u}", *(["made += 1"] if piece else []))
+class LatticeWriter(PlanWriter):
+    """Writes a step that goes over all that motion has reached, operation after operation."""
 
+    _judging: Function | None = None
+    """The pass over bonds that comes with the next sweep."""
 
-def _write_bands(out: Function, plan: Plan, judging: Function, sweep: Function) -> None:
-    """Band by band, so that what the pass over bonds has read and written is still near when it is
-    swept."""
-    back, ahead = (along[0] for along in plan.scene.home_reach)
-    out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
-    out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
-    out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
-    write_pass(out, plan, 2, judging, "judged", "ready", "0", "kind.shape[-1]")
-    out.add(2, "judged = ready")
-    write_pass(out, plan, 2, sweep, "low", "high")
+    def begin(self) -> None:
+        """What the lines of operations name, and how far motion has come."""
+        out, plan = self.out, self.plan
+        out.add(1, "step += 1")
+        planes = ["u_@", "v_@", *(f"z{n}_@" for n in range(len(plan.levels) - 1))]
+        for name in planes:
+            out.add(1, *plan.each(f"flat_{name} = {name}.reshape(-1)"))
+        out.add(1, *(held(end, "made") for end in plan.leads))
+        out.add(1, *(f"was{m}[:] = own{m}" for m in plan.kept))
+        for name in (f"{name}{m}" for m in plan.rotations for name in ("own", "was")):
+            out.add(1, f"flat_{name} = {name}.reshape(-1)")
+        out.add(1, "for e in range(box.size):", "    box[e] += growth[e]")
+        out.add(1, "i0, i1 = max(0, box[0]), min(starts.shape[1] - 1, box[1])")
+
+    def end(self) -> None:
+        """What was after the step is before the next one."""
+        u, v = (", ".join(self.plan.each(f"{name}_@")) for name in "uv")
+        self.out.add(1, f"{u}, {v} = {v}, {u}")
+
+    def listed(self, name: str, *lines: str, ahead: bool = False) -> None:
+        """All of them."""
+        self.out.add(1, f"for e in range({name}.size):", *("    " + line for line in lines))
+
+    def judge_bonds(self) -> None:
+        """With the sweep."""
+        self._judging = self.passes.judge
+
+    def sweep(self, level: int) -> None:
+        """Band by band with the pass over bonds, so that what that has read and written is still
+        near; else all rows."""
+        sweep, judging, self._judging = self.passes.sweeps[level], self._judging, None
+        if judging is None:
+            write_pass(self.out, self.plan, 1, sweep, "i0", "i1")
+            return
+        out, plan = self.out, self.plan
+        back, ahead = (along[0] for along in plan.scene.home_reach)
+        out.add(1, f"judged, last = max(0, i0 - {back}), min(starts.shape[1] - 1, i1 + {ahead})")
+        out.add(1, "for low in range(i0, i1, band):", "    high = min(low + band, i1)")
+        out.add(2, f"ready = last if high == i1 else min(high + {ahead}, last)")
+        write_pass(out, plan, 2, judging, "judged", "ready", "0", "kind.shape[-1]")
+        out.add(2, "judged = ready")
+        write_pass(out, plan, 2, sweep, "low", "high")
+
+    def over_rows(self, name: str, write: Callable[[Function], None]) -> None:
+        """All rows."""
+        write_pass(self.out, self.plan, 1, self.rows(name, write), "i0", "i1", "made")
+
+    def follow(self, mapped: Callable[[str], Lines], planes: str, lag: int = 0) -> None:
+        """All points."""
+        source = "flat_u" if lag else planes
+        self.out.add(1, "for f in range(points.size):")
+        self.out.add(2, *mapped(source), *self.plan.each(f"{planes}_@[points[f]] = t_@"))
 
 
 def write_pass(

@@ -32,6 +32,7 @@ from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.followers import Followers, GatheringFollowers, MoveFollowers
+from pbdkit.stepping.kernel import Function
 from pbdkit.stepping.leaders import Clamps, Guidance, NewtonForces, prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import (
     Arrays,
@@ -47,7 +48,6 @@ from pbdkit.stepping.numba_engine.arrays import (
 from pbdkit.stepping.numba_engine.boundary import foreseen, leading_arrays, wall_arrays
 from pbdkit.stepping.numba_engine.emitter import write_kernel, write_module, write_pass
 from pbdkit.stepping.numba_engine.plan import (
-    Function,
     Level,
     Plan,
     banded,
@@ -66,6 +66,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.operation import Led
+from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
 from pbdkit.stepping.state import Floats, State, cut_bonds, unmoved_state
 
@@ -308,7 +309,8 @@ class CompiledStepper(Engine):
         if plan.tears:
             self._arrays["torn"] = np.zeros(start.u.shape[1:], np.uint8)
         shared = (*plan.shared, *self._named(start, [[]]))
-        source, self._names = write_kernel(replace(plan, shared=shared), groups)
+        plan = replace(plan, shared=shared)
+        source, self._names = write_kernel(plan, program_of(scene), groups)
         # No step is made, so that what does not compile is known before the first.
         self._run = load_blamed(levels, source, self._given(start, [[]], 0))
 

@@ -10,11 +10,10 @@ The rules of a scene as the levels of its kernel, tried out on single numbers fi
 from __future__ import annotations
 
 import math
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, permutations
 from typing import Any
@@ -46,11 +45,11 @@ from pbdkit.scene.constants import (
     numbers_of,
     particle_numbers,
 )
-from pbdkit.scene.leaders import has_guides
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses, tried
 from pbdkit.stepping.followers import target
-from pbdkit.stepping.leaders import Clamps, Guidance
+from pbdkit.stepping.kernel import Function, KernelWriter, Lines
+from pbdkit.stepping.leaders import Clamps, Guidance, leader_lists
 from pbdkit.stepping.numba_engine.cache import load_kernel
 from pbdkit.stepping.numba_engine.time_skewing import (
     CACHE,
@@ -121,11 +120,9 @@ class Plan:
 
     @cached_property
     def leads(self) -> dict[str, str]:
-        """The lists of leaders by the ending of their names, with the axes along which they lead:
-        one for all, or where some are guided one for each axis."""
-        return (
-            {f"_{c}": c for c in self.axes} if has_guides(self.scene.leading) else {"": self.axes}
-        )
+        """The lists of leaders by the ending of their names, with the axes along which they
+        lead."""
+        return leader_lists(self.scene)
 
     @cached_property
     def slanted(self) -> list[tuple[str, str]]:
@@ -264,6 +261,15 @@ class Plan:
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"
 
+    def local_places(self, s: str) -> list[str]:
+        """X from site (0, 0), in the order of operations of the rasters."""
+        index = [f"{name} + first[{n}]" for n, name in enumerate((*self.lead, "j + j0"))]
+        found = []
+        for n, along in enumerate(zip(*self.scene.raster.lattice.cell().vectors, strict=True)):
+            terms = [f"({at}) * {float(v)!r}" for at, v in zip(index, along, strict=True)]
+            found.append(f"at[{s}, {n}] + ({' + '.join(terms)})")
+        return found
+
     def flat(self, s: str) -> str:
         """The place at which a row begins in flat arrays of all sublattices."""
         found = s
@@ -287,40 +293,49 @@ def values(numbers: Sequence[Number], where: dict[Home, str]) -> str:
     return listed(where[number.home].format(n=next(counts[number.home])) for number in numbers)
 
 
-class Function:
-    """A function of a kernel: its lines, and the arguments of its own before those that all
-    functions share and that its lines turn out to use."""
+@dataclass(frozen=True)
+class Passes:
+    """The functions of a kernel that a step calls: the one that judges bonds, where they are judged
+    apart from moves, the sweep of each level, and by name those that operations bring along."""
 
-    def __init__(self, shared: Sequence[str], name: str, *own: str) -> None:
-        self.shared, self.name, self.own = shared, name, own
-        self.depth = 0
-        self.lines: list[str] = []
+    judge: Function | None
+    sweeps: Sequence[Function]
+    others: dict[str, Function] = field(default_factory=dict)
 
-    def add(self, depth: int, *lines: str) -> None:
-        """Adds lines at a depth of indentation, counted from `self.depth`."""
-        self.lines += ["    " * (self.depth + depth) + line for line in lines]
 
-    @property
-    def used(self) -> list[str]:
-        """Those of the shared names that its lines use, as they are or flat."""
-        words = self._words() - set(self.own)
-        return [name for name in self.shared if {name, f"flat_{name}"} & words]
+class PlanWriter(KernelWriter):
+    """A writer of the kernel of a plan, with the function that it writes into."""
 
-    @property
-    def source(self) -> list[str]:
-        """Its lines, with a head."""
-        head = f"def {self.name}({', '.join([*self.own, *self.used])}):"
-        words = self._words()
-        flat = [f"flat_{n} = {n}.reshape(-1)" for n in self.used if f"flat_{n}" in words]
-        lines = ("    " + line for line in [*flat, *self.lines])
-        return ["", "", "@part", head, *lines]
+    def __init__(self, plan: Plan, out: Function, passes: Passes) -> None:
+        self.plan, self.out, self.passes = plan, out, passes
 
-    def call(self, *own: str) -> str:
-        """A call with these values of its own arguments."""
-        return f"{self.name}({', '.join([*own, *self.used])})"
+    def rows(self, name: str, write: Callable[[Function], None]) -> Function:
+        """A function of some rows that an operation brings along."""
+        if name not in self.passes.others:
+            found = Function(self.plan.shared, name, "first_row", "last_row", "moment")
+            write(found)
+            self.passes.others[name] = found
+        return self.passes.others[name]
 
-    def _words(self) -> set[str]:
-        return set(re.findall(r"\w+", "\n".join(self.lines)))
+    def each(self, pattern: str, axes: str = "") -> Lines:
+        """As the plan does."""
+        return self.plan.each(pattern, axes)
+
+    def number(self, value: float) -> str:
+        """As the plan does."""
+        return self.plan.number(value)
+
+    def row(self, array: str, first: str) -> str:
+        """As the plan does."""
+        return self.plan.row(array, first)
+
+    def places(self, sublattice: str) -> Lines:
+        """In the order of operations of the rasters."""
+        return self.plan.local_places(sublattice)
+
+    def is_given(self, array: str) -> bool:
+        """Among the names that its functions share."""
+        return array in self.plan.shared
 
 
 DEEP, BAND, ROW = 16, 8, 24 * 2**10

@@ -36,7 +36,8 @@ from pbdkit.plugin import RenewsBonds, RenewsParticles, Slot, Softens, SoftensCe
 from pbdkit.scene.constants import Home, bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
-from pbdkit.stepping.numba_engine.plan import Function, Level, Plan, listed, values
+from pbdkit.stepping.kernel import Function
+from pbdkit.stepping.numba_engine.plan import Level, Plan, listed, values
 from pbdkit.stepping.state import State
 
 CHUNK = 64
@@ -491,16 +492,6 @@ def _chosen_target(value: str, where: str, otherwise: str) -> str:
     return f"{value} if {where} else {otherwise}" if where else value
 
 
-def local_places(plan: Plan, s: str) -> list[str]:
-    """X from site (0, 0), in the order of operations of the rasters."""
-    index = [f"{name} + first[{n}]" for n, name in enumerate((*plan.lead, "j + j0"))]
-    places = []
-    for n, along in enumerate(zip(*plan.scene.raster.lattice.cell().vectors, strict=True)):
-        terms = [f"({at}) * {float(v)!r}" for at, v in zip(index, along, strict=True)]
-        places.append(f"at[{s}, {n}] + ({' + '.join(terms)})")
-    return places
-
-
 def _pattern(level: Level, names: list[str], kind: str) -> str:
     """Names of components, those of a vector together."""
     found, rest = [], iter(names)
@@ -696,7 +687,7 @@ def write_whole(
     chosen: tuple[str, ...] = ()
     if mark:
         chosen = f"{mark} {'!=' if damage else '=='} 0", "o@[j]"
-    out.add(1, *target_lines(plan, level, local_places(plan, str(s)), level.totals, *chosen))
+    out.add(1, *target_lines(plan, level, plan.local_places(str(s)), level.totals, *chosen))
     if plan.judged:
         out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
 
@@ -802,7 +793,7 @@ def write_one(out: Function, plan: Plan, level: Level) -> None:
     out.add(1, *displacements(plan, level), "for k in range(counts[s]):")
     _write_slot(out, plan, level, level.totals, "near")
     out.add(1, f"moves = (flat_kind[at_j] == {FOLLOWER}) & (near > 0)")
-    out.add(1, *target_lines(plan, level, local_places(plan, "s"), level.totals, "moves"))
+    out.add(1, *target_lines(plan, level, plan.local_places("s"), level.totals, "moves"))
     if plan.judged:
         out.add(1, "changed = changed | (now ^ bits)", "flat_lost[at_j] = now")
 
@@ -816,7 +807,7 @@ def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
     _write_slot(out, plan, level, sums, "near[j]")
     out.add(0, "for j in range(width):")
     out.add(1, *displacements(plan, level), f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
-    out.add(1, *target_lines(plan, level, local_places(plan, "s"), sums, "moves"))
+    out.add(1, *target_lines(plan, level, plan.local_places("s"), sums, "moves"))
 
 
 def _is_slot_after_slot(plan: Plan) -> bool:
