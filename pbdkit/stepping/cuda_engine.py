@@ -342,8 +342,8 @@ ALONE = 4096
 
 @dataclass(frozen=True)
 class GpuKernel:
-    """A kernel that is not yet compiled: `names` are those of the arrays that the kernel takes, and `alone` whether it is for one
-    block."""
+    """A kernel that is not yet compiled: `names` are those of the arrays that it takes, and `alone`
+    says whether it is for one block."""
 
     plan: Plan
     source: str

@@ -37,12 +37,9 @@ class FollowFrame(Operation):
         """Return what gives the lines that compute t_@ of the frame point f from some planes."""
 
         def lines(planes: str) -> Lines:
-            found = [*kernel.each(f"t_@ = {kernel.number(0.0)}")]
-            found.append("for e in range(entries[f], entries[f + 1]):")
-            return [
-                *found,
-                *(f"    t_{c} = t_{c} + {term}" for c, term in self._terms(kernel, planes)),
-            ]
+            start = kernel.each(f"t_@ = {kernel.number(0.0)}")
+            terms = (f"    t_{c} = t_{c} + {term}" for c, term in self._terms(kernel, planes))
+            return [*start, "for e in range(entries[f], entries[f + 1]):", *terms]
 
         return lines
 

@@ -17,6 +17,7 @@ engine.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from itertools import permutations
 
 import numpy as np
@@ -369,9 +370,9 @@ def leader_lists(scene: Scene) -> dict[str, str]:
 class PlaceLeaders(Operation):
     """Put the leaders where they are prescribed: the intermediate configuration."""
 
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
-        self._forces = NewtonForces(scene)
+    @cached_property
+    def _forces(self) -> NewtonForces:
+        return NewtonForces(self.scene)
 
     @classmethod
     def is_needed(cls, scene: Scene) -> bool:
@@ -456,10 +457,8 @@ class HoldDirections(TurnDirections):
 
     def emit(self, kernel: KernelWriter) -> None:
         """They are those before the step."""
-        numbers = self._clamps.numbers
-        kernel.listed(
-            "clamped", *(f"flat_own{m}[clamped[e]] = flat_was{m}[clamped[e]]" for m in numbers)
-        )
+        lines = (f"flat_own{m}[clamped[e]] = flat_was{m}[clamped[e]]" for m in self._clamps.numbers)
+        kernel.listed("clamped", *lines)
 
 
 class CorrectGuided(Operation):

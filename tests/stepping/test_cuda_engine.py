@@ -61,7 +61,7 @@ def text_of(scene, device):
     """The kernel of a scene as PTX."""
     from pbdkit.stepping import cuda_engine as kernel
 
-    made = program.program_of(scene)
+    made = program.kernel_of(scene)
     run = kernel.make_kernel(made.source, functions_of(made.plan.levels), 1024)
     return kernel.text_of(run, types_of(made.arrays), device)
 
