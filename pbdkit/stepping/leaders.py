@@ -364,6 +364,8 @@ def leader_lists(scene: Scene) -> dict[str, str]:
     """Return the lists of leaders in kernels by the ending of their names, with the axes along
     which they lead: one for all, or where some are guided one for each axis."""
     axes = "xyz"[: scene.axes]
+    if not scene.leading:
+        return {}
     return {f"_{c}": c for c in axes} if has_guides(scene.leading) else {"": axes}
 
 
