@@ -39,6 +39,8 @@ from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.leaders import steady_steps
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.numpy_engine import Engine
+from pbdkit.stepping.operation import Way
+from pbdkit.stepping.program import hindrance
 from pbdkit.stepping.state import State, initial_state
 
 
@@ -208,14 +210,7 @@ class DistributedSteppingDriver(SteppingDriver):
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
-        nearness = scene.experiment.neighbours.nearness()
-        refuse(
-            scene,
-            [
-                (bool(nearness), ("neighbours",), "neighbours are found anew in every step"),
-                (ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME),
-            ],
-        )
+        refuse_steps(ranks, scene)
         start, anew = division.begun(scene)
         Driver.__init__(self, division.scene, start, DistributedWatch(ranks, watch))
         self._engine, self.choice = division.stepper(ranks.bcast(choose(scene)))
@@ -239,7 +234,10 @@ class DistributedSteppingDriver(SteppingDriver):
         super().load_state_dict(self._division.scattered(parts))
 
 
-CHANGING_FRAME = "a frame whose map follows numbers of the rule that change in time"
+def refuse_steps(ranks: Ranks, scene: Scene) -> None:
+    """Raises NotSharedError in all processes for an operation that any of them cannot divide."""
+    found = [one for one in ranks.every(hindrance(scene, Way.RANKS)) if one]
+    refuse(scene, [(True, (one.field,), one.reason) for one in found])
 
 
 def refuse(scene: Scene, unfit: Iterable[tuple[bool, tuple[str, ...], str]]) -> None:
@@ -328,7 +326,7 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
 
     def __init__(self, division: Division, scene: Scene, watch: Watch) -> None:
         ranks, self._division = division.ranks, division
-        refuse(scene, [(ranks.any(scene.frame_changes), ("frame",), CHANGING_FRAME)])
+        refuse_steps(ranks, scene)
         _refuse(scene)
         start, anew = division.begun(scene)
         super().__init__(division.scene, start, DistributedWatch(ranks, watch))

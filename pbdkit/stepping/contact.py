@@ -27,7 +27,7 @@ from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
-from pbdkit.stepping.operation import Operation, Step
+from pbdkit.stepping.operation import PUSHED_BY_COURSES, Hindrance, Operation, Step, Way
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import Floats, State, unmoved_state
 
@@ -306,6 +306,11 @@ class PushOut(Operation):
         """Rows whose particles reach no obstacle's box, as far as their displacements go, are
         passed over."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
+
+    def hindrance(self, way: Way) -> Hindrance | None:
+        """How particles give way is known for the numbers at the beginning."""
+        reasons = {Way.GPU: "obstacles push", Way.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[way], "obstacles") if way in reasons else None
 
     def _write(self, kernel: KernelWriter, out: Function) -> None:
         """The function that pushes the particles of some rows."""

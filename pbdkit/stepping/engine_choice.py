@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pbdkit.errors import ExperimentError, PluginError
-from pbdkit.model.motions import Newton
-from pbdkit.scene.leaders import has_guides
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.leaders import Clamps, last_event
+from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numba_engine.time_skewing import exceeds_cache, single_steps
 from pbdkit.stepping.numpy_engine import Engine, Stepper
+from pbdkit.stepping.operation import Way
+from pbdkit.stepping.program import reason_against
 
 
 def what_is_missing() -> str:
@@ -35,15 +35,7 @@ def what_is_missing() -> str:
 
 def what_gpus_lack(scene: Scene) -> str:
     """Why a scene cannot be stepped on a GPU; empty where it can."""
-    if scene.experiment.neighbours.nearness():
-        return "neighbours are found anew"
-    if any(isinstance(leading.group.motion, Newton) for leading in scene.leading):
-        return "leaders move by Newton's law"
-    if Clamps(scene).numbers:
-        return "leaders are clamped"
-    if has_guides(scene.leading):
-        return "leaders lead along an axis"
-    return "obstacles push" if scene.barriers else ""
+    return reason_against(scene, Way.GPU)
 
 
 PATIENCE_S = 3.0
@@ -140,15 +132,10 @@ def what_kernels_lack(scene: Scene) -> str:
     there are none."""
     experiment, constants = scene.experiment, scene.constants
     changing = {field for field, _ in experiment.courses}
-    if changing and experiment.neighbours.nearness():
-        return "numbers change in time, and neighbours are found anew"
     if changing <= {"solver"}:
-        return ""
-    masses = any(isinstance(leading.group.motion, Newton) for leading in scene.leading)
-    if masses or scene.barriers or has_guides(scene.leading):
-        return "numbers change in time by which masses, obstacles or leaders along an axis push"
-    if scene.frame_changes:
-        return "numbers change in time by which the frame follows"
+        return reason_against(scene, Way.SOLVER_COURSES) if changing else ""
+    if reason := reason_against(scene, Way.COURSES):
+        return reason
     if constants.by_particle or constants.by_bond or (scene.cells and scene.cells.mixed):
         return "numbers differ from place to place and others change in time"
     for moment in sorted({bend for course in experiment.courses.values() for bend in course.bends}):

@@ -33,7 +33,16 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Led, Operation, Placed, Starts, Step
+from pbdkit.stepping.operation import (
+    PUSHED_BY_COURSES,
+    Hindrance,
+    Led,
+    Operation,
+    Placed,
+    Starts,
+    Step,
+    Way,
+)
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import Array, Floats, State
 
@@ -396,6 +405,13 @@ class PlaceLeaders(Operation):
             put = kernel.each(f"flat_u_@[led{end}[e]] = held{end}[#, e]", axes)
             kernel.listed(f"led{end}", *put, ahead=True)
 
+    def hindrance(self, way: Way) -> Hindrance | None:
+        """Forces on masses are computed on the host, by numbers as they are in its arrays."""
+        if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
+            return None
+        reasons = {Way.GPU: "leaders move by Newton's law", Way.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[way], "leaders") if way in reasons else None
+
 
 class GuideLeaders(Operation):
     """Put guided particles where they are prescribed after the step, too: along those axes they
@@ -415,6 +431,11 @@ class GuideLeaders(Operation):
         for end, axes in leader_lists(self.scene).items():
             put = kernel.each(f"flat_v_@[led{end}[e]] = held{end}[#, e]", axes)
             kernel.listed(f"led{end}", *put)
+
+    def hindrance(self, way: Way) -> Hindrance | None:
+        """How particles give way is known for the numbers at the beginning."""
+        reasons = {Way.GPU: "leaders lead along an axis", Way.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[way], "leaders") if way in reasons else None
 
 
 class GuideToObstacles(GuideLeaders):
@@ -446,6 +467,10 @@ class TurnDirections(Operation):
 
     def emit(self, kernel: KernelWriter) -> None:
         """Nothing: directions are turned before a call, and a call goes on while none turns."""
+
+    def hindrance(self, way: Way) -> Hindrance | None:
+        """Directions that are turned on the host are not sent to a GPU."""
+        return Hindrance("leaders are clamped", "leaders") if way is Way.GPU else None
 
 
 class HoldDirections(TurnDirections):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any, Literal, NamedTuple, Self
 
 from numpy.typing import NDArray
@@ -31,6 +32,28 @@ class Placed(NamedTuple):
 
 Led = list[Placed]
 Starts = tuple[Floats | None, ...]
+
+
+class Way(Enum):
+    """A way to make steps that not every operation knows."""
+
+    GPU = "on the threads of a GPU"
+    PASSES = "several steps in a pass over the memory"
+    RANKS = "rows of the lattice in several processes"
+    COURSES = "in kernels, while numbers of rule or fracture model change in time"
+    SOLVER_COURSES = "in kernels, while numbers of the solver change in time"
+
+
+PUSHED_BY_COURSES = (
+    "numbers change in time by which masses, obstacles or leaders along an axis push"
+)
+
+
+class Hindrance(NamedTuple):
+    """Why an operation cannot go a way, and the field of the experiment that asks for it."""
+
+    reason: str
+    field: str
 
 
 @dataclass(slots=True)
@@ -79,3 +102,7 @@ class Operation(ABC):
     @abstractmethod
     def emit(self, kernel: KernelWriter) -> None:
         """Write its part of a step into a kernel."""
+
+    def hindrance(self, way: Way) -> Hindrance | None:
+        """Return why it cannot go a way; None where it can."""
+        return None

@@ -16,7 +16,7 @@ from pbdkit.stepping.leaders import (
     PlaceLeaders,
     TurnDirections,
 )
-from pbdkit.stepping.operation import Operation
+from pbdkit.stepping.operation import Hindrance, Operation, Way
 
 Program = tuple[Operation, ...]
 ORDER: tuple[type[Operation], ...] = (
@@ -43,3 +43,16 @@ def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
     for kind in ORDER:
         found += [sweep] if sweep and kind is MoveFollowers else kind.of(scene)
     return tuple(found)
+
+
+def hindrance(scene: Scene, way: Way) -> Hindrance | None:
+    """Return the first reason for which the steps of a scene cannot go a way; None where they
+    can."""
+    reasons = (operation.hindrance(way) for operation in program_of(scene))
+    return next(filter(None, reasons), None)
+
+
+def reason_against(scene: Scene, way: Way) -> str:
+    """Return that reason in words; empty where there is none."""
+    found = hindrance(scene, way)
+    return found.reason if found else ""

@@ -16,8 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.plugin import RenewsBonds, SoftensCells
+from pbdkit.plugin import RenewsBonds
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.operation import Way
+from pbdkit.stepping.program import reason_against
 
 CACHE = 2**24
 """Bytes of displacements up to which a pass a step is as fast (measured)."""
@@ -40,12 +42,8 @@ def exceeds_cache(scene: Scene) -> bool:
 
 def single_steps(scene: Scene) -> str:
     """Why every step is a pass of its own; empty where several can go together."""
-    if scene.experiment.neighbours.nearness():
-        return "neighbours are found anew"
-    if isinstance(scene.experiment.fracture, SoftensCells):
-        return "bonds soften by the stress of cells"
-    if scene.inner and scene.inner.inner:
-        return "the rule moves by the moves of one that moves by another's"
+    if reason := reason_against(scene, Way.PASSES):
+        return reason
     if max(map(len, scene.neighbourhood.slots)) > MOST_SLOTS:
         return "there are many neighbours"
     if max(Skew(scene).along) > FARTHEST:
