@@ -39,7 +39,7 @@ from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.leaders import steady_steps
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.operation import Way
+from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import hindrance
 from pbdkit.stepping.state import State, initial_state
 
@@ -236,7 +236,7 @@ class DistributedSteppingDriver(SteppingDriver):
 
 def refuse_steps(ranks: Ranks, scene: Scene) -> None:
     """Raises NotSharedError in all processes for an operation that any of them cannot divide."""
-    found = [one for one in ranks.every(hindrance(scene, Way.RANKS)) if one]
+    found = [one for one in ranks.every(hindrance(scene, Mode.RANKS)) if one]
     refuse(scene, [(True, (one.field,), one.reason) for one in found])
 
 

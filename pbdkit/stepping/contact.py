@@ -27,7 +27,7 @@ from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
-from pbdkit.stepping.operation import PUSHED_BY_COURSES, Hindrance, Operation, Step, Way
+from pbdkit.stepping.operation import PUSHED_BY_COURSES, Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import Floats, State, unmoved_state
 
@@ -307,10 +307,10 @@ class PushOut(Operation):
         passed over."""
         kernel.over_rows("push_out", lambda out: self._write(kernel, out))
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """How particles give way is known for the numbers at the beginning."""
-        reasons = {Way.GPU: "obstacles push", Way.COURSES: PUSHED_BY_COURSES}
-        return Hindrance(reasons[way], "obstacles") if way in reasons else None
+        reasons = {Mode.GPU: "obstacles push", Mode.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[mode], "obstacles") if mode in reasons else None
 
     def _write(self, kernel: KernelWriter, out: Function) -> None:
         """The function that pushes the particles of some rows."""

@@ -15,7 +15,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numba_engine.time_skewing import exceeds_cache, single_steps
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.operation import Way
+from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import reason_against
 
 
@@ -35,7 +35,7 @@ def what_is_missing() -> str:
 
 def what_gpus_lack(scene: Scene) -> str:
     """Why a scene cannot be stepped on a GPU; empty where it can."""
-    return reason_against(scene, Way.GPU)
+    return reason_against(scene, Mode.GPU)
 
 
 PATIENCE_S = 3.0
@@ -133,8 +133,8 @@ def what_kernels_lack(scene: Scene) -> str:
     experiment, constants = scene.experiment, scene.constants
     changing = {field for field, _ in experiment.courses}
     if changing <= {"solver"}:
-        return reason_against(scene, Way.SOLVER_COURSES) if changing else ""
-    if reason := reason_against(scene, Way.COURSES):
+        return reason_against(scene, Mode.SOLVER_COURSES) if changing else ""
+    if reason := reason_against(scene, Mode.COURSES):
         return reason
     if constants.by_particle or constants.by_bond or (scene.cells and scene.cells.mixed):
         return "numbers differ from place to place and others change in time"

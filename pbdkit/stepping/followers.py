@@ -23,7 +23,7 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.frame import FollowFrame
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Hindrance, Operation, Step, Way
+from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
     Evaluator,
@@ -288,16 +288,16 @@ class MoveFollowers(Operation):
             level, scene = level + 1, inner
         kernel.sweep(level)
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """Neighbours found anew are a list that is made on the host in every step."""
         if self.scene.experiment.neighbours.nearness():
             changing = "numbers change in time, and neighbours are found anew"
             reasons = {
-                Way.RANKS: "neighbours are found anew in every step",
-                Way.COURSES: changing,
-                Way.SOLVER_COURSES: changing,
+                Mode.RANKS: "neighbours are found anew in every step",
+                Mode.COURSES: changing,
+                Mode.SOLVER_COURSES: changing,
             }
-            return Hindrance(reasons.get(way, "neighbours are found anew"), "neighbours")
-        if way is Way.PASSES and self.scene.inner and self.scene.inner.inner:
+            return Hindrance(reasons.get(mode, "neighbours are found anew"), "neighbours")
+        if mode is Mode.PASSES and self.scene.inner and self.scene.inner.inner:
             return Hindrance("the rule moves by the moves of one that moves by another's", "rule")
         return None

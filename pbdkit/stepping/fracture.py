@@ -18,7 +18,7 @@ from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Hindrance, Operation, Step, Way
+from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
 from pbdkit.stepping.state import State, cut_bonds
 
@@ -197,9 +197,9 @@ class BreakBonds(Operation):
         """Before particles move, or with them."""
         kernel.judge_bonds()
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """The stress of cells takes in particles farther away than a pass knows."""
         softens = isinstance(self.scene.experiment.fracture, SoftensCells)
-        if way is Way.PASSES and softens:
+        if mode is Mode.PASSES and softens:
             return Hindrance("bonds soften by the stress of cells", "fracture")
         return None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter, Lines
-from pbdkit.stepping.operation import Hindrance, Operation, Step, Way
+from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
 
 
 class FollowFrame(Operation):
@@ -29,14 +29,14 @@ class FollowFrame(Operation):
         """After all particles stand where they go."""
         kernel.follow(self.mapped(kernel), "flat_v", self.scene.lag)
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """A map that is made anew is an array of the host, and of a whole lattice."""
         reasons = {
-            Way.COURSES: "numbers change in time by which the frame follows",
-            Way.RANKS: "a frame whose map follows numbers of the rule that change in time",
+            Mode.COURSES: "numbers change in time by which the frame follows",
+            Mode.RANKS: "a frame whose map follows numbers of the rule that change in time",
         }
-        changes = way in reasons and self.scene.frame_changes
-        return Hindrance(reasons[way], "frame") if changes else None
+        changes = mode in reasons and self.scene.frame_changes
+        return Hindrance(reasons[mode], "frame") if changes else None
 
     def emit_for(self, kernel: KernelWriter, planes: str) -> None:
         """Write the same for planes that are no displacements: the moves of an inner rule."""

@@ -37,11 +37,11 @@ from pbdkit.stepping.operation import (
     PUSHED_BY_COURSES,
     Hindrance,
     Led,
+    Mode,
     Operation,
     Placed,
     Starts,
     Step,
-    Way,
 )
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import Array, Floats, State
@@ -405,12 +405,12 @@ class PlaceLeaders(Operation):
             put = kernel.each(f"flat_u_@[led{end}[e]] = held{end}[#, e]", axes)
             kernel.listed(f"led{end}", *put, ahead=True)
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """Forces on masses are computed on the host, by numbers as they are in its arrays."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
-        reasons = {Way.GPU: "leaders move by Newton's law", Way.COURSES: PUSHED_BY_COURSES}
-        return Hindrance(reasons[way], "leaders") if way in reasons else None
+        reasons = {Mode.GPU: "leaders move by Newton's law", Mode.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
 class GuideLeaders(Operation):
@@ -432,10 +432,10 @@ class GuideLeaders(Operation):
             put = kernel.each(f"flat_v_@[led{end}[e]] = held{end}[#, e]", axes)
             kernel.listed(f"led{end}", *put)
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """How particles give way is known for the numbers at the beginning."""
-        reasons = {Way.GPU: "leaders lead along an axis", Way.COURSES: PUSHED_BY_COURSES}
-        return Hindrance(reasons[way], "leaders") if way in reasons else None
+        reasons = {Mode.GPU: "leaders lead along an axis", Mode.COURSES: PUSHED_BY_COURSES}
+        return Hindrance(reasons[mode], "leaders") if mode in reasons else None
 
 
 class GuideToObstacles(GuideLeaders):
@@ -468,9 +468,9 @@ class TurnDirections(Operation):
     def emit(self, kernel: KernelWriter) -> None:
         """Nothing: directions are turned before a call, and a call goes on while none turns."""
 
-    def hindrance(self, way: Way) -> Hindrance | None:
+    def hindrance(self, mode: Mode) -> Hindrance | None:
         """Directions that are turned on the host are not sent to a GPU."""
-        return Hindrance("leaders are clamped", "leaders") if way is Way.GPU else None
+        return Hindrance("leaders are clamped", "leaders") if mode is Mode.GPU else None
 
 
 class HoldDirections(TurnDirections):

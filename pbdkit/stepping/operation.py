@@ -34,8 +34,8 @@ Led = list[Placed]
 Starts = tuple[Floats | None, ...]
 
 
-class Way(Enum):
-    """A way to make steps that not every operation knows."""
+class Mode(Enum):
+    """A mode of stepping that not every operation goes with."""
 
     GPU = "on the threads of a GPU"
     PASSES = "several steps in a pass over the memory"
@@ -50,7 +50,7 @@ PUSHED_BY_COURSES = (
 
 
 class Hindrance(NamedTuple):
-    """Why an operation cannot go a way, and the field of the experiment that asks for it."""
+    """Why an operation cannot be made in a mode, and the field of the experiment that asks for it."""
 
     reason: str
     field: str
@@ -103,6 +103,6 @@ class Operation(ABC):
     def emit(self, kernel: KernelWriter) -> None:
         """Write its part of a step into a kernel."""
 
-    def hindrance(self, way: Way) -> Hindrance | None:
-        """Return why it cannot go a way; None where it can."""
+    def hindrance(self, mode: Mode) -> Hindrance | None:
+        """Return why it cannot be made in a mode; None where it can."""
         return None

@@ -16,7 +16,7 @@ from pbdkit.stepping.leaders import (
     PlaceLeaders,
     TurnDirections,
 )
-from pbdkit.stepping.operation import Hindrance, Operation, Way
+from pbdkit.stepping.operation import Hindrance, Mode, Operation
 
 Program = tuple[Operation, ...]
 ORDER: tuple[type[Operation], ...] = (
@@ -45,14 +45,14 @@ def program_of(scene: Scene, sweep: MoveFollowers | None = None) -> Program:
     return tuple(found)
 
 
-def hindrance(scene: Scene, way: Way) -> Hindrance | None:
-    """Return the first reason for which the steps of a scene cannot go a way; None where they
-    can."""
-    reasons = (operation.hindrance(way) for operation in program_of(scene))
+def hindrance(scene: Scene, mode: Mode) -> Hindrance | None:
+    """Return the first reason for which the steps of a scene cannot be made in a mode; None where
+    they can."""
+    reasons = (operation.hindrance(mode) for operation in program_of(scene))
     return next(filter(None, reasons), None)
 
 
-def reason_against(scene: Scene, way: Way) -> str:
+def reason_against(scene: Scene, mode: Mode) -> str:
     """Return that reason in words; empty where there is none."""
-    found = hindrance(scene, way)
+    found = hindrance(scene, mode)
     return found.reason if found else ""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pbdkit.plugin import RenewsBonds
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.operation import Way
+from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import reason_against
 
 CACHE = 2**24
@@ -42,7 +42,7 @@ def exceeds_cache(scene: Scene) -> bool:
 
 def single_steps(scene: Scene) -> str:
     """Why every step is a pass of its own; empty where several can go together."""
-    if reason := reason_against(scene, Way.PASSES):
+    if reason := reason_against(scene, Mode.PASSES):
         return reason
     if max(map(len, scene.neighbourhood.slots)) > MOST_SLOTS:
         return "there are many neighbours"
