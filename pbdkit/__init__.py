@@ -70,6 +70,7 @@ if TYPE_CHECKING:
         NeighbourMetric as NeighbourMetric,
         Offset as Offset,
         Pair as Pair,
+        ParticleOperation as ParticleOperation,
         Particles as Particles,
         Quantity as Quantity,
         Remembered as Remembered,
@@ -112,8 +113,8 @@ _HOME = {
         "BreaksAtStrain Calibrated Cell CellStress Component Components Diagnostic Draws "
         "FollowerRule FractureModel FrameMap FramePolicy FrameSites Here KnowsStiffness Lattice "
         "LeaderRows LoadRows Loadable MixesCells Moment Nearness NeighbourMetric Offset Pair "
-        "Particles Quantity Remembered Remembers RenewsBonds RenewsParticles Setting "
-        "SharesParticles Slot Softens SoftensCells SpaceVector StartsCracked Stiffness "
+        "ParticleOperation Particles Quantity Remembered Remembers RenewsBonds RenewsParticles "
+        "Setting SharesParticles Slot Softens SoftensCells SpaceVector StartsCracked Stiffness "
         "StoresEnergy TearsCells Torn TouchingRows TurnsParticles Variable Vector dot length "
         "squared_length where"
     ),

@@ -62,7 +62,7 @@ class Moves:
         large = compiles and scene.raster.count > LARGEST_BY_NUMPY
         if large and not (scene.has_fracture or renews):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            free = replace(stepped, barriers=())
+            free = stepped.bare
             stepped = replace(free, experiment=experiment, leading=_resting(scene))
             choice = Choice("numpy" if obstacle() else "compiled", 1, "asked for")
             self._engine, _ = make_engine(stepped, choice)

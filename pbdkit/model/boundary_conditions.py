@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
-    ConfigDict,
     Field,
     SerializeAsAny,
     SerializerFunctionWrapHandler,
@@ -27,6 +26,7 @@ from pbdkit.model.validation import closed_part, fault
 from pbdkit.plugin import Component, Pair
 from pbdkit.plugin.component import Strict
 from pbdkit.plugin.fracture import Segment
+from pbdkit.plugin.particles import Selection
 from pbdkit.plugin.schedule import BodyForce, Course, Force, at
 from pbdkit.plugin.units import LENGTH, Place
 
@@ -119,42 +119,7 @@ class Affine(Initial):
 AnyInitial = Annotated[SerializeAsAny[Initial], closed_part(Initial, Reference, Noise, Affine)]
 
 
-Length = Annotated[float, LENGTH]
-Box = Annotated[tuple[Length, Length, Length, Length], Field(strict=False)]
-Numbers = Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)]
-Points = Annotated[tuple[Place, ...], Field(strict=False, min_length=1)]
 Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1)]
-
-
-class Selection(Strict):
-    """Chooses body particles of the reference configuration, in one of five ways.
-
-    `edge`: the outermost of every row (left, right) or column (bottom, top); `box`: [xmin, ymin,
-    xmax, ymax], inclusive; `numbers`: as they are numbered; `nearest`: to each of some points;
-    `region`: all that the region of that name holds.
-    """
-
-    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
-
-    edge: Literal["left", "right", "bottom", "top"] | None = None
-    box: Box | None = None
-    numbers: Numbers | None = None
-    nearest: Points | None = None
-    region: str | None = None
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Selection:
-        if len(self._given()) != 1:
-            raise ValueError("give exactly one of edge, box, numbers, nearest, region")
-        return self
-
-    def _given(self) -> dict[str, Any]:
-        names = type(self).model_fields
-        return {n: getattr(self, n) for n in names if getattr(self, n) is not None}
-
-    @model_serializer
-    def _serialize(self) -> dict[str, Any]:
-        return self._given()
 
 
 class Driven(Strict):

@@ -35,6 +35,7 @@ from pbdkit.model.solver import AnySolver, Equilibrium, Record, Stepping
 from pbdkit.model.validation import brief, fault, open_part, report
 from pbdkit.plugin import (
     INTERFACES,
+    LISTS,
     Component,
     Diagnostic,
     Draws,
@@ -44,6 +45,7 @@ from pbdkit.plugin import (
     Lattice,
     Loadable,
     NeighbourMetric,
+    ParticleOperation,
     RenewsParticles,
     Softens,
     SoftensCells,
@@ -137,6 +139,10 @@ def _of_events(asked: Any) -> list[tuple[Key, bool, str]]:
         ("solver", jumps and remembers,
          f"the rule '{asked.rule.type}' remembers, so that where the steps lead depends on "
          "all of them; take solver: {type: stepping}"),
+        *(("solver", (jumps or settles) and not operation.rests,
+           f"'{operation.type}' may move particles that their rule leaves where they are, so that "
+           "no equilibrium is known; take solver: {type: stepping} without settle")
+          for operation in asked.operations),
     ]  # fmt: skip
 
 
@@ -300,6 +306,14 @@ AnyDiagnostic = Annotated[
 ]
 
 
+AnyOperation = Annotated[SerializeAsAny[ParticleOperation], open_part(ParticleOperation)]
+
+
+def _each(field: str, parts: Any) -> list[Any]:
+    """The components at a field, of which some list any number."""
+    return list(parts) if field in LISTS else [parts]
+
+
 def _default(part: str) -> Any:
     # As in a file, so that it is resolved like one, and `--set` can start from it.
     return Field(default={"type": part})
@@ -330,6 +344,7 @@ class Experiment(Strict):
     leaders: Annotated[tuple[LeaderGroup, ...], Field(strict=False)] = ()
     loads: Annotated[tuple[Load, ...], Field(strict=False)] = ()
     obstacles: Annotated[tuple[Obstacle, ...], Field(strict=False)] = ()
+    operations: Annotated[tuple[AnyOperation, ...], Field(strict=False)] = ()
     steps: Annotated[int, Field(ge=1, lt=2**62)]
     record: Record = Field(default_factory=Record)
     diagnostics: Annotated[tuple[AnyDiagnostic, ...], Field(strict=False)] = ()
@@ -345,7 +360,7 @@ class Experiment(Strict):
         }
         for field, classes in known.items():
             if key != "type" and any(key in each.known_keys() for each in classes):
-                below = f"{{{key}: ...}}" if field != "diagnostics" else f"[{{{key}: ...}}]"
+                below = f"[{{{key}: ...}}]" if field in LISTS else f"{{{key}: ...}}"
                 return f"write it under `{field}`, as in `{field}: {below}`"
         return ""
 
@@ -396,15 +411,15 @@ class Experiment(Strict):
         found: dict[str, Any] = serialize(self)
         if not found.keys() >= INTERFACES.keys():
             return found  # of some fields alone
-        *single, many = (found[field] for field in INTERFACES)
-        for part, dumped in zip(self.components(), [*single, *many], strict=True):
+        written = [each for field in INTERFACES for each in _each(field, found[field])]
+        for part, dumped in zip(self.components(), written, strict=True):
             dumped["type"] = self._registry.name_of(part)
             if isinstance(part, TakesFields):
                 dumped |= part.in_place_of_numbers()
             for name in given_by_units(part):
                 if self.units and self.units.value(name):
                     del dumped[name]  # there it is said
-        for name in ("units", "regions"):
+        for name in ("units", "regions", "operations"):
             if not found[name]:
                 del found[name]
         return found
@@ -504,8 +519,7 @@ class Experiment(Strict):
 
     def components(self) -> list[Component]:
         """Every part of an open interface."""
-        *single, many = (getattr(self, field) for field in INTERFACES)
-        return [*single, *many]
+        return [each for field in INTERFACES for each in _each(field, getattr(self, field))]
 
     def distributions(self) -> dict[str, str]:
         """The distributions that the parts come from, with their versions."""

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from pbdkit.model.experiment import Experiment
-from pbdkit.plugin import INTERFACES
+from pbdkit.plugin import INTERFACES, LISTS
 from pbdkit.plugin.discovery import RETIRED, Retired
 from pbdkit.plugin.registry import Registry
 
@@ -35,7 +35,7 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
             named |= {"const": spellings[0]} if len(spellings) == 1 else {"enum": spellings}
             named["default"] = spellings[0]
         part, choice = top["properties"][field], [dict(names[c, "validation"]) for c in components]
-        if field == "diagnostics":
+        if field in LISTS:
             part["items"] = {"oneOf": choice}
         else:
             kept = {k: v for k, v in part.items() if k == "default"}

@@ -42,6 +42,7 @@ from pbdkit.scene.constants import SceneConstants
 from pbdkit.scene.frame import Frame
 from pbdkit.scene.leaders import Leading
 from pbdkit.scene.loads import Loads
+from pbdkit.scene.operations import Operated
 from pbdkit.scene.scene import Ground, Scene
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.state import State
@@ -293,6 +294,7 @@ class _Window:
             inner=self.scene(inner) if inner else None,
             leading=tuple(map(self._leading, scene.leading)),
             loads=self._loads(scene.loads) if scene.loads else None,
+            operations=tuple(map(self._operated, scene.operations)),
         )
 
     def leads(self, leading: Leading) -> Mask:
@@ -362,6 +364,11 @@ class _Window:
         phase = None if cells.phase is None else self._cut(cells.phase)
         mixed = tuple(map(self._cut, cells.mixed))
         return replace(cells, share=share, weight=weight, mixed=mixed, phase=phase)
+
+    def _operated(self, operated: Operated) -> Operated:
+        some = self.moves(operated.place)
+        rows = operated.rows[some] - self.raster.before + self._whole.before
+        return replace(operated, rows=rows, place=self._places(operated.place[some]))
 
     def _loads(self, loads: Loads) -> Loads:
         each = []

@@ -25,6 +25,7 @@ from pbdkit.plugin.fracture import (
 )
 from pbdkit.plugin.frame import Anchors, FrameMap, FramePolicy, FrameSites
 from pbdkit.plugin.lattice import BasisSite, Cell, Lattice, Nearness, NeighbourMetric, Offset, Slot
+from pbdkit.plugin.operation import ParticleOperation
 from pbdkit.plugin.rule import (
     AppliesTwice,
     Calibrated,
@@ -50,20 +51,24 @@ INTERFACES: dict[str, type[Component]] = {
     "rule": FollowerRule,
     "frame": FramePolicy,
     "fracture": FractureModel,
+    "operations": ParticleOperation,
     "diagnostics": Diagnostic,
 }
 """The open interfaces by the field of the experiment in which their components stand."""
+LISTS = frozenset({"operations", "diagnostics"})
+"""The fields that list any number of components."""
 
 __all__ = [
-    "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "INTERFACES", "LENGTH", "STRESS", "Anchors",
-    "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellStress",
-    "Component", "Components", "Diagnostic", "Draws", "FollowerRule", "FractureModel", "FrameMap",
-    "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice", "LeaderRows", "LoadRows",
-    "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Offset", "Pair",
-    "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds", "RenewsParticles",
-    "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells", "SpaceVector",
-    "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Torn", "TouchingRows",
-    "TurnsParticles", "Variable", "Vector", "dot", "length", "squared_length", "where",
+    "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "INTERFACES", "LENGTH", "LISTS", "STRESS",
+    "Anchors", "AppliesTwice", "BasisSite", "Bonds", "BreaksAtStrain", "Calibrated", "Cell",
+    "CellStress", "Component", "Components", "Diagnostic", "Draws", "FollowerRule",
+    "FractureModel", "FrameMap", "FramePolicy", "FrameSites", "Here", "KnowsStiffness", "Lattice",
+    "LeaderRows", "LoadRows", "Loadable", "MixesCells", "Moment", "Nearness", "NeighbourMetric",
+    "Offset", "Pair", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
+    "RenewsBonds", "RenewsParticles", "Setting", "SharesParticles", "Slot", "Softens",
+    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells",
+    "Torn", "TouchingRows", "TurnsParticles", "Variable", "Vector", "dot", "length",
+    "squared_length", "where",
 ]  # fmt: skip
 
 

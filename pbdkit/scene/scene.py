@@ -64,6 +64,7 @@ from pbdkit.scene.loads import Loads, build_loads
 from pbdkit.scene.materials import weighed
 from pbdkit.scene.memory_estimate import refuse_too_large
 from pbdkit.scene.obstacles import Barrier, build_obstacles, collisions
+from pbdkit.scene.operations import Operated, build_operations
 
 
 class Ground:
@@ -175,7 +176,7 @@ class Scene:
     scene with the rule's inner rule) and `loads` are None where the scene has none. `leading` are
     the leader groups; `setting` is what a rule may derive its constants from, `middle` that of the
     body's box, from the lattice's site (0, 0); `warnings` are for the user, `barriers` the
-    obstacles.
+    obstacles, `operations` those of the experiment.
     """
 
     experiment: Experiment
@@ -191,6 +192,7 @@ class Scene:
     middle: Components
     warnings: tuple[str, ...]
     barriers: tuple[Barrier, ...] = ()
+    operations: tuple[Operated, ...] = ()
 
     @property
     def driven(self) -> tuple[Leading | Barrier, ...]:
@@ -221,8 +223,10 @@ class Scene:
 
     @cached_property
     def bare(self) -> Scene:
-        """The same without obstacles."""
-        return replace(self, barriers=()) if self.barriers else self
+        """The same without obstacles and operations of particles."""
+        if not (self.barriers or self.operations):
+            return self
+        return replace(self, barriers=(), operations=())
 
     @property
     def has_fracture(self) -> bool:
@@ -327,7 +331,8 @@ def _build(experiment: Experiment, ground: Ground) -> Scene:
     parts = (neighbourhood, raster, constants, following, cells, None, leading)
     lower, upper = body_box(raster)
     facts = loads, setting, (lower + upper) / 2
-    return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers))
+    operations = build_operations(raster, experiment)
+    return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers, operations))
 
 
 def _segments(experiment: Experiment) -> dict[str, Segment]:

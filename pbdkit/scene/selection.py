@@ -14,9 +14,9 @@ import numpy as np
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.lattice.raster import FOLLOWER, NOWHERE, Floats, Raster, distinct
 from pbdkit.model.bodies import Body
-from pbdkit.model.boundary_conditions import Selection
 from pbdkit.plugin import Pair
 from pbdkit.plugin.frame import Indices
+from pbdkit.plugin.particles import Selection
 from pbdkit.scene.constants import signed_distance
 
 STRAIGHT = 1e-9

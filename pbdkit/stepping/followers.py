@@ -261,11 +261,6 @@ class MoveFollowers(Operation):
         super().__init__(scene)
         self._known = followers
 
-    @classmethod
-    def is_needed(cls, scene: Scene) -> bool:
-        """In every scene."""
-        return True
-
     @cached_property
     def _followers(self) -> Followers:
         nearness = self.scene.experiment.neighbours.nearness()

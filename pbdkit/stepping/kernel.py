@@ -68,6 +68,10 @@ class KernelWriter(ABC):
         """Return the pattern for each axis, or for some."""
 
     @abstractmethod
+    def vector(self, pattern: str) -> str:
+        """Return a vector whose components have this pattern."""
+
+    @abstractmethod
     def number(self, value: float) -> str:
         """Return a literal in the precision of the scene."""
 

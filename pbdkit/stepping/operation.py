@@ -50,7 +50,8 @@ PUSHED_BY_COURSES = (
 
 
 class Hindrance(NamedTuple):
-    """Why an operation cannot be made in a mode, and the field of the experiment that asks for it."""
+    """Why an operation cannot be made in a mode, and the field of the experiment that asks for
+    it."""
 
     reason: str
     field: str
@@ -91,9 +92,9 @@ class Operation(ABC):
         return [cls(scene)] if cls.is_needed(scene) else []
 
     @classmethod
-    @abstractmethod
     def is_needed(cls, scene: Scene) -> bool:
         """Whether a scene has the feature."""
+        return True
 
     @abstractmethod
     def apply(self, step: Step) -> None:

@@ -17,6 +17,7 @@ from pbdkit.stepping.leaders import (
     TurnDirections,
 )
 from pbdkit.stepping.operation import Hindrance, Mode, Operation
+from pbdkit.stepping.particle_operation import OperateOnParticles
 
 Program = tuple[Operation, ...]
 ORDER: tuple[type[Operation], ...] = (
@@ -28,6 +29,7 @@ ORDER: tuple[type[Operation], ...] = (
     MoveFollowers,
     HoldDirections,
     CorrectGuided,
+    OperateOnParticles,
     GuideToObstacles,
     PushOut,
     HoldLeaders,

@@ -20,7 +20,7 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.scene.frame import Frame
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
-from pbdkit.stepping.numba_engine.plan import Plan, frame_order
+from pbdkit.stepping.numba_engine.plan import Plan, banded, frame_order
 from pbdkit.stepping.numba_engine.sweeps import (
     GENERAL,
     NOBODY,
@@ -61,6 +61,11 @@ def constant_arrays(plan: Plan) -> Arrays:
         arrays |= tearing_arrays(scene)
     if plan.softens_cells:
         arrays |= stress_arrays(scene, real)
+    for n, operated in enumerate(scene.operations):
+        # One more, so that no array is empty.
+        arrays[f"operation{n}"] = np.array([*operated.parameters, 0.0], real)
+        order, rows = banded(plan, f"operated{n}", operated.place)
+        arrays |= {f"operated{n}": operated.place[order]} | rows
     if frame := scene.frame:
         arrays |= _of_frame(frame, frame_order(plan), real)
     return arrays

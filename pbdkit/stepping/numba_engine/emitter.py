@@ -69,11 +69,13 @@ def module_text(
     for n, level in enumerate(plan.levels):
         own = level.seen
         kinds |= {f"Rule{n}": own.rule, f"Weights{n}": own.weights, f"Own{n}": own.own}
+    fields = {kind: [number.name for number in numbers] for kind, numbers in kinds.items()}
+    for n, operated in enumerate(plan.scene.operations):
+        fields[f"Operation{n}"] = list(operated.parameters._fields)
     lines = ['"""Made by pbdkit for one kind of scene; not to be edited."""', ""]
     if plan.scene.axes == 3:
         lines.append("Vector = SpaceVector")
-    for kind, numbers in kinds.items():
-        lines.append(f'{kind} = namedtuple("{kind}", {[number.name for number in numbers]!r})')
+    lines += [f'{kind} = namedtuple("{kind}", {names!r})' for kind, names in fields.items()]
     lines += [line for function in functions for line in function.source]
     lines += ["", "", *head, *("    " + line for line in run.lines)]
     return "\n".join(lines) + "\n"

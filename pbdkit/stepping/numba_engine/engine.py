@@ -66,6 +66,7 @@ from pbdkit.stepping.numba_engine.sweeps import (
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
 from pbdkit.stepping.operation import Led
+from pbdkit.stepping.particle_operation import OperateOnParticles
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
 from pbdkit.stepping.state import Floats, State, cut_bonds, unmoved_state
@@ -301,6 +302,10 @@ class CompiledStepper(Engine):
         inner = [name for n in range(len(levels) - 1) for name in plan.each(f"z{n}_@")]
         self._moves = np.zeros((len(inner), *scene.raster.shape), start.u.dtype)
         self._arrays |= dict(zip(inner, self._moves, strict=True))
+        self._moved_at_rest = [
+            np.unravel_index(operation.moved_at_rest, scene.raster.shape)[1:]
+            for operation in OperateOnParticles.of(scene)
+        ]
         self._clamps, self._clamped = Clamps(scene), np.zeros(0, np.intp)
         own = start.particle_values
         self._arrays |= {f"was{m}": np.zeros(scene.raster.shape, own[m].dtype) for m in plan.kept}
@@ -360,6 +365,7 @@ class CompiledStepper(Engine):
         if self._contact:
             for later in range(step, step + len(ways)):
                 self._reach.touch(self._contact.touched_at_rest(later))
+        self._reach.touch(self._moved_at_rest)
         count = self._reach.before(placed, load, max(steady, len(ways)))
         with blaming(self._scene.experiment.rule, f"at step {step}"):
             self._run(*self._given(state, ways, count))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.plugin import (
+    Component,
     Components,
     FollowerRule,
     FractureModel,
@@ -321,6 +322,10 @@ class PlanWriter(KernelWriter):
         """As the plan does."""
         return self.plan.each(pattern, axes)
 
+    def vector(self, pattern: str) -> str:
+        """As the plan does."""
+        return self.plan.vector(pattern)
+
     def number(self, value: float) -> str:
         """As the plan does."""
         return self.plan.number(value)
@@ -430,6 +435,8 @@ def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
         found["stress"] = CellStresses(levels[-1].scene).stress
     if levels[-1].scene.barriers:
         found["leave"] = outlines.leave
+    for n, operated in enumerate(levels[-1].scene.operations):
+        found[f"displacement{n}"] = operated.operation.displacement
     return found
 
 
@@ -455,10 +462,13 @@ def blamed(levels: Sequence[Level]) -> Iterator[None]:
             raise
 
 
-def _culprit(levels: Sequence[Level], error: BaseException) -> FollowerRule | FractureModel:
+def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
     """The part whose function an error of the compiler names, else the rule."""
     functions, text = functions_of(levels).items(), str(error)
     named = [name for name, of in functions if f"function {of.__qualname__} " in text]
+    for n, operated in enumerate(levels[-1].scene.operations):
+        if f"displacement{n}" in named:
+            return operated.operation
     if any(not name[-1].isdigit() for name in named):
         return levels[-1].scene.experiment.fracture
     culprit = next((level for level in levels if f"apply{level.number}" in named), levels[-1])
