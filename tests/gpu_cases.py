@@ -4,6 +4,7 @@ its own, as numba asks for (NUMBA_ENABLE_CUDASIM=1)."""
 import os
 
 import numpy as np
+from particle_operations import Drag, Wind
 from property_cases import FRAMES, LATTICES, RULES
 from remembering_parts import Tiring, Weakest
 from turning_frame import Turning
@@ -74,6 +75,13 @@ SHEETS = {
         "neighbours": MANY,
         "rule": Tiring(spread=0.1),
         "fracture": Weakest(spread=0.3, weak=0.7),
+    },
+    "operations of particles": {
+        "operations": [
+            Wind(select={"edge": "top"}),
+            Drag(select={"box": [1.0, 1.0, 4.0, 4.0]}),
+        ],
+        "fracture": TORN | {"thresholds": [1.2]},
     },
     "moves of another": TWICE | {"frame": {"type": "mean"}},
     "single precision": TEARS | {"solver": MOVING | {"precision": "float32"}},

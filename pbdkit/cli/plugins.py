@@ -23,7 +23,7 @@ from pbdkit.cli.commands import own_commands, plugins_with_commands
 from pbdkit.cli.options import json_option
 from pbdkit.errors import ExperimentError
 from pbdkit.io.atomic_file import write_folder
-from pbdkit.plugin import BUILTIN, INTERFACES
+from pbdkit.plugin import BUILTIN, INTERFACES, LISTS
 from pbdkit.plugin.discovery import canonical
 from pbdkit.plugin.registry import Registry
 
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 
 INTERFACE_NAMES = (
-    "FollowerRule", "Lattice", "NeighbourMetric", "FramePolicy", "FractureModel", "Diagnostic",
+    "FollowerRule", "Lattice", "NeighbourMetric", "FramePolicy", "FractureModel",
+    "ParticleOperation", "Diagnostic",
 )  # fmt: skip
 """The open interfaces by name, here so that `--help` imports none of them."""
 
@@ -190,6 +191,7 @@ DEFAULT_PARTS = {
     "rule": "{type: barycentre}",
     "frame": "{type: mean}",
     "fracture": "{type: none}",
+    "operations": "[]",
     "diagnostics": "[{type: displacement}]",
 }
 """The parts of the example experiment, but for the one that the plugin offers."""
@@ -219,8 +221,8 @@ class Project:
 
     def files(self) -> dict[str, str]:
         """The text of each file, by its place in the project's folder."""
-        listed = self.field == "diagnostics"
-        own = f"[{{type: {self.type}}}]" if listed else f"{{type: {self.type}}}"
+        own = f"{{type: {self.type}}}"
+        own = f"[{own}]" if self.field in LISTS else own
         parts = DEFAULT_PARTS | {self.field: own}
         known = {
             **vars(self),

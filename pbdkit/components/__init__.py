@@ -23,7 +23,7 @@ COMPONENTS = {
 
 @hookimpl
 def pbdkit_components() -> list[type[Component]]:
-    """The built-in components of the six interfaces."""
+    """The built-in components of the seven interfaces."""
     return [
         getattr(import_module(f"{__name__}.{module}"), name)
         for module, names in COMPONENTS.items()

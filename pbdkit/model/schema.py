@@ -36,7 +36,7 @@ def experiment_schema(registry: Registry, *, installed: bool = True) -> dict[str
             named["default"] = spellings[0]
         part, choice = top["properties"][field], [dict(names[c, "validation"]) for c in components]
         if field in LISTS:
-            part["items"] = {"oneOf": choice}
+            part["items"] = {"oneOf": choice} if choice else False
         else:
             kept = {k: v for k, v in part.items() if k == "default"}
             choice += [_deprecated(one) for one in RETIRED if one.field == field]

@@ -132,8 +132,8 @@ def remedy(error: BaseException, component: type[Component] | None = None) -> st
 
 
 API = 1
-"""The version of the hook and the six interfaces. A plugin may declare the one that it was written
-for as `pbdkit_api`, in the module or on the object that its entry point names."""
+"""The version of the hook and the interfaces. A plugin may declare the one that it was written for
+as `pbdkit_api`, in the module or on the object that its entry point names."""
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)

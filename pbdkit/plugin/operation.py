@@ -28,8 +28,8 @@ class ParticleOperation(Component):
     ``displacement(u, u, p)`` is u, exactly, and for any other `new` it is not. Equilibria are then
     those of the rule alone; experiments that look for one refuse other operations."""
 
-    select: Selection = Field(
-        description="The particles of the body to which it happens.", examples=[{"edge": "right"}]
+    select: Selection | None = Field(
+        None, description="The particles of the body to which it happens; all where it is left out."
     )
 
     def parameters(self) -> dict[str, float]:

@@ -29,7 +29,9 @@ def build_operations(raster: Raster, experiment: Experiment) -> tuple[Operated, 
     nobody or a frame point."""
     body, found = Selecting(raster, experiment.regions), []
     for n, operation in enumerate(experiment.operations):
-        rows = body.select(operation.select, ("operations", n, "select"))
+        rows = raster.body_rows
+        if operation.select:
+            rows = body.select(operation.select, ("operations", n, "select"))
         with blaming(operation, "when asked for its parameters", "operations", n):
             numbers = operation.parameters()
         parameters = namedtuple("Parameters", numbers)(**numbers)

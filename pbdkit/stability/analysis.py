@@ -161,6 +161,7 @@ class Analysis:
         bonds nor neighbours, contacts nor numbers change."""
         experiment = self.scene.experiment
         changes = self.scene.has_fracture or self.scene.barriers or experiment.courses
+        changes = changes or self.scene.operations
         return experiment.rule.linear and not changes and not experiment.neighbours.nearness()
 
     @cached_property
@@ -187,6 +188,11 @@ class Analysis:
     def left_out(self) -> list[str]:
         """What is not known because it would take too long, and why."""
         found, solver = self.spectra.left_out, self.scene.experiment.stepping
+        if types := dict.fromkeys(f"'{one.operation.type}'" for one in self.scene.operations):
+            found.append(
+                f"operations: the analysis leaves out {', '.join(types)}; eigenvalues, steps and "
+                "lag are those of the rule alone"
+            )
         if not self.estimated:
             return found
         if solver.memory > 0.0 and self.swing(solver.relaxation, solver.memory) is None:

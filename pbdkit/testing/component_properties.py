@@ -50,6 +50,7 @@ from pbdkit.plugin import (
     Lattice,
     NeighbourMetric,
     Offset,
+    ParticleOperation,
     Remembered,
     RenewsBonds,
 )
@@ -390,7 +391,7 @@ def _same(one: Any, other: Any) -> bool:
     return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
 
 
-@asked_of(FollowerRule, FractureModel, FramePolicy, Diagnostic, is_needed=True)
+@asked_of(FollowerRule, FractureModel, FramePolicy, ParticleOperation, Diagnostic, is_needed=True)
 def changes_no_input(subject: Subject) -> None:
     """What it is given it leaves as it is: the arrays belong to the state of the run."""
     for question in subject.questions():
@@ -506,7 +507,7 @@ ROUNDING = 1e-12
 """Some thousand roundings: functions of numpy may differ in the last digit from place to place."""
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def returns_a_value_a_particle(subject: Subject) -> None:
     """Each component of an answer is one value a particle, or one number for all of them; a rule
     contributes as many from every neighbour, and `breaks` says yes or no."""
@@ -554,7 +555,7 @@ def renews_what_it_remembers(subject: Subject) -> None:
                 raise PropertyError(f"{fault} as {number.dtype}: fractions would be lost")
 
 
-@asked_of(FollowerRule, FractureModel)
+@asked_of(FollowerRule, FractureModel, ParticleOperation)
 def keeps_single_precision(subject: Subject) -> None:
     """Numbers of float32 get answers of float32: a run in single precision is one throughout."""
     for question in _elementwise(subject):
@@ -567,7 +568,7 @@ def keeps_single_precision(subject: Subject) -> None:
                 )
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def takes_particles_in_any_order(subject: Subject) -> None:
     """Particles in another order get the same answers in that order, and neighbours summed in the
     opposite order the same move, to rounding: numbering means nothing."""
@@ -626,7 +627,7 @@ def _refuse_an_order_of_slots(scene: Scene) -> None:
             raise PropertyError(f"{fault}: do not sum large numbers that cancel")
 
 
-@asked_of(FollowerRule, FractureModel, is_needed=True)
+@asked_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def is_local(subject: Subject) -> None:
     """A particle that is asked about alone, with plain numbers, gets the answer that it gets among
     the others: only itself and its neighbours count."""
@@ -747,6 +748,26 @@ def breaks_beyond_its_strain(subject: Subject) -> None:
                 where = f"at strain {stretch[wrong][0]:.6g} along {slot.site} the bond"
                 fault = f"{where} {'stays' if expected else 'breaks'}"
                 raise PropertyError(f"`breaking_strain` and `breaks` disagree: {fault}")
+
+
+@asked_of(ParticleOperation)
+def rests_as_declared(subject: Subject) -> None:
+    """Where it declares `rests`, a particle that the rule leaves where it is stays there, exactly,
+    and any other moves: equilibria are then those of the rule alone."""
+    if not subject.component.rests:
+        raise NotAskedError("it does not declare `rests`")
+    (question,) = subject.questions()
+    u, new = question.inputs["u"], question.inputs["new"]
+    if differing(flat(question.ask(u, u)), flat(u)):
+        raise PropertyError(
+            "`displacement` moves a particle that rests: write it as `new` plus what vanishes with "
+            "`new - u`, or leave `rests` out"
+        )
+    stays = np.all([a == b for a, b in zip(question.ask(u, new), u, strict=True)], axis=0)
+    if stays.any():
+        raise PropertyError(
+            "`displacement` holds a particle that the rule moves: leave `rests` out"
+        )
 
 
 @asked_of(FramePolicy)

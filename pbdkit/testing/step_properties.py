@@ -24,6 +24,7 @@ from pbdkit.plugin import (
     Lattice,
     Loadable,
     NeighbourMetric,
+    ParticleOperation,
     TurnsParticles,
 )
 from pbdkit.plugin.rule import material_of
@@ -231,7 +232,7 @@ def _refuse_other_records(scene: Scene, again: Scene) -> None:
         raise PropertyError(f"`{name}` of a run gone on with after step {STEPS - 1} is another one")
 
 
-@asked_of(*STEPPED)
+@asked_of(*STEPPED, ParticleOperation)
 def is_the_same_compiled(subject: Subject) -> None:
     """The compiled engine gives the numbers of the numpy engine, to the last bit; what does not
     compile is stepped by numpy, and says so."""

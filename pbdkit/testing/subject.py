@@ -24,6 +24,7 @@ from pbdkit.errors import ExperimentError, PluginError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     INTERFACES,
+    LISTS,
     CellStress,
     Component,
     Components,
@@ -37,6 +38,7 @@ from pbdkit.plugin import (
     Lattice,
     Loadable,
     NeighbourMetric,
+    ParticleOperation,
     RenewsBonds,
     RenewsParticles,
     Softens,
@@ -242,6 +244,19 @@ def _to_diagnostic(diagnostic: Diagnostic, scene: Scene, seed: int) -> list[Ques
 
 
 @questions_of.register
+def _to_operation(operation: ParticleOperation, scene: Scene, seed: int) -> list[Question]:
+    """`displacement`."""
+    operated = scene.operations[0]
+
+    def displaced(u: Any, new: Any) -> Any:
+        found = operation.displacement(u, new, operated.parameters)
+        return as_vector(found, "displacement", u)
+
+    inputs = {"u": here(scene, seed)["u"], "new": here(scene, seed + 1)["u"]}
+    return [Question("displacement", inputs, displaced, elementwise=True)]
+
+
+@questions_of.register
 def _to_lattice(lattice: Lattice, _: Scene, __: int) -> list[Question]:
     return [Question("cell", {}, lattice.cell)]
 
@@ -315,7 +330,7 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
         "rule": _rules(component),
         "frame": _frames(component),
     }
-    given[field] = [component] if field == "diagnostics" else component
+    given[field] = [component] if field in LISTS else component
     for name in choices.keys() & given.keys():
         part = given[name]
         choices[name] = list(part) if isinstance(part, (list, tuple)) else [part]

@@ -58,7 +58,11 @@ def test_the_project_runs_as_it_stands(new: New, call: Call, interface: str) -> 
     assert listed(call)["pbdkit-brand-new"]["state"] == "ok"
     result = call("run", str(folder / "example.yaml"), "--json")
     assert (result.code, result.err, json.loads(result.out)["status"]) == (0, "", "complete")
-    assert json.loads(call("check", str(folder / "example.yaml"), "--json").out)["warnings"] == []
+    warnings = json.loads(call("check", str(folder / "example.yaml"), "--json").out)["warnings"]
+    left_out = ["the analysis leaves out 'brand-new'"] * (interface == "ParticleOperation")
+    assert [part in warning for part, warning in zip(left_out, warnings, strict=True)] == [
+        True
+    ] * len(left_out)
     tests = runpy.run_path(str(folder / "tests" / "test_example.py"))
     tests["test_the_example_runs_with_this_plugin"]()
 

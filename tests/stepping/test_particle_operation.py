@@ -1,18 +1,22 @@
 """Operations that components bring along are stepped by every engine as the built-in ones are."""
 
+import json
+from itertools import count
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
+import particle_operations
 import pytest
 from interpreted_kernels import interpreting
+from particle_operations import Drag, Wind
 from property_cases import HOLD_LEFT, pull_right
 from thread_ranks import on_ranks
 
 import pbdkit
-from pbdkit.plugin import ParticleOperation, Vector
-from pbdkit.restart import resumption
+from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Run, record
 from pbdkit.stepping.engine_choice import what_gpus_lack
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from pbdkit.stepping.numba_engine.time_skewing import single_steps
@@ -21,31 +25,8 @@ from pbdkit.stepping.state import initial_state
 from tests.mpi.test_run import assert_same, written
 from tests.stepping.numba_engine.test_engine import TORN, assert_bitwise_equal, sheet
 from tests.stepping.numba_engine.test_time_skewing import small_passes
-
-
-class Drag(ParticleOperation):
-    """Particles keep a share of their old place."""
-
-    type: Literal["drag"] = "drag"
-    factor: float = 0.25
-
-    rests: ClassVar[bool] = True
-
-    @staticmethod
-    def displacement(u, new, p):
-        return new - p.factor * (new - u)
-
-
-class Wind(ParticleOperation):
-    """Particles go on by so much in every step."""
-
-    type: Literal["wind"] = "wind"
-    speed: float = 0.01
-
-    @staticmethod
-    def displacement(u, new, p):
-        return Vector(new.x + p.speed, new.y)
-
+from tests.test_restart import assert_same as assert_same_file
+from tests.test_restart import run_in_parts
 
 MIDDLE = {"box": [2.5, 1.5, 6.5, 5.5]}
 CASES = {
@@ -111,3 +92,73 @@ def test_ranks_share_it(tmp_path):
     written(parts, tmp_path / "one.nc")
     on_ranks(3, lambda ranks: written(parts, tmp_path / "three.nc", ranks))
     assert_same(tmp_path / "one.nc", tmp_path / "three.nc")
+
+
+def test_a_run_in_parts_is_the_whole_run(install, tensile, tmp_path):
+    install("pbdkit-drag", Path(particle_operations.__file__).read_text())
+    where = {"select": {"box": [1.0, 0.0, 2.0, 2.0]}}
+    given = tensile | {"operations": [{"type": "drag", "factor": 0.3} | where]}
+    whole, parts = tmp_path / "whole.nc", tmp_path / "parts.nc"
+    scene = build_scene(pbdkit.Experiment(**given))
+    assert [len(operated.place) for operated in scene.operations] == [6]
+    record(Run(scene), NetcdfSink(whole))
+    assert run_in_parts(given, parts, count(2)) > 0
+    assert_same_file(whole, parts)
+
+
+def test_an_equilibrium_stays_where_it_is():
+    dragged = CASES["drag on all, torn"]["operations"]
+    at_rest = {"solver": {"type": "equilibrium", "tolerance": 1e-9}}
+    alone, with_drag = (
+        pbdkit.run(pbdkit.Experiment(**sheet(**at_rest, **parts)))
+        for parts in ({}, {"operations": dragged})
+    )
+    np.testing.assert_array_equal(alone.position, with_drag.position)
+    settle = {"solver": {"type": "stepping", "settle": {"tolerance": 1e-6}}, "steps": 5000}
+    stepped = pbdkit.run(pbdkit.Experiment(**sheet(**settle, operations=dragged)))
+    np.testing.assert_allclose(stepped.position[-1], alone.position[-1], atol=1e-5)
+    assert 10 < stepped.time[-1] < 5000
+
+
+@pytest.mark.parametrize("solver", [{"type": "equilibrium"}, {"type": "stepping", "settle": {}}])
+def test_what_may_move_at_rest_has_no_equilibrium(solver):
+    with pytest.raises(pbdkit.ExperimentError, match="solver: 'wind' may move particles"):
+        pbdkit.Experiment(**sheet(operations=[Wind(select={"edge": "top"})], solver=solver))
+
+
+def test_the_analysis_leaves_it_out_and_says_so():
+    experiment = pbdkit.Experiment(**sheet(**CASES["drag"]))
+    analysis = pbdkit.analyse(experiment)
+    assert not analysis.exact
+    assert any("'drag'" in line for line in analysis.warnings())
+    assert analysis.spectral_radius == pbdkit.analyse(pbdkit.Experiment(**sheet())).spectral_radius
+
+
+def test_it_selects_somebody():
+    nobody = Drag(select={"box": [90.0, 90.0, 91.0, 91.0]})
+    with pytest.raises(pbdkit.ExperimentError, match=r"operations.0.select: selects no particle"):
+        scene_of(operations=[nobody])
+
+
+def test_it_returns_a_vector():
+    class Odd(Drag):
+        type: Literal["odd"] = "odd"
+
+        @staticmethod
+        def displacement(u, new, p):
+            return 0.0
+
+    scene = scene_of(operations=[Odd(select=MIDDLE)])
+    with pytest.raises(pbdkit.PluginError, match="`displacement` returned"):
+        Stepper(scene).advance(initial_state(scene))
+
+
+def test_a_file_names_it_and_is_written_as_it_was(tmp_path):
+    (tmp_path / "e.json").write_text(
+        json.dumps(sheet(operations=[{"type": "drag", "select": {"edge": "top"}, "factor": 0.5}]))
+    )
+    experiment = pbdkit.load(tmp_path / "e.json", components=[Drag])
+    assert experiment.operations == (Drag(select={"edge": "top"}, factor=0.5),)
+    written_ = experiment.model_dump(mode="json", by_alias=True)["operations"]
+    assert written_ == [{"type": "drag", "select": {"edge": "top"}, "factor": 0.5}]
+    assert "operations" not in pbdkit.Experiment(**sheet()).model_dump(mode="json")

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from typing import Literal
 
 import pytest
-from faulty import directions, others, remembering, rules
+from faulty import directions, operations, others, remembering, rules
 from faulty.kagome import Kagome, OnKagome
 from interpreted_kernels import interpreting
 from pydantic import Field
@@ -108,6 +108,8 @@ FAULTS = [
     (others.Approximate, "takes-offsets-of-the-cell", "is none of the cell's"),
     (others.Favours, "takes-sublattices-in-any-order", "where the sites are listed backwards"),
     (others.Contradicts, "finds-the-same-anew", "`nearness` finds other neighbours"),
+    (operations.Kicks, "rests-as-declared", "moves a particle that rests"),
+    (operations.Pins, "rests-as-declared", "holds a particle that the rule moves"),
     (others.Alternates, "takes-every-point-alone", "follows somebody else where fewer points"),
     (others.SaysItIsLocal, "follows-who-is-near", "leave out `local`"),
     (others.Shrinks, "follows-translations", "let the weights of each point sum to 1"),

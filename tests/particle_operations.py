@@ -1,0 +1,35 @@
+"""Operations of particles, for tests: as a distribution offers them, and handed over as classes."""
+
+from typing import ClassVar, Literal
+
+import pbdkit
+from pbdkit.plugin import ParticleOperation, Vector
+
+
+class Drag(ParticleOperation):
+    """Particles keep a share of their old place."""
+
+    type: Literal["drag"] = "drag"
+    factor: float = 0.25
+
+    rests: ClassVar[bool] = True
+
+    @staticmethod
+    def displacement(u, new, p):
+        return new - p.factor * (new - u)
+
+
+class Wind(ParticleOperation):
+    """Particles go on by so much in every step."""
+
+    type: Literal["wind"] = "wind"
+    speed: float = 0.01
+
+    @staticmethod
+    def displacement(u, new, p):
+        return Vector(new.x + p.speed, new.y)
+
+
+@pbdkit.hookimpl
+def pbdkit_components():
+    return [Drag, Wind]
