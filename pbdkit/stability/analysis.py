@@ -160,8 +160,8 @@ class Analysis:
         """Whether the numbers hold for the whole run: the rule declares itself linear, and neither
         bonds nor neighbours, contacts nor numbers change."""
         experiment = self.scene.experiment
-        changes = self.scene.has_fracture or self.scene.barriers or experiment.courses
-        changes = changes or self.scene.operations
+        scene = self.scene
+        changes = scene.has_fracture or scene.barriers or scene.operations or experiment.courses
         return experiment.rule.linear and not changes and not experiment.neighbours.nearness()
 
     @cached_property

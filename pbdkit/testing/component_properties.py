@@ -765,9 +765,8 @@ def rests_as_declared(subject: Subject) -> None:
         )
     stays = np.all([a == b for a, b in zip(question.ask(u, new), u, strict=True)], axis=0)
     if stays.any():
-        raise PropertyError(
-            "`displacement` holds a particle that the rule moves: leave `rests` out"
-        )
+        told = "`displacement` holds a particle that the rule moves: leave `rests` out"
+        raise PropertyError(told)
 
 
 @asked_of(FramePolicy)
