@@ -234,9 +234,9 @@ class DistributedSteppingDriver(SteppingDriver):
         super().load_state_dict(self._division.scattered(parts))
 
 
-def refuse_steps(ranks: Ranks, scene: Scene) -> None:
+def refuse_steps(ranks: MPICommunicator, scene: Scene) -> None:
     """Raises NotSharedError in all processes for an operation that any of them cannot divide."""
-    found = [one for one in ranks.every(hindrance(scene, Mode.RANKS)) if one]
+    found = [one for one in ranks.allgather(hindrance(scene, Mode.RANKS)) if one]
     refuse(scene, [(True, (one.field,), one.reason) for one in found])
 
 
