@@ -1,11 +1,7 @@
-"""Pictures of a dataset's configurations: kinds, or a variable as dots, bonds or a field; and of an
-experiment before it runs.
+"""Pictures of configurations: one or several steps of a run, two runs, an experiment's set-up.
 
-Two datasets side by side on one scale, or what the second has more than the first.
-
-Dots, lines or pixels: what is legible where particles lie so far apart on the page.
-
-A figure of a body at several steps, or of several bodies, with one scale and one legend.
+Particles are drawn as dots, bonds as lines, a variable as a field of pixels, by what is legible at
+the distance of particles on the page.
 """
 
 from __future__ import annotations
@@ -44,7 +40,7 @@ from pbdkit.plotting.layers import (
     draw_numbers,
     draw_outline,
 )
-from pbdkit.plotting.layout import Legend, Page, Panels, ScaleBar, dress_bar, legend_handles
+from pbdkit.plotting.layout import Page, Panels, legend_handles, style_bar
 from pbdkit.plotting.style import Look, figure_of, label
 
 if TYPE_CHECKING:
@@ -410,10 +406,10 @@ class Sheet:
         self.axes = self._page.axes if self._page else list(axes or [])
         self._larger = 1.0
         if self._page:
-            self._page.arrange(None, None)
+            self._page.arrange()
             if look.numbers:
                 self._larger = min(max(1.0, NUMBERED_PT / self._apart()), LARGEST)
-                self._page.arrange(None, None, self._larger)
+                self._page.arrange(larger=self._larger)
         else:
             self._dress(panels)
         self._manner = manner_of(self._body, self._quantity, look, self._apart())
@@ -484,18 +480,15 @@ class Sheet:
         of_kinds = self._manner.dots == "kinds"
         palette = OF_KINDS if of_kinds else self._palette
         if page:
-            bar = ScaleBar(page.figure, scale, text) if scale else None
             present = set(self._extent.kinds if of_kinds else self._extent.classes)
-            handles = legend_handles(palette, present) if palette else []
-            legend = Legend(page.figure, handles) if palette else None
-            page.arrange(bar, legend, self._larger)
+            handles = legend_handles(palette, present) if palette else None
+            page.arrange(scale, text, handles, self._larger)
             return
         if scale:
             bar_of = self.figure.colorbar(
                 ScalarMappable(scale.norm, scale.colours), ax=self.axes, extend=scale.extend
             )
-            length = bar_of.ax.get_window_extent().height / self.figure.dpi
-            dress_bar(bar_of, scale, length)
+            style_bar(bar_of, scale)
             bar_of.set_label(text)
         if palette:
             self._add_legend(palette)

@@ -1,14 +1,7 @@
-"""Force and displacement of what drives a body: a leader group, a load or an obstacle.
+"""Curves and histories: one number over another or over the steps, a line for each run.
 
-A panel of lines: its axes and labels, the colours of the lines, and who is who.
-
-A line for each member of a sweep; one for a single run.
-
-Curves of a run: force over displacement, stress over strain, energies, one number over another.
-
-Of a sweep there is a line a member.
-
-Histories: what becomes of single particles and bonds, step by step.
+Curves are force over displacement, stress over strain and energies; histories those of single
+particles and bonds. A dataset of a sweep has a line for each member.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Fields over the cells of a body as pixels, for however many cells, with numpy alone.
-
-What lies over one another in a panel; each layer shows a step, and then another.
-"""
+"""Layers of a panel: fields as pixels, classes, dots and bonds, each of which shows a step."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
-"""What says which colour means what: a bar beside or below the panels, and a legend.
+"""Figures with panels of one body, as large as the texts around them leave room for.
 
-How many panels stand beside one another, and how large they are: numbers alone.
-
-A figure with panels of one body, as large as what stands around them leaves room for.
-
-The shape of a body decides that of its panels, from 200 by 6 to 6 by 200. Texts are measured, and
-the figure is made around them: nothing is clipped, nothing lies over anything else.
+The panels have the shape of the body, from 200 by 6 particles to 6 by 200. The figure is made
+around what is drawn: nothing is clipped, and nothing lies over anything else.
 """
 
 from __future__ import annotations
@@ -19,8 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, Locator, MaxNLocator
+from matplotlib.transforms import Bbox
 
 from pbdkit.errors import ExperimentError
 from pbdkit.plotting.colours import Palette, Scale
@@ -28,152 +24,48 @@ from pbdkit.plotting.layers import INK
 from pbdkit.plotting.style import new_figure, renderer_of
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.colorbar import Colorbar
-    from matplotlib.figure import Figure
+    from collections.abc import Iterable
+
+    from matplotlib.legend import Legend
+    from matplotlib.text import Text
+
+PAGE_WIDTH_IN = 7.2
+"""Width of a page."""
+PAGE_HEIGHT_IN = 8.0
+"""Height of a page."""
+SHORT_PAGE_HEIGHT_IN = 5.6
+"""Height of a page with 2 to `SHORT_PAGE_PANELS` panels."""
+SHORT_PAGE_PANELS = 6
+PANEL_AREA_IN2 = 20.0
+"""Maximum area of one panel."""
+SMALLEST_PANEL_IN = 0.05
+SHORT_AXIS_IN = 0.4
+"""Axes shorter than this have one tick."""
+GAP_IN, TITLE_IN, EDGE_IN = 0.1, 0.26, 0.08
+"""Space between panels, for the title above each, and at the edge of the page."""
+BAR_LENGTH_IN, BAR_WIDTH_IN = 3.4, 0.14
+"""Maximum length and width of a colour bar."""
+SIDE_BAR_HEIGHT_IN = 1.3
+"""Panels that are less tall have their colour bar below them."""
+LABEL_LINES = 3
+"""Maximum number of lines of the label of a colour bar beside the panels."""
+CHARACTERS_PER_IN = 14.5
+"""Characters of a line of text in `TEXT_PT`, about."""
+HEADING_PT, TEXT_PT, TICK_PT = 10.0, 9.0, 8.0
 
 
-THICK_IN, LONGEST_IN, SHORTEST_IN, LINES = 0.14, 3.4, 1.3, 3
-SHORTER_IN = 0.12
-"""A bar is so much shorter than the panels, for its lowest and highest number."""
-TEXT_PT, SMALL_PT = 9.0, 8.0
-
-
-def inches(figure: Figure, artist: Artist) -> tuple[float, float]:
-    """How wide and tall something is, with all that belongs to it."""
-    box = artist.get_tightbbox(renderer_of(figure))
-    return (box.width / figure.dpi, box.height / figure.dpi) if box else (0.0, 0.0)
-
-
-def dress_bar(bar: Colorbar, scale: Scale, length: float) -> None:
-    """Round numbers at a bar of so many inches, without the power of ten that its label has."""
-    upright = bar.orientation == "vertical"
+def style_bar(bar: Any, scale: Scale) -> None:
+    """Label the ticks of a colour bar without the power of ten that is in its label."""
     ten = 10.0**scale.exponent
-    many = max(2, int(length / (0.32 if upright else 0.6)))
-    locator = MaxNLocator(many, steps=[1, 2, 2.5, 5, 10])
-    ticks = np.asarray(locator.tick_values(scale.low, scale.high))
-    slack = 1e-6 * (scale.high - scale.low)
-    ticks = ticks[(ticks >= scale.low - slack) & (ticks <= scale.high + slack)]
-    digits = max(0, 2 - math.floor(math.log10(np.ptp(ticks) / ten))) if len(ticks) > 1 else 6
-    bar.set_ticks(ticks.tolist(), labels=[_number(t / ten, digits) for t in ticks])
-    bar.ax.minorticks_off()
-    bar.ax.tick_params(labelsize=SMALL_PT)
+    bar.formatter = lambda value, _: f"{value / ten + 0.0:.6g}".replace("-", "−")
+    bar.update_ticks()
+    bar.minorticks_off()
+    bar.ax.tick_params(labelsize=TICK_PT)
     bar.outline.set_linewidth(0.5)
 
 
-def _number(value: float, digits: int) -> str:
-    """As matplotlib writes it, with a sign as broad as a plus."""
-    return f"{round(value, digits) + 0.0:g}".replace("-", "−")
-
-
-class ScaleBar:
-    """The bar of a scale. It stands beside panels that are tall enough for what it says, else below
-    them."""
-
-    def __init__(self, figure: Figure, scale: Scale, text: str) -> None:
-        self._figure, self._scale, self._text = figure, scale, text
-        self._ax = figure.add_axes((0.1, 0.1, 0.1, 0.1))
-        self.beside, self.size, self._length = True, (0.0, 0.0), 0.0
-
-    def fit(self, width: float, height: float) -> None:
-        """Chooses where it stands at panels of that size in all, and measures `size`."""
-        upright = self._wrapped(min(height, LONGEST_IN))
-        self.beside = height >= SHORTEST_IN and upright is not None
-        if self.beside:
-            self._length, text = min(height - SHORTER_IN, LONGEST_IN), upright
-        else:
-            self._length = min(max(width, SHORTEST_IN), LONGEST_IN)
-            text = self._wrapped(max(width, self._length)) or self._text
-        self._ax.remove()
-        thick, page = THICK_IN, self._figure.get_size_inches()
-        box = (thick, self._length) if self.beside else (self._length, thick)
-        self._ax = self._figure.add_axes((0.0, 0.0, box[0] / page[0], box[1] / page[1]))
-        colours = ScalarMappable(self._scale.norm, self._scale.colours)
-        across = "vertical" if self.beside else "horizontal"
-        more: dict[str, Any] = {"extend": self._scale.extend, "extendfrac": 0.04}
-        bar = self._figure.colorbar(colours, cax=self._ax, orientation=across, **more)
-        dress_bar(bar, self._scale, self._length)
-        bar.set_label(text or "", fontsize=TEXT_PT)
-        self.size = inches(self._figure, self._ax)
-
-    def _wrapped(self, length: float) -> str | None:
-        """What it says, in as few lines of that length as do; None where none do."""
-        for lines in range(1, LINES + 1):
-            for broad in range(math.ceil(len(self._text) / lines), len(self._text) + 1):
-                said = textwrap.wrap(self._text, max(1, broad), break_long_words=False)
-                if len(said) > lines:
-                    continue
-                if max(text_inches(self._figure, line, TEXT_PT)[0] for line in said) <= length:
-                    return "\n".join(said)
-                break
-        return None
-
-    def put(self, left: float, bottom: float, room: float) -> None:
-        """There, in inches from the lower left corner of the whole; along it in the middle of
-        that `room`."""
-        page, renderer = self._figure.get_size_inches(), renderer_of(self._figure)
-        width, height = (THICK_IN, self._length) if self.beside else (self._length, THICK_IN)
-        self._ax.set_position((left / page[0], bottom / page[1], width / page[0], height / page[1]))
-        box = self._ax.get_tightbbox(renderer)
-        assert box is not None
-        dpi = self._figure.dpi
-        if self.beside:
-            move = (left - box.x0 / dpi, 0.5 * (room - self._length))
-        else:
-            move = (0.5 * (room - width), bottom - box.y0 / dpi)
-        place = (left + move[0]) / page[0], (bottom + move[1]) / page[1]
-        self._ax.set_position((*place, width / page[0], height / page[1]))
-
-
-class Legend:
-    """Names and colours, below the panels."""
-
-    def __init__(self, figure: Figure, handles: list[Line2D]) -> None:
-        self._figure, self._handles = figure, handles
-        self.beside = False
-        self.size = (0.0, 0.0)
-        self._legend: Any = None
-
-    def fit(self, width: float) -> None:
-        """In as many columns as there is room for, one at least."""
-        for columns in range(len(self._handles), 0, -1):
-            if self._legend is not None:
-                self._legend.remove()
-            self._legend = self._figure.legend(
-                handles=self._handles, ncols=columns, loc="lower left", frameon=False,
-                handletextpad=0.1, columnspacing=1.2, borderpad=0.1, borderaxespad=0.0,
-                fontsize=TEXT_PT,
-            )  # fmt: skip
-            self.size = inches(self._figure, self._legend)
-            if self.size[0] <= width:
-                break
-
-    def put(self, left: float, bottom: float) -> None:
-        """There, in inches from the lower left corner of the whole."""
-        page = self._figure.get_size_inches()
-        self._legend.set_bbox_to_anchor((left / page[0], bottom / page[1]))
-
-
-def text_inches(figure: Figure, text: str, points: float) -> tuple[float, float]:
-    """How wide and tall a line of text is."""
-    probe = Text(0, 0, text, fontsize=points)
-    probe.set_figure(figure)
-    box = probe.get_window_extent(renderer_of(figure))
-    return box.width / figure.dpi, box.height / figure.dpi
-
-
-def shortened(figure: Figure, text: str, points: float, width: float) -> str:
-    """A line of text, with its end left out where it is longer than that."""
-    kept = text
-    while kept and text_inches(figure, kept, points)[0] > width:
-        kept = kept[: -max(2, len(kept) // 20)].rstrip("\\") + "…"
-        if len(kept) <= 2:
-            break
-    return kept
-
-
 def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
-    """A dot with its name for each class that is there."""
+    """Return a dot with its name for each class that is present."""
     return [
         handle(name, colour)
         for number, (name, colour) in reversed(palette.colours.items())
@@ -182,14 +74,14 @@ def legend_handles(palette: Palette, present: set[int]) -> list[Line2D]:
 
 
 def handle(name: str, colour: str) -> Line2D:
-    """A dot with a name."""
+    """Return a dot with a name."""
     return Line2D([], [], ls="", marker="o", ms=5, mfc=colour, mec=INK, mew=0.5, label=name)
 
 
 @dataclass(frozen=True)
 class Panels:
-    """What the panels show: `box` (left, right, bottom, top) of each, the longest title of each,
-    the heading of all, and what both axes are."""
+    """The limits (left, right, bottom, top) of all panels, the longest title of each, the heading
+    of the figure, and the labels of both axes."""
 
     box: tuple[float, float, float, float]
     titles: list[str]
@@ -198,15 +90,14 @@ class Panels:
 
     @property
     def shape(self) -> float:
-        """How often as wide as tall."""
+        """Width over height."""
         left, right, bottom, top = self.box
         return (right - left) / (top - bottom)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How panels stand: `columns` and `rows`, the size of each and from each to the next, inches,
-    and the size of all with what stands around them."""
+class Grid:
+    """Rows of panels: the size of each, and the distance from each to the next, in inches."""
 
     columns: int
     rows: int
@@ -214,254 +105,205 @@ class Plan:
     height: float
     pitch: tuple[float, float]
 
-    def goodness(self, panels: int) -> float:
-        """Large panels, and few places without one."""
-        filled = panels / (self.columns * self.rows)
-        return math.copysign(abs(self.width) * filled**0.7, self.width)
-
     @property
-    def block(self) -> tuple[float, float]:
-        """The size of all panels together."""
+    def size(self) -> tuple[float, float]:
+        """Width and height of all panels together."""
         across = (self.columns - 1) * self.pitch[0] + self.width
         return across, (self.rows - 1) * self.pitch[1] + self.height
 
 
-@dataclass(frozen=True)
-class Room:
-    """What there is for panels, inches: `free` across and up, the `gap` between two either way, the
-    least from one to the next, and the largest `area` of one."""
-
-    free: tuple[float, float]
-    gap: tuple[float, float]
-    least: float
-    area: float
-
-
-def best_plan(panels: int, shape: float, room: Room) -> Plan:
-    """Of so many panels, each so many times as wide as tall."""
-    found = [_plan(panels, columns, shape, room) for columns in range(1, panels + 1)]
-    fitting = [plan for plan in found if plan.block[0] <= room.free[0] + 1e-6]
-    return max(fitting or found[:1], key=lambda plan: plan.goodness(panels))
-
-
-def _plan(panels: int, columns: int, shape: float, room: Room) -> Plan:
-    rows = math.ceil(panels / columns)
-    width = (room.free[0] - (columns - 1) * room.gap[0]) / columns
-    height = (room.free[1] - (rows - 1) * room.gap[1]) / rows
-    width = min(width, height * shape, math.sqrt(room.area * shape))
-    pitch = (max(width + room.gap[0], room.least), width / shape + room.gap[1])
-    return Plan(columns, rows, width, width / shape, pitch)
-
-
-PAGE_IN, TALLEST_IN, AREA_IN2 = 7.2, 8.0, 20.0
-"""The width and height of a page, and the area of one panel at most."""
-SEVERAL_IN, SEVERAL = 5.6, 6
-"""The height of a page of no more than so many panels."""
-GAP_IN, MARGIN_IN, SMALLEST_IN = 0.1, 0.08, 0.05
-HEAD_PT, PAGE_TEXT_PT, PAGE_SMALL_PT = 10.0, 9.0, 8.0
-LABEL_IN = 0.2
-GUESS = (0.5, 0.45, 0.1)
-
-
 class Page:
-    """A new figure with its axes, in rows, to be arranged when its keys are known.
+    """A new figure with its axes, arranged again when its colour bar and legend are known.
 
-    `size`, in inches, is that of the whole; without it, the whole is as large as is needed.
-    `alone` is that of `new_figure`.
+    `size` is that of the figure in inches; without it the figure is as large as it needs to be. A
+    figure that is `alone` is not one of pyplot.
     """
 
     def __init__(
-        self, shown: Panels, dpi: float, size: tuple[float, float] | None, *, alone: bool
+        self, panels: Panels, dpi: float, size: tuple[float, float] | None, *, alone: bool
     ) -> None:
-        self.figure, self._shown, self._size = new_figure(alone=alone, dpi=dpi), shown, size
-        self._one = len(shown.titles) == 1
-        self.axes = [self._panel(title) for title in shown.titles]
-        self._labels = [self._text(shown.labels[0]), self._text(shown.labels[1], rotation=90)]
-        self._heading = self._text("" if self._one else shown.heading, fontsize=HEAD_PT)
-        self._left, self._bottom, self._over = GUESS
-        self._under = self._beside = 0.0
-        self._bar: ScaleBar | None = None
-        self._legend: Legend | None = None
+        self.figure = new_figure(alone=alone, dpi=dpi)
+        self._panels, self._size, self._single = panels, size, len(panels.titles) == 1
+        self.axes = [self._panel(title) for title in panels.titles]
+        self._labels = [self.figure.text(0, 0, text, fontsize=TEXT_PT) for text in panels.labels]
+        self._heading = self.figure.text(0, 0, "", fontsize=HEADING_PT, ha="center", va="bottom")
+        self._before, self._after = np.array((0.6, 0.5)), np.array((0.1, 0.4))
+        """Space between the panels and the edges of the figure: left and below; right and above."""
+        self._around, self._overhang = self._before + self._after, 0.1
+        """Inches that are taken around the panels of a page; what tick labels reach beyond one."""
+        self._grid = self._best_grid(1.0)
 
     def _panel(self, title: str) -> Axes:
         ax = self.figure.add_axes((0, 0, 1, 1), label=f"panel {len(self.figure.axes)}")
-        left, right, bottom, top = self._shown.box
+        left, right, bottom, top = self._panels.box
         ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-        ax.set_title(title, fontsize=HEAD_PT if self._one else PAGE_TEXT_PT, pad=4)
-        ax.tick_params(labelsize=PAGE_SMALL_PT if self._one else PAGE_SMALL_PT - 1, length=3, pad=2)
+        ax.set_title(title, fontsize=HEADING_PT if self._single else TEXT_PT, pad=4)
+        ax.tick_params(labelsize=TICK_PT - (not self._single), length=3, pad=2)
         return ax
 
-    def _text(self, text: str, **more: Any) -> Text:
-        style: dict[str, Any] = {"fontsize": PAGE_TEXT_PT, "ha": "center", "va": "center"} | more
-        return self.figure.text(0, 0, text, **style)
+    def arrange(
+        self,
+        scale: Scale | None = None,
+        text: str = "",
+        handles: list[Line2D] | None = None,
+        larger: float = 1.0,
+    ) -> None:
+        """Put everything in its place, with the colour bar of a scale and a legend.
 
-    def arrange(self, bar: ScaleBar | None, legend: Legend | None, larger: float = 1.0) -> Plan:
-        """Puts everything in its place, on a page so many times `larger` than that of a journal,
-        and returns where the panels stand. Raises ExperimentError where a given size leaves nothing
-        of the panels."""
-        self._bar, self._legend = bar, legend
-        for _ in range(3):  # what stands around panels depends on their size, and that on it
-            plan = self._plan(larger)
-            self._keys(plan)
-            self._put(plan)
-            self._measure(plan)
-        plan = self._plan(larger)
-        self._put(plan)
-        return plan
+        A figure without a given size is at most `larger` times as large as the page of a journal.
+        Raises ExperimentError where a given size leaves no room for the panels.
+        """
+        bar = self._bar(scale, text) if scale else None
+        legend = self._legend(handles) if handles else None
+        for _ in range(3):  # the space around the panels depends on their size, which depends on it
+            self._grid = self._best_grid(larger)
+            self._place_panels()
+            self._place_keys(bar, legend)
+            self._measure()
+        self._grid = self._best_grid(larger)
+        self._place_panels()
+        self._place_keys(bar, legend)
 
-    def _plan(self, larger: float) -> Plan:
-        """The arrangement with the largest panels."""
-        count = len(self._shown.titles)
-        tall = TALLEST_IN if count == 1 or count > SEVERAL else SEVERAL_IN
-        page = self._size or (PAGE_IN * larger, tall * larger)
-        around = self._around()
-        room = Room(
-            (page[0] - around[0], page[1] - around[1]),
-            (GAP_IN + 2 * self._over, GAP_IN + self._top),
-            0.0 if self._one else self._widest_title() + GAP_IN,
-            math.inf if self._size else AREA_IN2 * larger**2,
-        )
-        plan = best_plan(count, self._shown.shape, room)
-        if min(plan.width, plan.height) < SMALLEST_IN:
+    def _best_grid(self, larger: float) -> Grid:
+        """Return the grid with the largest panels and few places left empty."""
+        count, shape = len(self.axes), self._panels.shape
+        tall = SHORT_PAGE_HEIGHT_IN if 1 < count <= SHORT_PAGE_PANELS else PAGE_HEIGHT_IN
+        page = self._size or (PAGE_WIDTH_IN * larger, tall * larger)
+        wide, high = np.array(page) - self._around
+        area = math.inf if self._size else PANEL_AREA_IN2 * larger**2
+        title = 0.0 if self._single else max(map(len, self._panels.titles)) / CHARACTERS_PER_IN
+        gap, grids = GAP_IN + 2 * self._overhang, []
+        for columns in range(1, count + 1):
+            rows = math.ceil(count / columns)
+            width = min(
+                (wide - (columns - 1) * gap) / columns,
+                (high - (rows - 1) * (GAP_IN + TITLE_IN)) / rows * shape,
+                math.sqrt(area * shape),
+            )
+            pitch = max(width + gap, title + GAP_IN), width / shape + GAP_IN + TITLE_IN
+            grids.append(Grid(columns, rows, width, width / shape, pitch))
+        fitting = [grid for grid in grids if grid.size[0] <= wide + 1e-6] or grids[:1]
+        best = max(fitting, key=lambda g: g.width * (count / (g.columns * g.rows)) ** 0.7)
+        if min(best.width, best.height) < SMALLEST_PANEL_IN:
             raise ExperimentError(
                 f"figsize: {page[0]:g} by {page[1]:g} inches leave no room for {count} panels "
                 "beside what is written there; give a larger size, or fewer times"
             )
-        return plan
+        return best
 
-    @property
-    def _top(self) -> float:
-        """The height of a title with its distance."""
-        points = HEAD_PT if self._one else PAGE_TEXT_PT
-        return text_inches(self.figure, "Step 1y", points)[1] + 6 / 72
-
-    def _around(self) -> tuple[float, float]:
-        """What is taken by all that stands around the panels."""
-        heading = 0.0 if self._one else HEAD_PT / 72 * 1.6
-        wide = 2 * MARGIN_IN + self._left + self._over + self._beside
-        return wide, 2 * MARGIN_IN + self._bottom + self._under + self._top + heading
-
-    def _keys(self, plan: Plan) -> None:
-        """Where bar and legend stand, and what they take."""
-        width, height = plan.block
-        self._under = self._beside = 0.0
-        room = width + self._left + self._over if self._size is None else self._size[0]
-        if self._bar:
-            self._bar.fit(max(width, room - 2 * MARGIN_IN), height)
-            if self._bar.beside:
-                self._beside = self._bar.size[0] + GAP_IN
-            else:
-                self._under += self._bar.size[1] + GAP_IN
-        if self._legend:
-            self._legend.fit(room - 2 * MARGIN_IN)
-            self._under += self._legend.size[1] + 0.5 * GAP_IN
-
-    def _put(self, plan: Plan) -> None:
-        """The size of the figure, and the places of everything."""
-        (width, height), around, size = plan.block, self._around(), self._size
-        left, right = self._sides(plan)
-        whole = size or (left + width + right, height + around[1])
-        self.figure.set_size_inches(*whole)
-        if size:
-            left += max(0.0, whole[0] - left - width - right) / 2
-        low = MARGIN_IN + max(0.0, whole[1] - height - around[1]) / 2
-        bottom = low + self._bottom + self._under
+    def _place_panels(self) -> None:
+        """Set the size of the figure, and place panels, heading and labels of the axes."""
+        grid, (width, height) = self._grid, self._grid.size
+        least = self._before + self._after + (width, height)
+        page = np.array(self._size or least)
+        self.figure.set_size_inches(*page)
+        left, bottom = self._before + np.maximum(0.0, page - least) / 2
+        self._block = Bbox.from_bounds(left, bottom, width, height)
         for n, ax in enumerate(self.axes):
-            row, column = divmod(n, plan.columns)
-            x, y = left + column * plan.pitch[0], bottom + (plan.rows - 1 - row) * plan.pitch[1]
-            each = (plan.width / whole[0], plan.height / whole[1])
-            ax.set_position((x / whole[0], y / whole[1], *each))
-            self._ticks(ax, plan, column == 0, n + plan.columns >= len(self.axes))
-        middle = left + width / 2
-        self._put_texts((left, bottom), plan, middle)
-        if self._legend:
-            self._legend.put(_inside(middle, self._legend.size[0], whole[0]), low)
-            low += self._legend.size[1] + 0.5 * GAP_IN
-        if self._bar and self._bar.beside:
-            self._bar.put(left + width + self._over + GAP_IN, bottom, height)
-        elif self._bar:
-            self._bar.put(_inside(middle, self._bar.size[0], whole[0]), low, self._bar.size[0])
+            row, column = divmod(n, grid.columns)
+            x, y = left + column * grid.pitch[0], bottom + (grid.rows - 1 - row) * grid.pitch[1]
+            ax.set_position(np.array((x, y, grid.width, grid.height)) / np.tile(page, 2))
+            ax.tick_params(labelleft=column == 0, labelbottom=n + grid.columns >= len(self.axes))
+            ax.xaxis.set_major_locator(_locator(*self._panels.box[:2], grid.width, 0.5))
+            ax.yaxis.set_major_locator(_locator(*self._panels.box[2:], grid.height, 0.3))
+        self._place_texts(page)
 
-    def _sides(self, plan: Plan) -> tuple[float, float]:
-        """What is left free to the left and to the right of all panels: as far as what stands in
-        their middle, above and below, is wider than they are, unless the size is given."""
-        width, _ = plan.block
-        if self._size:
-            return MARGIN_IN + self._left, MARGIN_IN + self._over + self._beside
-        heading = shortened(self.figure, self._said, HEAD_PT, PAGE_IN)
-        below = [key.size[0] for key in (self._bar, self._legend) if key and not key.beside]
-        x_label = text_inches(self.figure, self._shown.labels[0], PAGE_TEXT_PT)[0]
-        widest = max([text_inches(self.figure, heading, HEAD_PT)[0], x_label, *below])
-        title = 0.0 if self._one else self._widest_title() - plan.width
-        over = max(0.0, (widest - width) / 2, title / 2)
-        return MARGIN_IN + max(over, self._left), MARGIN_IN + max(over, self._over + self._beside)
+    def _place_texts(self, page: Any) -> None:
+        block, y = self._block, self._panels.labels[1]
+        middle, ticks = (
+            block.get_points().mean(axis=0),
+            self._drawn(self.axes, for_layout_only=True),
+        )
+        upright = block.height + 0.3 >= len(y) / CHARACTERS_PER_IN
+        across, up = self._labels
+        across.set(position=np.array((middle[0], ticks.y0)) / page, ha="center", va="top")
+        up.set(position=np.array((ticks.x0 - 0.04, middle[1])) / page, ha="right", va="center")
+        up.set(text=y if upright else y.split(" (")[0], rotation=90.0 if upright else 0.0)
+        room = 2 * (min(middle[0], page[0] - middle[0]) if self._size else PAGE_WIDTH_IN / 2)
+        heading = self.axes[0].title if self._single else self._heading
+        text = self._panels.titles[0] if self._single else self._panels.heading
+        self._shorten(heading, text, room - 2 * EDGE_IN)
+        self._heading.set_position(np.array((middle[0], block.y1 + TITLE_IN + 0.05)) / page)
 
-    def _widest_title(self) -> float:
-        return max(text_inches(self.figure, t, PAGE_TEXT_PT)[0] for t in self._shown.titles)
+    def _shorten(self, artist: Text, text: str, width: float) -> None:
+        """Set a text, and leave out its end where it is wider."""
+        artist.set_text(text)
+        while len(text) > 2 and self._drawn([artist]).width > width:
+            text = text[: -max(2, len(text) // 20)].rstrip("\\") + "…"
+            artist.set_text(text)
 
-    @property
-    def _said(self) -> str:
-        return self._shown.titles[0] if self._one else self._shown.heading
+    def _bar(self, scale: Scale, text: str) -> Any:
+        """Return the colour bar; it stands beside panels that are tall enough for its label."""
+        width, height = self._grid.size
+        broad = int(min(height, BAR_LENGTH_IN) * CHARACTERS_PER_IN)
+        lines = textwrap.wrap(text, max(1, broad), break_long_words=False)
+        beside = height >= SIDE_BAR_HEIGHT_IN and len(lines) <= LABEL_LINES
+        beside = beside and max(map(len, lines)) <= broad
+        if not beside:
+            lines = textwrap.wrap(text, int(max(width, BAR_LENGTH_IN) * CHARACTERS_PER_IN))
+        bar = self.figure.colorbar(
+            ScalarMappable(scale.norm, scale.colours), cax=self.figure.add_axes((0, 0, 1, 1)),
+            orientation="vertical" if beside else "horizontal", extend=scale.extend,
+            extendfrac=0.04,
+        )  # fmt: skip
+        style_bar(bar, scale)
+        bar.set_label("\n".join(lines), fontsize=TEXT_PT)
+        return bar
 
-    def _put_texts(self, corner: tuple[float, float], plan: Plan, middle: float) -> None:
-        """Labels in the middle of all panels, and the heading above them."""
-        (width, height), whole = plan.block, self.figure.get_size_inches()
-        x, y = self._shown.labels
-        upright = text_inches(self.figure, y, PAGE_TEXT_PT)[0] <= height + 0.5 * self._bottom
-        y, rotation = (y, 90.0) if upright else (y.split(" (")[0], 0.0)
-        room = 2 * (min(middle, whole[0] - middle) - MARGIN_IN)
-        heading = shortened(self.figure, self._said, HEAD_PT, room)
-        if self._one:
-            self.axes[0].title.set_text(heading)
-        else:
-            self._heading.set_text(heading)
-        above = self._top + HEAD_PT / 72 * 0.8
-        places = [
-            (self._labels[0], x, corner[0] + width / 2, corner[1] - self._bottom + 0.5 * LABEL_IN),
-            (self._labels[1], y, corner[0] - self._left + 0.5 * LABEL_IN, corner[1] + height / 2),
-            (self._heading, self._heading.get_text(), middle, corner[1] + height + above),
-        ]
-        for text, said, across, up in places:
-            text.set(text=said, position=(across / whole[0], up / whole[1]))
-        self._labels[1].set_rotation(rotation)
+    def _legend(self, handles: list[Line2D]) -> Legend:
+        """Return the legend, in as many columns as there is room for on the page."""
+        room = self._size[0] if self._size else max(self._grid.size[0], PAGE_WIDTH_IN)
+        for columns in range(len(handles), 0, -1):
+            legend = self.figure.legend(
+                handles=handles, ncols=columns, loc="upper center", frameon=False,
+                handletextpad=0.1, columnspacing=1.2, borderpad=0.1, borderaxespad=0.0,
+                fontsize=TEXT_PT,
+            )  # fmt: skip
+            if columns == 1 or self._drawn([legend]).width <= room - 2 * EDGE_IN:
+                break
+            legend.remove()
+        return legend
 
-    def _ticks(self, ax: Axes, plan: Plan, leftmost: bool, lowest: bool) -> None:
-        """Round numbers, as many as there is room for."""
-        left, right, bottom, top = self._shown.box
-        digits = max(len(f"{v:.0f}") for v in (left, right))
-        ax.xaxis.set_major_locator(_locator(left, right, plan.width, 0.2 + 0.1 * digits))
-        ax.yaxis.set_major_locator(_locator(bottom, top, plan.height, 0.27))
-        ax.tick_params(labelleft=leftmost, labelbottom=lowest)
+    def _place_keys(self, bar: Any, legend: Legend | None) -> None:
+        """Place the colour bar beside or below the panels, and the legend below all."""
+        block, page = self._block, self.figure.get_size_inches()
+        middle = block.get_points().mean(axis=0)
+        low = self._drawn([*self.axes, self._labels[0]]).y0 - 0.08
+        if bar and bar.orientation == "vertical":
+            length, left = min(block.height - 0.12, BAR_LENGTH_IN), block.x1 + self._overhang
+            place = np.array((left + GAP_IN, middle[1] - length / 2, BAR_WIDTH_IN, length))
+            bar.ax.set_position(place / np.tile(page, 2))
+        elif bar:
+            length = min(max(block.width, SIDE_BAR_HEIGHT_IN), BAR_LENGTH_IN)
+            place = np.array((middle[0] - length / 2, low - BAR_WIDTH_IN, length, BAR_WIDTH_IN))
+            bar.ax.set_position(place / np.tile(page, 2))
+            low = self._drawn([bar.ax]).y0 - 0.05
+        if legend:
+            legend.set_bbox_to_anchor((middle[0], low), self.figure.dpi_scale_trans)
 
-    def _measure(self, plan: Plan) -> None:
-        """What ticks take beside the panels."""
-        dpi, renderer = self.figure.dpi, renderer_of(self.figure)
-        left = bottom = over = 0.0
-        for ax in self.axes:
-            for axis in (ax.xaxis, ax.yaxis):
-                ticks = axis.get_tightbbox(renderer)
-                if ticks is None:
-                    continue
-                bottom = max(bottom, ax.bbox.y0 - ticks.y0)
-                if axis is ax.xaxis:
-                    over = max(over, ticks.x1 - ax.bbox.x1, ax.bbox.x0 - ticks.x0)
-                else:
-                    left = max(left, ax.bbox.x0 - ticks.x0)
-        self._over = max(0.0, over / dpi)
-        self._left = max(left / dpi, self._over) + LABEL_IN
-        self._bottom = bottom / dpi + LABEL_IN
+    def _drawn(self, artists: Iterable[Any], **more: Any) -> Bbox:
+        """Return the box around artists with all that belongs to them, in inches."""
+        renderer = renderer_of(self.figure)
+        boxes = [box for artist in artists if (box := artist.get_tightbbox(renderer, **more))]
+        return Bbox(Bbox.union(boxes).get_points() / self.figure.dpi)
 
-
-def _inside(middle: float, width: float, whole: float) -> float:
-    """Where something begins that is to lie about the middle, and within the whole."""
-    return max(MARGIN_IN, min(middle - width / 2, whole - MARGIN_IN - width))
+    def _measure(self) -> None:
+        """Measure the space that is taken around the panels."""
+        texts = [text for text in self.figure.texts if text.get_text()]
+        drawn = self._drawn([*self.figure.axes, *texts, *self.figure.legends])
+        self._before = np.subtract(self._block.min, drawn.min) + EDGE_IN
+        self._after = np.subtract(drawn.max, self._block.max) + EDGE_IN
+        # Titles may be wider than the panels, and make the page wider instead of these narrower.
+        narrow = self._drawn(self.figure.axes, for_layout_only=True)
+        left = min(narrow.x0, self._drawn([self._labels[1]]).x0)
+        self._around = self._before + self._after
+        self._around[0] = narrow.x1 - left - self._block.width + 2 * EDGE_IN
+        last = self._drawn([self.axes[-1]], for_layout_only=True)
+        self._overhang = max(0.0, last.width - self._grid.width) / 2
 
 
-def _locator(low: float, high: float, length: float, apart: float) -> Locator:
-    """Ticks at least so many inches apart along so many."""
-    many = int(length / apart)
-    if many >= 2:
-        return MaxNLocator(many, steps=[1, 2, 5, 10])
-    ticks = MaxNLocator(2, steps=[1, 2, 5, 10]).tick_values(low, high)
-    inner = [tick for tick in ticks if low <= tick <= high]
-    return FixedLocator(sorted(inner, key=abs)[:1])
+def _locator(low: float, high: float, length: float, distance: float) -> Locator:
+    """Return a locator of ticks at a distance in inches at least; of one tick on short axes."""
+    if length < SHORT_AXIS_IN:
+        return FixedLocator([0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.1g}")])
+    return MaxNLocator(max(1, int(length / distance)), steps=[1, 2, 5, 10])

@@ -110,7 +110,7 @@ def _figure(picture: Picture | None) -> str:
         named.setdefault(colour, []).append(said)
     chips = "".join(
         f'<span style="white-space:nowrap;margin-right:12px"><span style="display:inline-block;'
-        f'width:10px;height:10px;background:{colour}"></span> {escape(", ".join(said))}</span> '
+        f'width:10px;height:10px;background:{colour}"></span> {escape("; ".join(said))}</span> '
         for colour, said in named.items()
     )
     return f'<div style="max-width:480px">{picture.svg}<div>{chips}</div></div>'

@@ -1,12 +1,6 @@
-"""A small writer of SVG: shapes in lattice coordinates, text that is escaped.
+"""Pictures of a scene before it runs: the body, its supports, loads, obstacles, cracks and cuts.
 
-Where to and how far motions and forces go, in one vector each, as arrows show it.
-
-A scene before it runs: the body, who leads, what acts on it and what is in its way.
-
-Shapes are drawn on a canvas: the SVG of a notebook, or axes of matplotlib (`scene_axes.py`).
-
-A scene before it runs, on axes of matplotlib, with coordinates in the user's units.
+Shapes are drawn on a canvas: the SVG of a notebook, or axes of matplotlib.
 """
 
 from __future__ import annotations
@@ -26,7 +20,7 @@ from numpy.typing import NDArray
 from pbdkit.lattice.raster import FOLLOWER, Raster
 from pbdkit.model.boundary_conditions import Load
 from pbdkit.model.motions import Hold, Motion, Newton, Oscillation, Rotation
-from pbdkit.plotting.layout import Legend, Page, Panels, handle
+from pbdkit.plotting.layout import Page, Panels, handle
 from pbdkit.plotting.style import Look, figure_of, label, plain
 from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.constants import signed_distance
@@ -302,7 +296,7 @@ class _Drawing:
             colour = HELD if held else LEADS
             said = "mass" if isinstance(motion, Newton) else "held" if held else "led"
             if leading.group.axes:
-                said += f" along {' and '.join(leading.group.axes)} only"
+                said += f" along {' and '.join(leading.group.axes)}"
             self.canvas.dots(leading.reference, max(1.4 * self.dot, 3.0), colour, square=held)
             self._note(colour, said)
             ways = np.zeros((len(leading.rows), 2)) + extreme(
@@ -472,10 +466,10 @@ def draw_on_axes(scene: Scene, look: Look, ax: Axes | None) -> Axes:
     page = Page(
         Panels((left, right, bottom, top), [title], "", labels), look.dpi, look.figsize, alone=True
     )
-    page.arrange(None, None)
+    page.arrange()
     ax = page.axes[0]
     meanings = draw_scene(scene, AxesCanvas(ax, unit))
-    page.arrange(None, Legend(page.figure, _handles(meanings)))
+    page.arrange(handles=_handles(meanings))
     return ax
 
 
@@ -484,4 +478,4 @@ def _handles(meanings: SceneLegend) -> list[Any]:
     named: dict[str, list[str]] = {}
     for colour, words in meanings:
         named.setdefault(colour, []).append(words)
-    return [handle(", ".join(words), colour) for colour, words in named.items()]
+    return [handle("; ".join(words), colour) for colour, words in named.items()]

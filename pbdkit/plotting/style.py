@@ -1,9 +1,4 @@
-"""Figures: of pyplot where somebody uses that, so that they show; else without a screen.
-
-Words in pictures: what a variable is, in which units, never longer than there is room for.
-
-Options that pictures, comparisons and movies have in common.
-"""
+"""Figures, words and options that all pictures have in common."""
 
 from __future__ import annotations
 
