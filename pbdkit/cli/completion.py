@@ -1,8 +1,7 @@
-"""What the tabulator key offers: experiments, settings, results, and what is in them.
+"""Completion by the tabulator key: experiments, results, paths of `--set` and their values.
 
-What cannot be found out is not offered: a shell has no place for messages.
-
-The paths that `--set` takes, and the values at them, by the JSON Schema of experiments.
+Click completes files and choices; what is here completes what an experiment or a result contains.
+The paths of `--set` are those of the experiment on the line and of the JSON Schema.
 """
 
 from __future__ import annotations
@@ -27,32 +26,35 @@ from click.shell_completion import (
 )
 
 SUFFIXES = (".yaml", ".yml", ".json")
+"""Endings of the names of experiment files."""
 RESULT = ".nc"
-MOST_TIMES = 200
-"""So many steps are offered at once: the first and the last, and some between."""
+MAX_TIMES = 200
+"""Maximum number of steps that are offered at once: the first and the last, and some between."""
 Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem]]
-Finder = Callable[[click.Context, str], Iterable[str | CompletionItem]]
+Candidates = Callable[[click.Context, str], Iterable[str | CompletionItem]]
 
 
-def _completer(find: Finder) -> Completer:
-    """Offers what is found that begins as what is there, and nothing where finding fails."""
+def _completer(candidates: Candidates) -> Completer:
+    """Return the candidates that begin as the word does; none where they cannot be computed, as a
+    shell has no place for messages."""
 
     def complete(context: click.Context, _: click.Parameter, begun: str) -> list[CompletionItem]:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found = [*find(context, begun)]
+                every = [*candidates(context, begun)]
         except (Exception, SystemExit):
             return []
-        items = [one if isinstance(one, CompletionItem) else CompletionItem(one) for one in found]
+        items = [one if isinstance(one, CompletionItem) else CompletionItem(one) for one in every]
         return [item for item in items if item.value.startswith(begun)]
 
     return complete
 
 
-def _experiments(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
-    """The shipped experiments and the experiment files here; where no shipped one begins so,
-    whatever the shell itself offers as files."""
+@_completer
+def experiments(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
+    """Complete shipped experiments and experiment files in this folder; where no shipped one begins
+    so, the shell completes files."""
     from pbdkit.model.shipped import shipped_names
 
     names = [name for name in shipped_names() if name.startswith(begun)]
@@ -63,15 +65,17 @@ def _experiments(context: click.Context, begun: str) -> Iterator[str | Completio
     yield from sorted(p.name for p in Path().glob(f"{escape(begun)}*") if p.suffix in SUFFIXES)
 
 
-def _shipped(context: click.Context, begun: str) -> Iterable[str]:
-    """The shipped experiments."""
+@_completer
+def shipped(context: click.Context, begun: str) -> Iterable[str]:
+    """Complete shipped experiments."""
     from pbdkit.model.shipped import shipped_names
 
     return shipped_names()
 
 
-def _results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
-    """The results in a folder, those of runs that are not finished, and the folders in it."""
+@_completer
+def results(context: click.Context, begun: str) -> Iterator[str | CompletionItem]:
+    """Complete results, unfinished ones too, and folders."""
     from pbdkit.io.run_store import STORE
 
     folder = begun[: begun.rfind("/") + 1]
@@ -87,9 +91,10 @@ def _results(context: click.Context, begun: str) -> Iterator[str | CompletionIte
         yield CompletionItem(begun, type="file")
 
 
-def _settings(context: click.Context, begun: str) -> Iterator[str]:
-    """The paths of the experiment on the line, with the settings before; behind `=` the words that
-    can stand there, and the present value."""
+@_completer
+def settings(context: click.Context, begun: str) -> Iterator[str]:
+    """Complete the paths that can be set in the experiment on the line, with the settings before;
+    behind `=` the words that can stand there, and the present value."""
     from pbdkit.model.schema import experiment_schema
     from pbdkit.plugin.registry import Registry
 
@@ -116,9 +121,9 @@ def _data(context: click.Context) -> dict[str, Any]:
     return {**defaults, **source.data}
 
 
-def _variables(context: click.Context, begun: str) -> Iterator[str]:
-    """What particles or bonds of the result on the line can be coloured by, the components of
-    vectors too."""
+@_completer
+def variables(context: click.Context, begun: str) -> Iterator[str]:
+    """Complete the variables of particles and bonds of the result on the line, with components."""
     with _content(context) as content:
         variables = dict(content.variables)
         listed = (some.attrs.get("coordinates", "") for some in (content, *variables.values()))
@@ -132,18 +137,19 @@ def _variables(context: click.Context, begun: str) -> Iterator[str]:
             yield from (f"{name}_{axis}" for axis in axes)
 
 
-def _times(context: click.Context, begun: str) -> Iterator[str]:
-    """The recorded steps of the result on the line."""
+@_completer
+def times(context: click.Context, begun: str) -> Iterator[str]:
+    """Complete the recorded steps of the result on the line."""
     with _content(context) as content:
         times = [f"{time}" for time in content.variables["time"][...].tolist()]
     times = [time for time in times if time.startswith(begun)]
-    stride = -(-len(times) // MOST_TIMES)
+    stride = -(-len(times) // MAX_TIMES)
     yield from dict.fromkeys([*times[:: stride or 1], *times[-1:]])
 
 
 @contextmanager
 def _content(context: click.Context) -> Iterator[Any]:
-    """The first result among what is on the line, opened without xarray."""
+    """Open the first result on the line, without xarray."""
     from pbdkit.io.seal import opened
 
     given = [v for v in context.params.values() if isinstance(v, Path)]
@@ -155,17 +161,11 @@ def _content(context: click.Context) -> Iterator[Any]:
         file.close()
 
 
-experiments = _completer(_experiments)
-shipped = _completer(_shipped)
-results = _completer(_results)
-settings = _completer(_settings)
-variables = _completer(_variables)
-times = _completer(_times)
-
-
 class _Bash(BashComplete):
-    """Bash parts words at `=`, and puts a space behind what it completes. Here `--set rule.K=1` has
-    one value, and no space comes behind `=`."""
+    """Completion in bash, which splits words at `=` and puts a space behind what it completes.
+
+    Here `--set rule.K=1` has one value, and no space comes behind `=`.
+    """
 
     source_template = BashComplete.source_template.replace(
         "COMPREPLY+=($value)",
@@ -174,7 +174,7 @@ class _Bash(BashComplete):
     _known = 0
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """The words before, and that which is to be completed."""
+        """Return the words before, and the word to complete."""
         parts, at = split_arg_string(os.environ["COMP_WORDS"]), int(os.environ["COMP_CWORD"])
         parts = [*parts, ""][: at + 1]
         words = parts[:1]
@@ -189,89 +189,90 @@ class _Bash(BashComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Without what stands before the part that bash completes."""
+        """Return an item without what stands before the part that bash completes."""
         return f"{item.type},{item.value[self._known :]}"
 
 
 def speak_bash() -> None:
-    """From now on this is what click takes for bash."""
+    """Register the completion in bash with click."""
     add_completion_class(_Bash)
 
 
 Schema = Mapping[str, Any]
 MISSING = object()
-"""In place of what an experiment leaves out."""
-
+"""The value of an entry that an experiment leaves out."""
 NEEDS_QUOTES = {*" \"'{}$"}
-"""A shell would not leave a word with these as it is."""
+"""Characters that a shell does not leave as they are."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A place in an experiment: what stands there, and what the schema says of it."""
+class Entry:
+    """An entry of an experiment by its path: its value, or the default, and its schema."""
 
     path: str
-    data: Any
+    value: Any
     schema: Schema
 
 
+def _entry(path: str, data: Mapping[str, Any], key: str, schema: Schema) -> Entry:
+    return Entry(f"{path}{key}", data.get(key, schema.get("default", MISSING)), schema)
+
+
 class SettingPaths:
-    """Of one experiment's `data`; `schema` is that of experiments."""
+    """The paths that can be set in the `data` of an experiment with that schema."""
 
     def __init__(self, data: Mapping[str, Any], schema: Schema) -> None:
-        self._definitions, self._whole = schema.get("$defs", {}), Place("", data, schema)
+        self._definitions, self._root = schema.get("$defs", {}), Entry("", data, schema)
 
     def paths(self) -> list[str]:
-        """Down to single values, and lists of them."""
-        return [place.path for place in self._below(self._whole)]
+        """Return the paths of single values, and of lists of them."""
+        return [entry.path for entry in self._leaves(self._root)]
 
     def values(self, path: str) -> list[str]:
-        """What can stand there: the words that the schema lists, and what stands there now."""
-        place = self._whole
-        for word in path.split("."):
-            inner = (one for one in self._inside(place) if one.path.rpartition(".")[-1] == word)
-            if (found := next(inner, None)) is None:
+        """Return the words that the schema lists at a path, and the present value."""
+        entry, keys = self._root, path.split(".")
+        for depth in range(1, len(keys) + 1):
+            inner = {entry.path: entry for entry in self._entries(entry)}
+            if ".".join(keys[:depth]) not in inner:
                 return []
-            place = found
-        words = dict.fromkeys(self._words(place.schema))
-        now = place.data if place.data is not MISSING else place.schema.get("default", MISSING)
+            entry = inner[".".join(keys[:depth])]
+        words, now = dict.fromkeys(self._words(entry.schema)), entry.value
         if now is not MISSING and now is not None:
             words[now if isinstance(now, str) else json.dumps(now, separators=(",", ":"))] = None
         return [word for word in words if not {*word} & NEEDS_QUOTES]
 
-    def _below(self, place: Place) -> Iterator[Place]:
-        inside = [*self._inside(place)]
-        if not inside:
-            yield place
-        for one in inside:
-            yield from self._below(one)
+    def _leaves(self, entry: Entry) -> Iterator[Entry]:
+        entries = [*self._entries(entry)]
+        for inner in entries:
+            yield from self._leaves(inner)
+        if not entries:
+            yield entry
 
-    def _inside(self, place: Place) -> Iterator[Place]:
-        """What it holds; nothing where it is a single value, or a list of them."""
-        begun = f"{place.path}." if place.path else ""
-        data, forms = place.data, [*self._forms(place.schema)]
-        if data is MISSING:
-            data = place.schema.get("default", MISSING)
+    def _entries(self, entry: Entry) -> Iterator[Entry]:
+        """Yield the entries of a map, or of a list of maps; none of a single value."""
+        path, data = f"{entry.path}." if entry.path else "", entry.value
+        forms = [*self._forms(entry.schema)]
         if isinstance(data, list):
             items: Schema = next((form["items"] for form in forms if "items" in form), {})
             if any(isinstance(one, dict) for one in data) and items:
-                yield from (Place(f"{begun}{n}", one, items) for n, one in enumerate(data))
+                yield from (Entry(f"{path}{n}", one, items) for n, one in enumerate(data))
             return
         maps = [form for form in forms if "properties" in form]
         if isinstance(data, dict):
             fitting = [form for form in maps if _fits(form, data)] or maps[:1]
-            known: dict[str, Any] = dict(fitting[0]["properties"]) if fitting else {}
+            schemas: dict[str, Any] = dict(fitting[0]["properties"]) if fitting else {}
             types = [form["properties"]["type"] for form in maps if "type" in form["properties"]]
-            known |= {"type": {"anyOf": types}} if types else {}
-            other: Schema = next((f["additionalProperties"] for f in forms if _is_open(f)), {})
-            for key in dict.fromkeys([*data, *known]):
-                yield Place(f"{begun}{key}", data.get(key, MISSING), known.get(key, other))
+            schemas |= {"type": {"anyOf": types}} if types else {}
+            more = [form.get("additionalProperties") for form in forms]
+            other: Schema = next((one for one in more if isinstance(one, Mapping)), {})
+            for key in dict.fromkeys([*data, *schemas]):
+                yield _entry(path, data, key, schemas.get(key, other))
         elif data is MISSING and len(maps) == len(forms) == 1:
             for key, schema in maps[0]["properties"].items():
-                yield Place(f"{begun}{key}", MISSING, schema)
+                yield _entry(path, {}, key, schema)
 
     def _forms(self, schema: Schema) -> Iterator[Schema]:
-        """The ways to write it that are not deprecated, references followed."""
+        """Yield the alternatives of a schema that are not deprecated, references followed."""
         if "$ref" in schema:
             yield from self._forms(self._definitions.get(schema["$ref"].split("/")[-1], {}))
             return
@@ -291,10 +292,6 @@ class SettingPaths:
 
 
 def _fits(form: Schema, data: Mapping[str, Any]) -> bool:
-    """Whether a part of that type may be so written; anything where it has no type."""
+    """Return whether a map of that `type` may have the form; any map may where it has no type."""
     kind = form["properties"].get("type")
     return kind is None or data.get("type") in (kind.get("const"), *kind.get("enum", ()))
-
-
-def _is_open(form: Schema) -> bool:
-    return isinstance(form.get("additionalProperties"), Mapping)

@@ -23,7 +23,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.errors import ExperimentError, StorageError
-from pbdkit.io.atomic_file import FULL, is_full, is_local, lock, opened_alone, sync_folder
+from pbdkit.io.atomic_file import FULL, is_full, lock, opened_alone, sync_folder
 from pbdkit.io.checkpoint import Arrays, Checkpoint
 from pbdkit.io.paged_file import (
     PAGE,
@@ -36,7 +36,16 @@ from pbdkit.io.paged_file import (
     write_header,
 )
 from pbdkit.io.seal import ByteRange, seal_of
-from pbdkit.io.sqlite_file import connect, fault_of, files_of, is_database, look
+from pbdkit.io.sqlite_file import (
+    ONE_PAGE,
+    connect,
+    fault_of,
+    files_of,
+    is_database,
+    journal_mode,
+    look,
+    size_of,
+)
 
 FORMAT = "3"
 """Of the store; a newer one is refused."""
@@ -176,13 +185,13 @@ class RunStore:
         if schema not in ([], SCHEMA):
             raise StorageError(f"{self.path}: is no store of a run, or one of an earlier pbdkit")
         if self._writes:
-            self._file.execute(f"PRAGMA journal_mode = {_journal(self.path)}")
+            self._file.execute(f"PRAGMA journal_mode = {journal_mode(self.path)}")
         if schema:
             self._list()
 
     def _make(self) -> None:
         self.identity = secrets.token_bytes(IDENTITY_BYTES)
-        self._file.execute(f"PRAGMA journal_mode = {_journal(self.path)}")
+        self._file.execute(f"PRAGMA journal_mode = {journal_mode(self.path)}")
         self._file.execute("BEGIN")
         self._file.execute(f"PRAGMA application_id = {MARK}")
         self._file.execute(TABLE)
@@ -300,19 +309,12 @@ def _refuse_others(path: Path) -> None:
             raise StorageError(f"{path}-journal: names another file, and is none of pbdkit's")
 
 
-def _journal(path: Path) -> str:
-    """On a network the write-ahead log would need memory that machines share."""
-    return "WAL" if is_local(path) else "TRUNCATE"
-
-
 def _digest_of_all(listed: dict[str, bytes]) -> str:
     return xxhash.xxh3_128_hexdigest(b"".join(sorted(listed.values())))
 
 
 STORE, RECORDS = ".run", ".run-records"
 """Behind the name of the output: the store, and the file of large values."""
-ONE_PAGE = 4096
-"""Bytes at most of a store in which nothing was committed yet."""
 
 
 def store_of(output: Path) -> Path:
@@ -406,7 +408,7 @@ def left_of(output: Path) -> Left:
         return Left.NOTHING
     header = header_of(records)
     if not is_database(store):
-        if header or _size(store) > ONE_PAGE or _size(Path(f"{store}-wal")):
+        if header or size_of(store) > ONE_PAGE or size_of(Path(f"{store}-wal")):
             raise damaged(store, "it is missing, or no database")
         return Left.BEGUN
     with RunStore(store) as found:
@@ -453,10 +455,6 @@ def damaged(path: Path, what: str) -> StorageError:
 def is_left(output: Path) -> bool:
     """Whether there is anything of a store, or records."""
     return any(path.exists() for path in (*files_of(store_of(output)), records_of(output)))
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
 
 
 def remove_store(output: Path) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -62,11 +62,11 @@ class KeepingSink(Sink):
 
 
 class MemorySink(Sink):
-    """Grows every column in memory."""
+    """A dataset in memory; `columns` and `sizes` are those that it has begun with."""
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Nothing is allocated before it comes."""
-        self._columns, self._sizes = columns, sizes
+        """Begin; nothing is allocated before it comes."""
+        self.columns, self.sizes = columns, sizes
         self._entries: dict[str, list[Any]] = {c.name: [] for c in columns}
 
     def put(self, values: Values) -> None:
@@ -86,14 +86,16 @@ class MemorySink(Sink):
         """The dataset as in the file."""
         import xarray
 
-        variables = {c.name: (c.dims, self._values(c), c.attributes) for c in self._columns}
-        coordinates = [c.name for c in self._columns if c.coordinate]
+        variables = {c.name: (c.dims, self.values(c), c.attributes) for c in self.columns}
+        coordinates = [c.name for c in self.columns if c.coordinate]
         return xarray.Dataset(variables, attrs=self._attributes).set_coords(coordinates)
 
-    def _values(self, column: Column) -> Any:
+    def values(self, column: Column, rows: Iterable[int] | None = None) -> Any:
+        """Return the values of a column; of one that grows those `rows`, by default all."""
         entries = self._entries[column.name]
         if column.grows:
-            shape = (len(entries), *(self._sizes[d] for d in column.dims[1:]))
+            entries = entries if rows is None else [entries[row] for row in rows]
+            shape = (len(entries), *(self.sizes[d] for d in column.dims[1:]))
             return np.array(entries, column.dtype).reshape(shape)
         dtype = None if column.dtype == "str" else column.dtype
         return np.asarray(entries[0] if entries else [], dtype)

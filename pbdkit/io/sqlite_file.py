@@ -8,6 +8,8 @@ import sqlite3
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from pbdkit.io.atomic_file import is_local
+
 BEGINNING = b"SQLite format 3\0"
 SMALLEST_PAGE = 512
 PATIENCE_S = 60.0
@@ -15,11 +17,23 @@ PATIENCE_S = 60.0
 LOGS = ("-journal", "-wal")
 """What SQLite adds to the name of the file, for commits that are not in it, or not yet."""
 SHARED_MEMORY = "-shm"
+ONE_PAGE = 4096
+"""Maximum size in bytes of a database in which nothing was committed."""
 
 
 def files_of(path: Path) -> list[Path]:
     """Return the files that SQLite keeps of a database, there or not."""
     return [path.with_name(path.name + more) for more in ("", *LOGS, SHARED_MEMORY)]
+
+
+def journal_mode(path: Path) -> str:
+    """Return the mode of the journal: on a network a write-ahead log would need shared memory."""
+    return "WAL" if is_local(path) else "TRUNCATE"
+
+
+def size_of(path: Path) -> int:
+    """Return the size of a file in bytes; 0 where there is none."""
+    return path.stat().st_size if path.exists() else 0
 
 
 def is_database(path: Path) -> bool:

@@ -1,6 +1,6 @@
-"""Colours of what has a name and no number: kinds of particles, roles.
+"""Colours of kinds, roles and other classes, and the scale of colours of a quantity.
 
-The scale of colours: which value has which, about zero where both signs are there.
+The colours of a quantity with both signs are centred at zero.
 """
 
 from __future__ import annotations

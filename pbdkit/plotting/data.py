@@ -1,14 +1,7 @@
-"""The cells of a body at rest, which a field fills: quadrilaterals, or triangles.
+"""Datasets as pictures read them: the body with its cells and outline, recorded steps of it, the
+quantity that is drawn in colour, and variables by name as curves need them.
 
-The outline of a body within the cells that it cuts: fields end there, and not with the cells.
-
-What is drawn in colour: a variable of particles or bonds, a component or length of a vector.
-
-A dataset as pictures need it: the body, which does not change, and recorded steps of it.
-
-What several steps of a body cover: the place that they take, and the values that they have.
-
-Variables by name as curves want them: components, one place, one number a step, and units.
+Fields fill the cells of the body at rest, quadrilaterals or triangles, up to its outline.
 """
 
 from __future__ import annotations

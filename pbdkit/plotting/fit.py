@@ -1,5 +1,6 @@
-"""The picture of a fit: what was measured, what was fitted, what is left, and where the data tell
-each parameter."""
+"""The picture of a fit: measurements, fitted values, residuals, and where the data determine each
+parameter.
+"""
 
 from __future__ import annotations
 

@@ -106,9 +106,10 @@ def _weights(middles: Array) -> Array:
 def _groups(corners: Array) -> Iterator[tuple[Array, Array]]:
     """Cells, by their rows, that take as many samples, and where these lie along both sides, as
     shares."""
-    each = [corners[:, k] for k in range(4)]  # by columns: many times as fast as along an axis
-    extent = np.maximum(*(np.maximum.reduce(each) - np.minimum.reduce(each)).T)
-    finest = np.maximum(np.ceil(extent), 1.0)
+    a, b, c, d = (corners[:, k] for k in range(4))
+    along = np.maximum(abs(b - a), abs(c - d)), np.maximum(abs(d - a), abs(c - b))
+    # Steps of samples along both sides together reach no further than a pixel: none is missed.
+    finest = np.maximum(np.ceil(np.maximum(*(along[0] + along[1]).T)), 1.0)
     finest = np.maximum(finest * min(1.0, math.sqrt(MOST / max(1.0, (finest**2).sum()))), 1.0)
     # Rounded up to a power of the square root of two: few groups, and not many more samples.
     levels = np.ceil(2 * np.log2(finest) - 1e-6).astype(int)

@@ -1,4 +1,4 @@
-"""What a notebook shows of an experiment, an analysis and an identity: HTML without scripts."""
+"""Pages of experiments, analyses and identities in notebooks: HTML without scripts."""
 
 from __future__ import annotations
 

@@ -33,11 +33,11 @@ import numpy as np
 import xxhash
 
 from pbdkit.errors import ExperimentError, PbdkitError, PbdkitWarning, StorageError, did_you_mean
-from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column, Values
+from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column
 from pbdkit.io.open import open as open_result
 from pbdkit.io.recorder import Recorder
 from pbdkit.io.save import write_dataset
-from pbdkit.io.sinks import Sink
+from pbdkit.io.sinks import MemorySink
 from pbdkit.memory import machine_memory
 from pbdkit.model.experiment import Experiment, given_classes
 from pbdkit.model.reading import OF_PROGRAM, Source
@@ -221,23 +221,6 @@ TEXT = 8
 """Bytes of a text, about."""
 
 
-class _Plan(Sink):
-    """Takes the columns of a run that is not made."""
-
-    def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Keeps what it is told."""
-        self.columns, self.sizes, self.planned = columns, sizes, planned
-
-    def put(self, values: Values) -> None:
-        """Not wanted."""
-
-    def finish(self, attributes: dict[str, str]) -> None:
-        """Does not come."""
-
-    def abandon(self) -> None:
-        """Does not come."""
-
-
 class SizeEstimate:
     """Looks at the experiments of all members, builds the scene of each different body, and sums up
     the dataset that they come to."""
@@ -260,7 +243,7 @@ class SizeEstimate:
         if shape in self._seen:
             return
         self._seen.add(shape)
-        plan = _Plan()
+        plan = MemorySink()
         with named(words):
             Recorder(build_scene(experiment), plan).begin()
         known = {column.name: column for column in plan.columns}

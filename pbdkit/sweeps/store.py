@@ -18,15 +18,18 @@ from pathlib import Path
 from typing import Any, Self
 
 from pbdkit.errors import StorageError
-from pbdkit.io.atomic_file import FULL, is_full, is_local, lock, sync_folder
+from pbdkit.io.atomic_file import FULL, is_full, lock, sync_folder
 from pbdkit.io.sqlite_file import (
     BEGINNING,
+    ONE_PAGE,
     PATIENCE_S,
     connect,
     fault_of,
     files_of,
     is_database,
+    journal_mode,
     look,
+    size_of,
 )
 from pbdkit.sweeps.worker import MemberReport, digest_of
 
@@ -37,7 +40,6 @@ TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{32}(\.nc)?")
 """The names of files that are being written: host, process, random number."""
 LARGE_BYTES = 2**20
 """What is larger is a file."""
-ONE_PAGE = 4096
 COMMIT_S = 1.0
 """So much at most of what was finished is lost when the machine stops."""
 APPLICATION, FORMAT = 0x70626473, 2
@@ -251,11 +253,11 @@ class Store:
     def _fault(self, noted: int) -> str | None:
         """Why the database cannot be used as it is: empty where it was never made whole, None where
         it can be used. Raises StorageError for what may be somebody else's."""
-        logs = any(_size(path) for path in files_of(self._path)[1:3])
+        logs = any(size_of(path) for path in files_of(self._path)[1:3])
         if not is_database(self._path):
             if noted or logs:
                 return f"is missing, or no database, and {noted or 'some'} members were held"
-            if _size(self._path) > ONE_PAGE or not _may_become_database(self._path):
+            if size_of(self._path) > ONE_PAGE or not _may_become_database(self._path):
                 raise self._stranger()
             return ""
         try:
@@ -322,8 +324,7 @@ class Store:
         self._database = database = self._closing.enter_context(closing(connect(self._path, "rw")))
         self._opened = self._path.stat()
         database.text_factory = partial(str, encoding="utf-8", errors="replace")
-        journal = "WAL" if is_local(self._path) else "TRUNCATE"
-        database.execute(f"PRAGMA journal_mode = {journal}")
+        database.execute(f"PRAGMA journal_mode = {journal_mode(self._path)}")
         self._keys = {key for (key,) in database.execute("SELECT key FROM member")}
 
     def _begin(self) -> None:
@@ -350,10 +351,6 @@ class Store:
         if is_full(self._folder):
             return FULL
         return f"{error}; what is held stays, and the same command goes on with what is sound of it"
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
 
 
 def _may_become_database(path: Path) -> bool:

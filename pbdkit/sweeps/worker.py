@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
+from pbdkit.io.atomic_file import WHOLE
 from pbdkit.io.layout import Column, Values, When
-from pbdkit.io.sinks import Sink
+from pbdkit.io.sinks import MemorySink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
 from pbdkit.plugin import Component
@@ -41,11 +42,6 @@ class MemberVariable(NamedTuple):
     attributes: dict[str, Any]
     coordinate: bool
     fixed: bool
-
-
-def variable_of(column: Column, values: NDArray[Any], fixed: bool) -> MemberVariable:
-    """The variable of a column of the dataset."""
-    return MemberVariable(column.dims, values, column.attributes, column.coordinate, fixed)
 
 
 def packed(variables: dict[str, MemberVariable]) -> bytes:
@@ -73,11 +69,9 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
     return found
 
 
-WHOLE = ("complete", "settled")
 KEPT = (*WHOLE, "separated")
-"""The status of members whose results are kept: of a body that came apart under an equilibrium, all
-that was recorded before."""
-"""The status of members whose values are in the dataset."""
+"""The status of members whose values are in the dataset: of a body that came apart under an
+equilibrium, all that was recorded before."""
 FAILED, INTERRUPTED, LOST = "failed", "interrupted", "lost"
 """The status of one that could not be run, and of those that the machine did not let end."""
 _one_at_a_time = threading.Lock()
@@ -113,63 +107,42 @@ def digest_of(key: str, status: str, message: str, content: bytes) -> bytes:
     return found.digest()
 
 
-class KeptSink(Sink):
-    """Takes of a run what is kept of it."""
+class KeptSink(MemorySink):
+    """A sink that keeps some variables of a run, at all recorded steps, the last or some."""
 
     def __init__(self, variables: Iterable[str] | None, times: str | tuple[int, ...]) -> None:
-        self._wanted = None if variables is None else set(variables)
+        self._variables = None if variables is None else set(variables)
         self._times = times
 
     def begin(self, columns: list[Column], sizes: dict[str, int], planned: dict[str, int]) -> None:
-        """Coordinates come along with the variables whose dimensions they describe."""
-        self.columns, self.sizes = kept_columns(columns, self._wanted), sizes
-        self._entries: dict[str, list[Any]] = {name: [] for name in self.columns}
+        """Begin with the columns that are kept, and the coordinates of their dimensions."""
+        super().begin(kept_columns(columns, self._variables), sizes, planned)
 
     def put(self, values: Values) -> None:
-        """Keeps what is wanted of it."""
-        for name in values.keys() & self._entries.keys():
-            self._entries[name].append(values[name])
-
-    def finish(self, attributes: dict[str, str]) -> None:
-        """There is no more."""
-
-    def abandon(self) -> None:
-        """Forgets everything."""
-        self._entries = {}
+        """Keep the values of those columns."""
+        super().put({name: value for name, value in values.items() if name in self._entries})
 
     def content(self) -> bytes:
-        """What is kept, as bytes."""
-        return packed({name: self._variable(column) for name, column in self.columns.items()})
+        """Return the variables as bytes."""
+        return packed({column.name: self._variable(column) for column in self.columns})
 
     def _variable(self, column: Column) -> MemberVariable:
-        entries = self._entries[column.name]
-        if not column.grows:
-            dtype = None if column.dtype == "str" else column.dtype
-            values = np.asarray(entries[0] if entries else [], dtype)
-            return variable_of(column, values, column.when is When.START)
-        if column.dims[0] == "time" and self._times != "all":
-            last = self._times == "last"
-            steps = self._entries["time"]
-            entries = (
-                entries[-1:]
-                if last
-                else [
-                    entry for step, entry in zip(steps, entries, strict=True) if step in self._times
-                ]
-            )
-        shape = (len(entries), *(self.sizes[d] for d in column.dims[1:]))
-        return variable_of(column, np.array(entries, column.dtype).reshape(shape), False)
+        rows, steps = None, self._entries.get("time", [])
+        if column.grows and column.dims[0] == "time" and self._times != "all":
+            wanted = steps[-1:] if self._times == "last" else self._times
+            rows = [row for row, step in enumerate(steps) if step in wanted]
+        values, fixed = self.values(column, rows), column.when is When.START
+        return MemberVariable(column.dims, values, column.attributes, column.coordinate, fixed)
 
 
-def kept_columns(columns: list[Column], wanted: set[str] | None) -> dict[str, Column]:
-    """Return the columns of that name, the labels along each of their dimensions, and of what
-    particles have the places at rest."""
-    chosen = [c for c in columns if wanted is None or c.name in wanted]
+def kept_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
+    """Return the columns of these variables and the coordinates of their dimensions; where
+    particles are among them, the positions at rest too."""
+    chosen = [c for c in columns if variables is None or c.name in variables]
     dims = {dim for column in chosen for dim in column.dims}
     if "particle" in dims:
         dims.add("axis")
-    labels = [c for c in columns if c.coordinate and c.dims and {*c.dims} <= dims]
-    return {c.name: c for c in columns if c in chosen or c in labels}
+    return [c for c in columns if c in chosen or (c.coordinate and c.dims and {*c.dims} <= dims)]
 
 
 def run_members(jobs: list[Job]) -> list[MemberReport]:

@@ -1,15 +1,8 @@
-"""What is asked of every component before any of its functions is called.
+"""Properties of components by themselves: parameters, lattices, neighbour metrics, the scenes that
+they take part in, and the answers of their functions.
 
-What is asked of lattices and neighbour metrics.
-
-What is asked before the first step: that scenes can be built, with numbers and variables as they
-are declared.
-
-What is asked of the answers of every component: that they follow from the question alone.
-
-What is asked of functions that are called with whole arrays, single numbers or probes.
-
-What is asked of fracture models, of frame policies and of diagnostics alone.
+Functions are called with whole arrays, single numbers and probes; their answers follow from their
+arguments alone.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Everything that is asked of components, in the order in which it is asked.
-
-Examines components: asks every property of their interface, each in its own guard.
+"""The conformance suite: examine the properties of a component, each in its own guard, as a report
+or as a test of pytest.
 """
 
 from __future__ import annotations

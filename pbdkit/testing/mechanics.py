@@ -1,11 +1,9 @@
 """Laws of mechanics, measured: how far a scene is from each, as a share of its largest stiffness.
 
-A body that is moved rigidly stores nothing; what particle a does to b, b does to a (Maxwell and
-Betti); no deformation gives energy back; a broken bond makes nothing stiffer. All hang on the
-stiffness matrix K = -∂force/∂u of the body's particles, leaders included, which is probed here by
-the forces that the stepper finds: nothing of the rule is taken for granted.
-
-The small solids on which laws of mechanics are asked of a component.
+A rigid motion of a body stores no energy; what particle a does to b, b does to a (Maxwell and
+Betti); no deformation gives energy back; a broken bond makes nothing stiffer. All follow from the
+stiffness matrix K = -∂force/∂u of the particles of the body, leaders included, which is probed here
+by the forces that the stepper computes, for small solids with free edges.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""What is asked of scenes that are told otherwise: in other units, mirrored, turned.
-
-What is asked of the stiffness that a body has, whole and with bonds torn at random.
+"""Properties under a change of units, reflection and rotation, and properties of the stiffness of a
+body, whole and with bonds broken at random.
 """
 
 from __future__ import annotations
 
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -183,43 +182,47 @@ others, whose stiffness is a difference of forces."""
 def moves_rigidly_for_nothing(subject: Subject) -> None:
     """Where forces are known and edges are free, a body that is moved or turned a little as a whole
     exerts no force, whatever bonds are broken."""
-    for solid in _solids(subject):
-        for what, K in solid.stages:
-            if (force := resistance_to_rigid_motions(solid.scene, K)) > _rounding(solid.scene):
-                _fail(
-                    solid.scene,
-                    f"a rigid motion of a {what} body meets {force:.3g} of its stiffness",
-                    "let forces act along the line between two particles, or sum to those of cells "
-                    "that feel strains alone",
-                )
+    _check_stiffness(
+        subject,
+        resistance_to_rigid_motions,
+        "a rigid motion of a {body} body meets {measure:.3g} of its stiffness",
+        "let forces act along the line between two particles, or sum to those of cells that feel "
+        "strains alone",
+    )
 
 
 @asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def acts_both_ways_alike(subject: Subject) -> None:
     """There, what a particle's displacement does to another is what the other's does to it (Maxwell
     and Betti): forces have no resultant, and a work."""
-    for solid in _solids(subject):
-        for what, K in solid.stages:
-            if (off := asymmetry(K)) > _rounding(solid.scene):
-                _fail(
-                    solid.scene,
-                    f"the stiffness of a {what} body is not symmetric, by {off:.3g} of the largest",
-                    "give both ends of a bond one weight, the transpose where it is a matrix",
-                )
+    _check_stiffness(
+        subject,
+        lambda _, K: asymmetry(K),
+        "the stiffness of a {body} body is not symmetric, by {measure:.3g} of the largest",
+        "give both ends of a bond one weight, the transpose where it is a matrix",
+    )
 
 
 @asked_of(FollowerRule, FramePolicy, FractureModel, is_needed=True)
 def gives_no_energy_back(subject: Subject) -> None:
     """There, no displacement from rest has a negative energy."""
+    _check_stiffness(
+        subject,
+        lambda _, K: energy_given_back(K),
+        "some displacement of a {body} body gives energy back, {measure:.3g} of the largest "
+        "stiffness",
+        "let `force` pull towards where neighbours are",
+    )
+
+
+def _check_stiffness(
+    subject: Subject, measure: Callable[[Scene, Floats], float], fault: str, remedy: str
+) -> None:
+    """Raise PropertyError where a measure of the stiffness of a solid exceeds its rounding."""
     for solid in _solids(subject):
-        for what, K in solid.stages:
-            if (back := energy_given_back(K)) > _rounding(solid.scene):
-                _fail(
-                    solid.scene,
-                    f"some displacement of a {what} body gives energy back, {back:.3g} of the "
-                    "largest stiffness",
-                    "let `force` pull towards where neighbours are",
-                )
+        for body, K in solid.stages:
+            if (measured := measure(solid.scene, K)) > _rounding(solid.scene):
+                _fail(solid.scene, fault.format(body=body, measure=measured), remedy)
 
 
 @asked_of(FollowerRule, FramePolicy, FractureModel)

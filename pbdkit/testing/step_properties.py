@@ -1,8 +1,5 @@
-"""What is asked of rules that take loads.
-
-What is asked of whole steps that a component takes part in.
-
-What is asked of rules whose particles have directions.
+"""Properties of whole steps in which a component takes part, of rules that take loads, and of rules
+whose particles have directions.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""A question: one call of a component with arrays that are kept; and all that can be asked.
+"""Properties and their subject: one component in small scenes, of every lattice with every
+neighbourhood, and the calls that are made of it.
 
-Inputs and answers are trees: arrays and numbers in vectors, tuples, lists and dicts; answers also
-in dataclasses.
-
-What a property is, and the subject of which it is asked: one component, in the small scenes in
-which it is tried, every lattice with every neighbourhood.
+A `Question` is one call whose arguments are kept, so that it is made again with other arguments.
+Arguments and answers are trees: arrays and numbers in vectors, tuples, lists and dicts; answers
+also in dataclasses.
 """
 
 from __future__ import annotations

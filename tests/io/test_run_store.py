@@ -25,6 +25,7 @@ from scene_strategies import experiments, pulled_apart, samples
 import pbdkit
 from pbdkit.io import netcdf as netcdf_sink
 from pbdkit.io import run_store as run_store
+from pbdkit.io import sqlite_file
 from pbdkit.io.atomic_file import is_local
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.io.run_store import RunStore, UnfinishedRun, status_of, store_of
@@ -420,7 +421,7 @@ def test_on_a_network_the_store_keeps_a_journal_that_needs_no_shared_memory(
     assert is_local(Path("/home/a.nc"), str(mounts))
     assert not is_local(Path("/net/a.nc"), str(mounts))
     mounts.write_text("1 0 0:1 / / rw - nfs4 host:/ rw\n")
-    monkeypatch.setattr(run_store, "is_local", lambda path: is_local(path, str(mounts)))
+    monkeypatch.setattr(sqlite_file, "is_local", lambda path: is_local(path, str(mounts)))
     right = whole(call)
     stopped(call, monkeypatch)
     assert names() >= {"out.nc.run", "out.nc.run-records"}

@@ -507,6 +507,29 @@ def test_a_field_has_the_value_of_its_place_and_holes_stay_holes():
             assert hole.sum() == pytest.approx(1e4 / count**2, rel=0.3)
 
 
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0.813, 0.282), (0.273, 0.745), (0.732, 0.811), (0.732, 0.811)],
+        [(0.1, 0.1), (0.6, 0.3), (0.9, 0.9), (0.4, 0.7)],
+    ],
+)
+def test_no_pixel_within_a_sheared_cell_is_missed(corners):
+    size, places = 59, np.array(corners, np.float32)
+    grid = Grid((0.0, 1.0, 0.0, 1.0), size, size)
+    field = grid.mean(grid.places(places)[None], np.ones((1, 4)))
+    y, x = np.mgrid[:size, :size] + 0.5
+    inside = np.ones((size, size), bool)
+    shape = list(dict.fromkeys(map(tuple, places * size)))
+    middle = np.mean(shape, axis=0)
+    for (ax, ay), (bx, by) in zip(shape, shape[1:] + shape[:1], strict=True):
+        normal = np.array([ay - by, bx - ax]) / np.hypot(bx - ax, by - ay)
+        normal *= np.sign(normal @ (middle - (ax, ay)))
+        inside &= normal[0] * (x - ax) + normal[1] * (y - ay) > 1.0
+    assert inside.sum() > 100
+    assert np.isfinite(field[inside]).all()
+
+
 def test_cells_with_a_broken_side_are_left_out_and_the_outline_goes_around_the_rest():
     site = np.stack(np.meshgrid(*2 * [np.arange(4)], indexing="ij"), -1).reshape(-1, 2)
     cells = cells_of(site, site.astype(float))

@@ -230,7 +230,7 @@ def test_identities_say_what_the_rule_is():
 
 def test_a_colour_stands_once_in_the_legend():
     text = "".join(pbdkit.load("modelling/composite-plate")._repr_html_())
-    assert "held along x only, held along y only" in text
+    assert "held along x; held along y" in text
 
 
 def test_at_an_equilibrium_no_steps_are_told():

@@ -38,7 +38,7 @@ from trials import (
 )
 
 from pbdkit.errors import PbdkitError
-from pbdkit.io import run_store
+from pbdkit.io import run_store, sqlite_file
 from pbdkit.io import run_store as unfinished
 from pbdkit.io.atomic_file import is_local
 from pbdkit.io.run_store import status_of
@@ -102,7 +102,7 @@ def dying(at: int) -> Callable[[], None]:
 
 def network() -> None:
     """Takes the disk for one of another machine: no write-ahead log."""
-    run_store.is_local = lambda path: is_local(path, mounts="/nowhere")
+    sqlite_file.is_local = lambda path: is_local(path, mounts="/nowhere")
 
 
 class Trial:

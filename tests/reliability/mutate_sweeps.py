@@ -32,6 +32,7 @@ import pbdkit
 import pbdkit.cli.sweep
 import pbdkit.sweeps.execute
 from pbdkit.cli import main as main_of_pbdkit
+from pbdkit.io import sqlite_file
 from pbdkit.sweeps import store
 
 EXPERIMENT = {
@@ -68,7 +69,7 @@ def small() -> None:
 def network() -> None:
     """Takes the disk for one of another machine: no write-ahead log."""
     small()
-    store.is_local = lambda path: False
+    sqlite_file.is_local = lambda path: False
 
 
 def dying(members: int, begin: Callable[[], None]) -> Callable[[], None]:

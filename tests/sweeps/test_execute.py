@@ -595,7 +595,7 @@ def test_a_cluster_that_does_not_answer_is_one_message(call, small, monkeypatch)
 
 def test_the_log_is_written_ahead_on_local_file_systems_only(small, tmp_path, monkeypatch):
     for local, journal in ((True, "wal"), (False, "truncate")):
-        monkeypatch.setattr(stores, "is_local", lambda path, local=local: local)
+        monkeypatch.setattr(sqlite_file, "is_local", lambda path, local=local: local)
         with stores.Store(tmp_path / journal) as store:
             (found,) = store._database.execute("PRAGMA journal_mode").fetchone()
             (synchronous,) = store._database.execute("PRAGMA synchronous").fetchone()
