@@ -210,10 +210,8 @@ class Page:
 
     def _place_texts(self, page: Any) -> None:
         block, y = self._block, self._panels.labels[1]
-        middle, ticks = (
-            block.get_points().mean(axis=0),
-            self._drawn(self.axes, for_layout_only=True),
-        )
+        middle = block.get_points().mean(axis=0)
+        ticks = self._drawn(self.axes, for_layout_only=True)
         upright = block.height + 0.3 >= len(y) / CHARACTERS_PER_IN
         across, up = self._labels
         across.set(position=np.array((middle[0], ticks.y0)) / page, ha="center", va="top")
@@ -298,8 +296,8 @@ class Page:
         left = min(narrow.x0, self._drawn([self._labels[1]]).x0)
         self._around = self._before + self._after
         self._around[0] = narrow.x1 - left - self._block.width + 2 * EDGE_IN
-        last = self._drawn([self.axes[-1]], for_layout_only=True)
-        self._overhang = max(0.0, last.width - self._grid.width) / 2
+        ticks = self._drawn([self.axes[-1].xaxis])
+        self._overhang = max(0.0, ticks.width - self._grid.width) / 2
 
 
 def _locator(low: float, high: float, length: float, distance: float) -> Locator:
