@@ -39,9 +39,9 @@ from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.leaders import steady_steps
 from pbdkit.stepping.numba_engine.time_skewing import Skew
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import hindrance
 from pbdkit.stepping.state import State, initial_state
+from pbdkit.stepping.step import Mode
 
 
 class DividedStepper(Engine):

@@ -27,9 +27,9 @@ from pbdkit.scene.leaders import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
-from pbdkit.stepping.operation import PUSHED_BY_COURSES, Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import Floats, State, unmoved_state
+from pbdkit.stepping.step import PUSHED_BY_COURSES, Hindrance, Mode, Operation, Step
 
 NUDGE = 0.01
 """Distance by which a particle is moved to measure what pulls it back, in lattice constants."""

@@ -81,9 +81,9 @@ from pbdkit.stepping.numba_engine.sweeps import (
     write_whole,
 )
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.operation import Led
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.state import State, cut_bonds, unmoved_state
+from pbdkit.stepping.step import Led
 
 THREAD = ("me", "threads")
 """What functions are given: the number of a thread, and of how many."""

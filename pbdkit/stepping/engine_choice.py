@@ -15,8 +15,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.leaders import last_event
 from pbdkit.stepping.numba_engine.time_skewing import exceeds_cache, single_steps
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import reason_against
+from pbdkit.stepping.step import Mode
 
 
 def what_is_missing() -> str:

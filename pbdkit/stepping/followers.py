@@ -23,7 +23,6 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.frame import FollowFrame
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import (
     Contributions,
     Evaluator,
@@ -33,6 +32,7 @@ from pbdkit.stepping.rule_evaluation import (
     blocks,
 )
 from pbdkit.stepping.state import Floats, State, shown
+from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
 
 REAL = "fiub"
 """The kinds of numpy's types that are numbers a particle can move by."""

@@ -18,9 +18,9 @@ from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.cell_stress import CellStresses
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
 from pbdkit.stepping.rule_evaluation import BLOCK_CELLS, Evaluator
 from pbdkit.stepping.state import State, cut_bonds
+from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
 
 Home = tuple[Any, ...]
 """Where bonds are kept: plane and cells."""

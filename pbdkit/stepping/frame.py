@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter, Lines
-from pbdkit.stepping.operation import Hindrance, Mode, Operation, Step
+from pbdkit.stepping.step import Hindrance, Mode, Operation, Step
 
 
 class FollowFrame(Operation):

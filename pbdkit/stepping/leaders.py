@@ -33,7 +33,9 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import (
+from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
+from pbdkit.stepping.state import Array, Floats, State
+from pbdkit.stepping.step import (
     PUSHED_BY_COURSES,
     Hindrance,
     Led,
@@ -43,8 +45,6 @@ from pbdkit.stepping.operation import (
     Starts,
     Step,
 )
-from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
-from pbdkit.stepping.state import Array, Floats, State
 
 
 class Clamps:

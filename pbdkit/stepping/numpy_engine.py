@@ -8,9 +8,9 @@ from typing import Literal
 
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import MoveFollowers
-from pbdkit.stepping.operation import Step
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.state import State
+from pbdkit.stepping.step import Step
 
 
 class Engine(ABC):

@@ -14,8 +14,8 @@ from pbdkit.plugin.frame import Indices
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import KernelWriter
-from pbdkit.stepping.operation import Operation, Step
 from pbdkit.stepping.state import Floats, shown
+from pbdkit.stepping.step import Operation, Step
 
 
 class OperateOnParticles(Operation):

@@ -16,8 +16,8 @@ from pbdkit.stepping.leaders import (
     PlaceLeaders,
     TurnDirections,
 )
-from pbdkit.stepping.operation import Hindrance, Mode, Operation
 from pbdkit.stepping.particle_operation import OperateOnParticles
+from pbdkit.stepping.step import Hindrance, Mode, Operation
 
 Program = tuple[Operation, ...]
 ORDER: tuple[type[Operation], ...] = (

@@ -23,8 +23,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stepping.leaders import Slants, prescribe, steady_steps
 from pbdkit.stepping.numba_engine.arrays import Arrays
 from pbdkit.stepping.numba_engine.plan import Plan, banded, room_for
-from pbdkit.stepping.operation import Led, Placed
 from pbdkit.stepping.state import State
+from pbdkit.stepping.step import Led, Placed
 
 
 def held(end: str, step: str) -> str:

@@ -65,11 +65,11 @@ from pbdkit.stepping.numba_engine.sweeps import (
     torn_marks,
 )
 from pbdkit.stepping.numpy_engine import Engine, Stepper
-from pbdkit.stepping.operation import Led
 from pbdkit.stepping.particle_operation import OperateOnParticles
 from pbdkit.stepping.program import program_of
 from pbdkit.stepping.rule_evaluation import Evaluator, presence
 from pbdkit.stepping.state import Floats, State, cut_bonds, unmoved_state
+from pbdkit.stepping.step import Led
 
 
 class PairFollowers(Followers):

@@ -59,9 +59,9 @@ from pbdkit.stepping.numba_engine.time_skewing import (
     exceeds_cache,
     single_steps,
 )
-from pbdkit.stepping.operation import Led
 from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.stepping.state import started
+from pbdkit.stepping.step import Led
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pbdkit.plugin import RenewsBonds
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.operation import Mode
 from pbdkit.stepping.program import reason_against
+from pbdkit.stepping.step import Mode
 
 CACHE = 2**24
 """Bytes of displacements up to which a pass a step is as fast (measured)."""
